@@ -1,0 +1,1 @@
+"""Geometric and predictive flight control, and the perching mission."""

@@ -1,0 +1,1 @@
+"""Maths, models and ROS conventions shared by every perch package."""

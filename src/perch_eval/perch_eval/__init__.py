@@ -1,0 +1,1 @@
+"""Flight reports, benchmarks and campaigns."""

@@ -1,0 +1,1 @@
+"""Target localisation, visual-inertial odometry, state estimation and powerline mapping."""

@@ -1,0 +1,1 @@
+"""Perching trajectories: QP with global bound checking, and the powerline NLP."""

@@ -1,0 +1,1 @@
+"""The simulated vehicle: plant, rotors, IMU, cameras, contact and timing."""
