@@ -1,0 +1,47 @@
+# Source this file to get a shell in which perch works:   source setup.bash
+# It puts the virtual environment, the built workspace and every node's executable on the path.
+# Made for bash; it needs a finished set-up (python3 scripts/setup.py, or any other script here).
+
+_perch_root="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
+
+_perch_prepend() {  # NAME FOLDER: put FOLDER first in the path variable NAME, once
+  local rest=":${!1}:"
+  rest="${rest//:$2:/:}"
+  rest="${rest#:}"
+  rest="${rest%:}"
+  export "$1=$2${rest:+:$rest}"
+}
+
+if [ ! -f "$_perch_root/install/setup.bash" ] || [ ! -f "$_perch_root/.venv/bin/activate" ]; then
+  echo "perch is not set up yet: run   python3 $_perch_root/scripts/setup.py   and source this file again" >&2
+  unset -f _perch_prepend
+  unset _perch_root
+  return 1
+fi
+
+source "$_perch_root/.venv/bin/activate"
+
+# The ROS wheels look for their shared libraries beside themselves. Saying so here saves each
+# Python a second start. A sourced ROS installation has done the same for itself.
+if [ -d "$_perch_root/.venv/share/rclpy" ]; then
+  for _perch_folder in "$_perch_root"/.venv/lib/python3*/site-packages/ros_*.libs "$_perch_root/.venv/lib"; do
+    [ -d "$_perch_folder" ] && _perch_prepend LD_LIBRARY_PATH "$_perch_folder"
+  done
+  export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1
+  _perch_prepend AMENT_PREFIX_PATH "$_perch_root/.venv"
+  _perch_prepend CMAKE_PREFIX_PATH "$_perch_root/.venv"
+fi
+
+source "$_perch_root/install/setup.bash"
+
+for _perch_folder in "$_perch_root"/install/perch_*/lib/perch_*; do
+  [ -d "$_perch_folder" ] && _perch_prepend PATH "$_perch_folder"
+done
+
+export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-42}"
+export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
+# The matrices here are small: threads inside numpy only take the cores from other nodes.
+export OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+unset -f _perch_prepend
+unset _perch_root _perch_folder
