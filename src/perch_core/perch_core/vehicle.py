@@ -1,0 +1,149 @@
+"""What a vehicle is: mass, rotors, sensors. One YAML file in `config/vehicles/` each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
+from perch_core.config import choice, quantity, text
+from perch_core.errors import ConfigError
+
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A camera as the vehicle file describes it."""
+
+    model: str = choice(options=("equidistant", "pinhole"), doc="projection model")
+    width: int = quantity(unit="px", low=16, high=4096)
+    height: int = quantity(unit="px", low=16, high=4096)
+    focal: tuple[float, float] = quantity(unit="px", above=0.0, doc="fx, fy")
+    centre: tuple[float, float] = quantity(unit="px", low=0.0, doc="cx, cy")
+    distortion: Vector4 = quantity((0.0, 0.0, 0.0, 0.0), doc="k1..k4 of the Kannala-Brandt polynomial")
+    position: Vector3 = quantity(unit="m", doc="p_BC")
+    orientation: Vector4 = quantity(doc="q_BC, xyzw")
+    colour: bool = quantity(False, doc="rgb8 instead of mono8")
+    rate: float = quantity(30.0, unit="Hz", above=0.0, high=120.0)
+    exposure: float = quantity(0.0035, unit="s", above=0.0, high=0.03)
+    exposure_max: float = quantity(0.0097, unit="s", above=0.0, high=0.03)
+    readout: float = quantity(0.0093, unit="s", low=0.0, high=0.05)
+    transport_min: float = quantity(0.005, unit="s", low=0.0, high=0.2)
+    transport_max: float = quantity(0.010, unit="s", low=0.0, high=0.2)
+    stamp_offset: float = quantity(0.0, unit="s", low=-0.05, high=0.05, doc="stamp minus true mid-exposure time")
+
+    def __post_init__(self) -> None:
+        if abs(np.linalg.norm(self.orientation) - 1) > 1e-3:
+            raise ConfigError("", "orientation", f"norm {np.linalg.norm(self.orientation):.4f} is not 1")
+        if self.transport_max < self.transport_min:
+            raise ConfigError("", "transport_max", f"{self.transport_max:g} is below transport_min {self.transport_min:g}")
+
+    def mount(self, name: str) -> CameraMount:
+        """The camera with its place on the body."""
+        common = dict(width=self.width, height=self.height, fx=self.focal[0], fy=self.focal[1],
+                      cx=self.centre[0], cy=self.centre[1])
+        camera = (EquidistantCamera(**common, distortion=self.distortion) if self.model == "equidistant"
+                  else PinholeCamera(**common))
+        return CameraMount(
+            name=name, camera=camera, p_BC=np.array(self.position),
+            R_BC=so3.quat_to_matrix(np.array(self.orientation) / np.linalg.norm(self.orientation)),
+            rate=self.rate, exposure=self.exposure, exposure_max=self.exposure_max, readout=self.readout,
+            transport_min=self.transport_min, transport_max=self.transport_max, stamp_offset=self.stamp_offset,
+            colour=self.colour,
+        )
+
+
+@dataclass(frozen=True)
+class ImuConfig:
+    """An IMU: ranges and noise, per sample at `rate`."""
+
+    rate: float = quantity(500.0, unit="Hz", above=0.0)
+    position: Vector3 = quantity((0.0, 0.0, 0.0), unit="m", doc="p_BI; axes parallel to B")
+    accel_noise: float = quantity(unit="m/s^2", low=0.0, doc="1 sigma per sample, vibration included")
+    gyro_noise: float = quantity(unit="rad/s", low=0.0, doc="1 sigma per sample")
+    accel_bias_walk: float = quantity(unit="m/s^2/sqrt(s)", low=0.0)
+    gyro_bias_walk: float = quantity(unit="rad/s/sqrt(s)", low=0.0)
+    accel_bias_init: float = quantity(unit="m/s^2", low=0.0, doc="1 sigma of the turn-on bias")
+    gyro_bias_init: float = quantity(unit="rad/s", low=0.0, doc="1 sigma of the turn-on bias")
+    accel_range: float = quantity(156.0, unit="m/s^2", above=0.0)
+    gyro_range: float = quantity(34.0, unit="rad/s", above=0.0)
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A quadrotor. Rotors in the order front-left, rear-left, rear-right, front-right unless the file says otherwise."""
+
+    name: str = text()
+    mass: float = quantity(unit="kg", above=0.0, high=50.0)
+    inertia: Vector3 = quantity(unit="kg m^2", above=0.0, doc="principal moments, axes of B")
+    rotor_xy: tuple[tuple[float, float], ...] = quantity(unit="m", doc="rotor positions in B")
+    rotor_yaw_sign: tuple[int, int, int, int] = quantity(doc="+1: the rotor's drag torque turns the body to +yaw")
+    thrust_coefficient: float = quantity(unit="N s^2/rad^2", above=0.0, doc="thrust = coefficient * speed^2")
+    torque_ratio: float = quantity(unit="m", above=0.0, doc="kappa of [P:eq2]: drag torque / thrust")
+    speed_min: float = quantity(unit="rad/s", low=0.0)
+    speed_max: float = quantity(unit="rad/s", above=0.0)
+    motor_time_constant: float = quantity(unit="s", low=0.0, high=1.0, doc="first-order lag of the rotor speed")
+    thrust_rate_max: float = quantity(float("inf"), unit="N/s", above=0.0, doc="|u| of [P:eq14g], per rotor")
+    body_rate_max: float = quantity(unit="rad/s", above=0.0, doc="largest |omega| that a plan may ask for")
+    drag: Vector3 = quantity((0.0, 0.0, 0.0), unit="N s/m", low=0.0, doc="linear rotor drag, axes of B")
+    perch_offset: float = quantity(unit="m", low=0.0, high=1.0, doc="velcro or gripper below the centre of mass")
+    perch_radius: float = quantity(0.04, unit="m", above=0.0, doc="radius of the velcro plate")
+    body_radii: Vector3 = quantity(unit="m", above=0.0, doc="ellipsoid that contains the vehicle")
+    propeller_radius: float = quantity(0.0, unit="m", low=0.0)
+    cameras: dict[str, CameraConfig] = text()
+    imu: ImuConfig = text()
+
+    def __post_init__(self) -> None:
+        if len(self.rotor_xy) != 4:
+            raise ConfigError("", "rotor_xy", f"has {len(self.rotor_xy)} rotors, needs 4")
+        if self.speed_max <= self.speed_min:
+            raise ConfigError("", "speed_max", f"{self.speed_max:g} is not above speed_min {self.speed_min:g} rad/s")
+        if 4 * self.thrust_max <= self.mass * GRAVITY:
+            raise ConfigError("", "speed_max", f"total thrust {4 * self.thrust_max:.2f} N cannot lift {self.mass:g} kg")
+
+    @cached_property
+    def inertia_matrix(self) -> np.ndarray:
+        """J in B [kg m^2], shape (3, 3). [M:eq1]"""
+        return np.diag(self.inertia)
+
+    @cached_property
+    def allocation(self) -> np.ndarray:
+        """Rotor thrusts -> (collective thrust, Mx, My, Mz), shape (4, 4). [P:eq2]"""
+        xy = np.array(self.rotor_xy)
+        return np.stack([np.ones(4), xy[:, 1], -xy[:, 0], self.torque_ratio * np.array(self.rotor_yaw_sign, float)])
+
+    @property
+    def thrust_min(self) -> float:
+        """Least thrust of one rotor [N]."""
+        return self.thrust_coefficient * self.speed_min**2
+
+    @property
+    def thrust_max(self) -> float:
+        """Greatest thrust of one rotor [N]."""
+        return self.thrust_coefficient * self.speed_max**2
+
+    @property
+    def hover_thrust(self) -> float:
+        """Collective thrust that carries the weight [N]."""
+        return self.mass * GRAVITY
+
+    @cached_property
+    def mounts(self) -> dict[str, CameraMount]:
+        """The cameras with their places on the body, by name (`down`, `front`)."""
+        return {name: item.mount(name) for name, item in self.cameras.items()}
+
+
+def load_vehicle(name_or_path: str | Path) -> Vehicle:
+    """The vehicle of `config/vehicles/<name>.yaml`, or of a file.
+
+    Raises:
+        ConfigError: no such vehicle, or a value that is refused.
+    """
+    return config.load(Vehicle, config.find("vehicles", name_or_path))
