@@ -1,0 +1,147 @@
+"""Polynomials in Bernstein form on [0, 1]: value(s) = sum_i c_i B_i^n(s), B_i^n(s) = C(n, i) s^i (1 - s)^(n - i).
+
+Coefficients stand on the last axis (degree + 1 of them); leading axes are any number of polynomials. The form is
+well conditioned, and the smallest and largest coefficient enclose the values: that is what bounds are proved with.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import comb
+
+import numpy as np
+
+
+@lru_cache(maxsize=None)
+def binomials(n: int) -> np.ndarray:
+    """Row n of Pascal's triangle, shape (n + 1,), read-only."""
+    row = np.array([comb(n, i) for i in range(n + 1)], float)
+    row.setflags(write=False)
+    return row
+
+
+def basis(degree: int, s: np.ndarray | float) -> np.ndarray:
+    """Values of the basis polynomials of one degree.
+
+    Args:
+        degree: degree n of the basis.
+        s: arguments in [0, 1], any shape.
+
+    Returns:
+        Array of shape `s.shape + (degree + 1,)`.
+    """
+    s = np.asarray(s, float)[..., None]
+    i = np.arange(degree + 1)
+    return binomials(degree) * s**i * (1.0 - s) ** (degree - i)
+
+
+def evaluate(coefficients: np.ndarray, s: np.ndarray | float) -> np.ndarray:
+    """Values of polynomials.
+
+    Args:
+        coefficients: shape (..., degree + 1).
+        s: arguments in [0, 1], any shape.
+
+    Returns:
+        Array of shape `coefficients.shape[:-1] + s.shape`.
+    """
+    coefficients = np.asarray(coefficients, float)
+    return np.tensordot(coefficients, basis(coefficients.shape[-1] - 1, s), axes=(-1, -1))
+
+
+def derivative(coefficients: np.ndarray, order: int = 1) -> np.ndarray:
+    """Coefficients of the derivative with respect to s, shape (..., max(degree - order, 0) + 1)."""
+    coefficients = np.asarray(coefficients, float)
+    for _ in range(order):
+        degree = coefficients.shape[-1] - 1
+        if degree == 0:
+            return np.zeros_like(coefficients)
+        coefficients = degree * np.diff(coefficients, axis=-1)
+    return coefficients
+
+
+def integral(coefficients: np.ndarray) -> np.ndarray:
+    """Coefficients of the antiderivative that vanishes at s = 0, shape (..., degree + 2)."""
+    coefficients = np.asarray(coefficients, float)
+    sums = np.cumsum(coefficients, axis=-1) / coefficients.shape[-1]
+    return np.concatenate([np.zeros_like(sums[..., :1]), sums], axis=-1)
+
+
+@lru_cache(maxsize=None)
+def elevation_matrix(degree: int, to_degree: int) -> np.ndarray:
+    """Matrix E with `elevated = coefficients @ E.T`, shape (to_degree + 1, degree + 1), read-only.
+
+    Each row is a convex combination, so that elevation never amplifies rounding.
+    """
+    if to_degree < degree:
+        raise ValueError(f"cannot elevate degree {degree} to the lower degree {to_degree}")
+    r = to_degree - degree
+    E = np.array([[comb(degree, j) * comb(r, i - j) / comb(to_degree, i) if 0 <= i - j <= r else 0.0
+                   for j in range(degree + 1)] for i in range(to_degree + 1)])
+    E.setflags(write=False)
+    return E
+
+
+def elevate(coefficients: np.ndarray, to_degree: int) -> np.ndarray:
+    """The same polynomials in a basis of a higher degree, shape (..., to_degree + 1)."""
+    coefficients = np.asarray(coefficients, float)
+    return coefficients @ elevation_matrix(coefficients.shape[-1] - 1, to_degree).T
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Coefficients of the products a(s) b(s).
+
+    Args:
+        a: shape (..., n + 1).
+        b: shape (..., m + 1), with leading axes that broadcast against those of `a`.
+
+    Returns:
+        Array of shape (..., n + m + 1).
+    """
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    n, m = a.shape[-1] - 1, b.shape[-1] - 1
+    scaled_a, scaled_b = a * binomials(n), b * binomials(m)
+    out = np.zeros(np.broadcast_shapes(a.shape[:-1], b.shape[:-1]) + (n + m + 1,))
+    for i in range(n + 1):
+        out[..., i:i + m + 1] += scaled_a[..., i:i + 1] * scaled_b
+    return out / binomials(n + m)
+
+
+def subdivide(coefficients: np.ndarray, s: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """De Casteljau's algorithm: the same polynomials on [0, s] and on [s, 1], each mapped to [0, 1].
+
+    Returns:
+        Two arrays of the shape of `coefficients`.
+    """
+    work = np.array(coefficients, float)
+    left, right = np.empty_like(work), np.empty_like(work)
+    last = work.shape[-1] - 1
+    for k in range(last + 1):
+        left[..., k] = work[..., 0]
+        right[..., last - k] = work[..., last - k]
+        work[..., :last - k] = (1.0 - s) * work[..., :last - k] + s * work[..., 1:last - k + 1]
+    return left, right
+
+
+@lru_cache(maxsize=None)
+def power_matrix(degree: int) -> np.ndarray:
+    """Matrix M with `powers = coefficients @ M.T` for powers of s in ascending order, integers, read-only."""
+    n = degree
+    M = np.array([[(-1) ** (k - i) * comb(n, k) * comb(k, i) if i <= k else 0
+                   for i in range(n + 1)] for k in range(n + 1)], float)
+    M.setflags(write=False)
+    return M
+
+
+def to_powers(coefficients: np.ndarray) -> np.ndarray:
+    """Coefficients of ascending powers of s, shape as given. Loses about 0.5 * degree digits: not for bounds."""
+    coefficients = np.asarray(coefficients, float)
+    return coefficients @ power_matrix(coefficients.shape[-1] - 1).T
+
+
+def from_powers(powers: np.ndarray) -> np.ndarray:
+    """Bernstein coefficients from ascending powers of s, shape as given."""
+    powers = np.asarray(powers, float)
+    n = powers.shape[-1] - 1
+    M = np.array([[comb(i, k) / comb(n, k) if k <= i else 0.0 for k in range(n + 1)] for i in range(n + 1)])
+    return powers @ M.T

@@ -1,0 +1,237 @@
+"""Powerline segments, Pluecker lines, and the line costs and constraints of paper P, written once. [P:eq3-13]
+
+The functions are generic over numbers, arrays (many states at once) and CasADi symbols: vectors are tuples of
+components, see `components`. Planner, controller and evaluation use the same ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.components import (
+    Scalar, Vector, add, components, cross, dot, function, rotate, rotate_back, scale, stack, subtract,
+)
+from perch_core.errors import PerchError
+
+ACTIVATION_RAMP = 0.02  # length over which the end of a segment fades in [m]
+_STEEPNESS = float(np.arctanh(0.98))  # tanh reaches 1 % and 99 % at the ends of the ramp
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A straight piece of powerline.
+
+    Attributes:
+        centre: o_W, middle of the segment in W [m], shape (3,).
+        direction: l_W, unit vector in W, shape (3,).
+        half_length: [m].
+        radius: of the wire [m].
+        id: number under which the map knows it.
+    """
+
+    centre: np.ndarray
+    direction: np.ndarray
+    half_length: float
+    radius: float
+    id: int = 0
+
+    def __post_init__(self) -> None:
+        centre, direction = np.array(self.centre, float), np.array(self.direction, float)
+        norm = float(np.linalg.norm(direction))
+        values = (*centre, *direction, self.half_length, self.radius)
+        if centre.shape != (3,) or direction.shape != (3,) or not np.all(np.isfinite(values)):
+            raise PerchError(f"line {self.id}: needs a finite centre and direction in 3-d, got {values}")
+        if norm == 0 or self.half_length <= 0 or self.radius <= 0:
+            raise PerchError(f"line {self.id}: length {2 * self.half_length:g} m and radius {self.radius:g} m must be > 0")
+        object.__setattr__(self, "centre", centre)
+        object.__setattr__(self, "direction", direction / norm)
+
+    @classmethod
+    def between(cls, start: np.ndarray, end: np.ndarray, radius: float, id: int = 0) -> Segment:
+        """The segment between two end points in W [m]."""
+        start, end = np.asarray(start, float), np.asarray(end, float)
+        return cls((start + end) / 2, end - start, float(np.linalg.norm(end - start)) / 2, radius, id)
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """End points in W [m]."""
+        return self.centre - self.half_length * self.direction, self.centre + self.half_length * self.direction
+
+    @property
+    def pluecker(self) -> tuple[np.ndarray, np.ndarray]:
+        """Moment n = o x l [m] and direction l of the infinite line, in W."""
+        return np.cross(self.centre, self.direction), self.direction
+
+    def closest_point(self, point: np.ndarray) -> np.ndarray:
+        """The point of the segment that is nearest to points in W, shapes (..., 3)."""
+        along = (np.asarray(point, float) - self.centre) @ self.direction
+        return self.centre + np.clip(along, -self.half_length, self.half_length)[..., None] * self.direction
+
+    def distance(self, point: np.ndarray) -> np.ndarray:
+        """Distance of points in W from the wire's axis [m], shapes (..., 3) -> (...)."""
+        return np.linalg.norm(np.asarray(point, float) - self.closest_point(point), axis=-1)
+
+
+def segment_distance(a: Segment, b: Segment) -> float:
+    """Least distance between the axes of two segments [m]."""
+    gap, cosine = b.centre - a.centre, float(a.direction @ b.direction)
+    sine2 = 1 - cosine**2
+    along_a, along_b = float(gap @ a.direction), float(gap @ b.direction)
+    candidates = [end for end in b.ends]
+    if sine2 > 1e-12:
+        s = (along_a - cosine * along_b) / sine2
+        t = (cosine * along_a - along_b) / sine2
+        if abs(s) <= a.half_length and abs(t) <= b.half_length:
+            return float(np.linalg.norm(a.centre + s * a.direction - b.centre - t * b.direction))
+    return float(min([a.distance(end) for end in candidates] + [b.distance(end) for end in a.ends]))
+
+
+def scaled_line(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, radii: Vector) -> tuple[Vector, Vector]:
+    """Line in the body frame, scaled so that the body's ellipsoid is the unit ball. [P:eq3]
+
+    Args:
+        p_WB, q_WB: pose of the body [m, xyzw].
+        o_W, l_W: a point and the direction of the line in W.
+        radii: delta, the ellipsoid's radii with the wire's radius added [m].
+
+    Returns:
+        o and l in the scaled frame.
+    """
+    o_B, l_B = rotate_back(q_WB, subtract(o_W, p_WB)), rotate_back(q_WB, l_W)
+    return tuple(o / d for o, d in zip(o_B, radii)), tuple(l / d for l, d in zip(l_B, radii))
+
+
+def line_distance_squared(o: Vector, l: Vector) -> Scalar:
+    """Squared distance of a line from the origin; above 1 in the scaled frame: no contact. [P:eq4]"""
+    moment = cross(o, l)
+    return dot(moment, moment) / dot(l, l)
+
+
+def line_clearance(o: Vector, l: Vector) -> Scalar:
+    """[P:eq4] without the fraction; positive: no contact with the infinite line. [P:eq5]
+
+    The paper's line `(|o|^2 - 1) |l|^2 - (o.l)^2 > 0`, from |o x l|^2 = |o|^2 |l|^2 - (o.l)^2.
+    """
+    return (dot(o, o) - 1) * dot(l, l) - dot(o, l) * dot(o, l)
+
+
+def segment_activation(p_WB: Vector, o_W: Vector, half_length: Scalar, reach: Scalar) -> Scalar:
+    """0 where the body can touch the segment, 1 far from it: sigm of k(x). [P:eq6]
+
+    tanh instead of the paper's arctan: arctan's tails leave percents of k(x) in the middle of the segment, where it
+    would weaken the constraint. Here less than 1 % is left at half the ramp.
+
+    Args:
+        p_WB: body position in W [m].
+        o_W: centre of the segment in W [m].
+        half_length: [m].
+        reach: greatest radius of the ellipsoid plus that of the wire [m].
+    """
+    offset = subtract(p_WB, o_W)
+    edge = half_length + reach + ACTIVATION_RAMP
+    # In the squared distance (no root at the centre); 2 edge x ramp is the ramp's extent there.
+    rise = _STEEPNESS / (edge * ACTIVATION_RAMP)
+    return 0.5 + 0.5 * function("tanh", rise * (dot(offset, offset) - edge * edge))
+
+
+def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half_length: Scalar, radius: Scalar,
+                      body_radii: Vector) -> Scalar:
+    """h_ca: positive where body and segment do not touch. [P:eq7]
+
+    Args:
+        p_WB, q_WB: pose of the body [m, xyzw].
+        o_W, l_W, half_length, radius: the segment [m].
+        body_radii: radii of the body's ellipsoid [m].
+
+    Returns:
+        h_ca [1/m^2]; it exceeds zero everywhere outside the segment's surroundings.
+    """
+    radii = tuple(r + radius for r in body_radii)
+    o, l = scaled_line(p_WB, q_WB, o_W, l_W, radii)
+    smallest, largest = min(body_radii), max(body_radii)
+    largest_eigenvalue = 1 / (smallest + radius)  # lambda_1 of Delta
+    far = segment_activation(p_WB, o_W, half_length, largest + radius)
+    return line_clearance(o, l) + largest_eigenvalue * largest_eigenvalue * far
+
+
+def scaled_clearance(states_p: np.ndarray, states_q: np.ndarray, segment: Segment, body_radii: Vector) -> np.ndarray:
+    """Distance of the finite segment in the scaled frame, minus 1: positive where nothing touches.
+
+    The check of finished trajectories: it takes the segment's true ends instead of the fade-out of [P:eq6].
+
+    Args:
+        states_p, states_q: poses of the body [m, xyzw], shapes (n, 3) and (n, 4).
+        segment: the wire.
+        body_radii: radii of the body's ellipsoid [m].
+
+    Returns:
+        Shape (n,), dimensionless.
+    """
+    radii = tuple(float(r) + segment.radius for r in body_radii)
+    o, l = scaled_line(components(states_p), components(states_q), components(segment.centre),
+                       components(segment.direction), radii)
+    along = np.clip(-dot(o, l) / dot(l, l), -segment.half_length, segment.half_length)
+    return np.linalg.norm(stack(add(o, scale(along, l))), axis=-1) - 1
+
+
+def line_in_camera(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, p_BC: Vector, q_BC: Vector
+                   ) -> tuple[Vector, Vector]:
+    """A line's point and direction in the camera frame C (z forward). [P:eq8]"""
+    o_B = subtract(rotate_back(q_WB, subtract(o_W, p_WB)), p_BC)
+    return rotate_back(q_BC, o_B), rotate_back(q_BC, rotate_back(q_WB, l_W))
+
+
+def camera_point(p_WB: Vector, q_WB: Vector, p_BC: Vector, q_BC: Vector, point_C: Vector) -> Vector:
+    """A point of the camera frame in W: the inverse of [P:eq8]."""
+    return add(p_WB, rotate(q_WB, add(p_BC, rotate(q_BC, point_C))))
+
+
+def image_line(o_C: Vector, l_C: Vector, fx: float = 1.0, fy: float = 1.0) -> tuple[Vector, Vector]:
+    """Pluecker coordinates n_I = K_L (o_C x l_C) and l_I = K_P l_C of a line in the image. [P:IV-D]"""
+    n_C = cross(o_C, l_C)
+    return (fy * n_C[0], fx * n_C[1], fx * fy * n_C[2]), (fx * l_C[0], fy * l_C[1], l_C[2])
+
+
+def reprojection_error(n_I: Vector) -> Scalar:
+    """r_e: signed distance of the line from the image centre, in units of the focal length (fx = 1) or pixels. [P:eq9]
+
+    It vanishes also where the camera looks along the line or the line lies behind; never use it alone.
+    """
+    return n_I[2] / function("sqrt", n_I[0] * n_I[0] + n_I[1] * n_I[1])
+
+
+def centre_points(n_I: Vector, l_I: Vector) -> tuple[Vector, Vector]:
+    """p2D, towards the line's point nearest to the image centre, and d3D, its point nearest to the camera. [P:eq10]"""
+    p2D = (-n_I[0] * n_I[2], -n_I[1] * n_I[2], n_I[0] * n_I[0] + n_I[1] * n_I[1])  # n x (e_z x n)
+    return p2D, cross(l_I, n_I)
+
+
+def centred_point(n_I: Vector, l_I: Vector) -> Vector:
+    """p3D: the point of the line whose image is nearest to the image centre, in the 3-d image frame. [P:eq11]"""
+    p2D, d3D = centre_points(n_I, l_I)
+    return tuple(value / d3D[2] for value in p2D)
+
+
+def cheirality(n_I: Vector, l_I: Vector) -> Scalar:
+    """h_lc: positive where the line passes in front of the camera. [P:eq12]"""
+    return centre_points(n_I, l_I)[1][2]
+
+
+def segment_visibility(n_I: Vector, l_I: Vector, e1_I: Vector, e2_I: Vector) -> Scalar:
+    """h_sv: positive where the centred point lies between the segment's ends. [P:eq13]
+
+    Args:
+        n_I, l_I: the line, from `image_line`.
+        e1_I, e2_I: the segment's ends in the 3-d image frame, K_P e_C.
+    """
+    p3D = centred_point(n_I, l_I)
+    return -dot(subtract(p3D, e1_I), subtract(p3D, e2_I))
+
+
+def segment_ends(o_C: Vector, l_C: Vector, half_length: Scalar, fx: float = 1.0, fy: float = 1.0) -> tuple[Vector, Vector]:
+    """Ends of a segment in the 3-d image frame, K_P (o_C -+ half_length l_C). [P:eq13]"""
+    reach = scale(half_length, l_C)
+    first, second = subtract(o_C, reach), add(o_C, reach)
+    return (fx * first[0], fy * first[1], first[2]), (fx * second[0], fy * second[1], second[2])

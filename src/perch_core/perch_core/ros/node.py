@@ -1,0 +1,95 @@
+"""The base of every node and its main loop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from typing import Any, Callable, Generic, TypeVar
+
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")  # one core per node; must be set before numpy is imported
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+from perch_core.errors import ConfigError
+from perch_core.ros import qos
+from perch_core.ros.conversions import to_stamp
+from perch_core.ros.parameters import Parameters
+
+T = TypeVar("T")
+
+
+class PerchNode(Node, Generic[T]):
+    """A node with typed parameters and diagnostics.
+
+    Subclasses are created by their module's `create(**kwargs)`, where `kwargs` go to `rclpy.node.Node`
+    (`cli_args`, `parameter_overrides`, `namespace`, `context`): so the same class runs alone and composed.
+    """
+
+    def __init__(self, name: str, parameters: type[T], on_change: Callable[[T], None] | None = None,
+                 **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        try:
+            self._parameters_of_node = Parameters(self, parameters, on_change)
+        except ConfigError:
+            self.destroy_node()
+            raise
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.STATUS)
+
+    @property
+    def params(self) -> T:
+        """The present parameters."""
+        return self._parameters_of_node.value
+
+    def publish_diagnostics(self, time: float, values: dict[str, Any], level: int = 0, message: str = "ok") -> None:
+        """Publish one status of this node on /diagnostics.
+
+        Args:
+            time: simulation time [s].
+            values: what to show; numbers are written with six digits.
+            level: 0 ok, 1 warning, 2 error.
+            message: one line for people.
+        """
+        status = DiagnosticStatus(level=bytes([level]), name=self.get_fully_qualified_name(), message=message,
+                                  hardware_id="perch")
+        status.values = [KeyValue(key=key, value=f"{v:.6g}" if isinstance(v, float) else str(v))
+                         for key, v in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = to_stamp(float(time))
+        self._diagnostics.publish(array)
+
+
+def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> None:
+    """Run one node until SIGINT or SIGTERM; exits the process with 0, or 2 when the caller's parameters are refused."""
+    try:
+        rclpy.init(args=args)
+    except Exception as error:  # rclpy raises its own type for a params file that is not YAML
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    signal.signal(signal.SIGTERM, lambda *_: rclpy.try_shutdown())
+    try:
+        node = create()
+    except (ConfigError, rclpy.exceptions.InvalidParameterValueException) as error:
+        print(f"error: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        sys.exit(2)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    try:
+        # EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6; spin_once does.
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0.5)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        close = getattr(node, "close", None)
+        if close is not None:
+            close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    sys.exit(0)

@@ -1,0 +1,204 @@
+"""Trajectories that a controller follows: polynomials in the flat outputs, and sampled full states.
+
+Times are seconds since the start of the trajectory; `start_time` is the stamp of that start on the caller's clock.
+Times outside [0, duration] are clamped: the first or last sample holds, with all its derivatives.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perch_core import bernstein, so3
+
+_DERIVATIVES = 4  # a sample carries position up to snap
+
+
+@dataclass(frozen=True, slots=True)
+class FlatSample:
+    """Flat outputs at one time, or at n times (leading axis n).
+
+    Attributes:
+        p: position in W [m], shape (3,).
+        v: velocity [m/s].
+        a: acceleration, gravity not included [m/s^2].
+        j: jerk [m/s^3].
+        s: snap [m/s^4].
+        yaw: heading, b2_des = (-sin yaw, cos yaw, 0) [rad].
+        yaw_rate: [rad/s].
+        yaw_acc: [rad/s^2].
+    """
+
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    j: np.ndarray
+    s: np.ndarray
+    yaw: float
+    yaw_rate: float
+    yaw_acc: float
+
+
+@dataclass(frozen=True)
+class FlatTrajectory:
+    """Piecewise polynomial in the flat outputs x, y, z, yaw. [M:eq3, M:eq17]
+
+    Attributes:
+        durations: segment durations [s], shape (n,).
+        coefficients: Bernstein coefficients on each segment's own [0, 1], shape (n, 4, degree + 1) [m, rad].
+        start_time: stamp of the start on the caller's clock [s].
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, or durations that are not positive.
+    """
+
+    durations: np.ndarray
+    coefficients: np.ndarray
+    start_time: float = 0.0
+    _edges: list[float] = field(init=False, repr=False, compare=False)
+    _tables: np.ndarray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        durations = np.array(self.durations, float)
+        coefficients = np.array(self.coefficients, float)
+        if durations.ndim != 1 or not len(durations) or coefficients.shape[:2] != (len(durations), 4) or coefficients.ndim != 3:
+            raise ValueError(f"durations {durations.shape} and coefficients {coefficients.shape}: need (n,) and (n, 4, degree + 1)")
+        if not (np.isfinite(coefficients).all() and np.isfinite(durations).all() and (durations > 0.0).all()):
+            raise ValueError("coefficients must be finite and durations finite and > 0 s")
+        degree = coefficients.shape[-1] - 1
+        # All derivatives in the basis of one degree: a sample is then one basis and one matrix product.
+        tables = np.empty((len(durations), _DERIVATIVES + 1, 4, degree + 1))
+        for order in range(_DERIVATIVES + 1):
+            raised = bernstein.elevate(bernstein.derivative(coefficients, order), degree)
+            tables[:, order] = raised / durations[:, None, None] ** order
+        for name, value in (("durations", durations), ("coefficients", coefficients), ("_tables", tables)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "_edges", [0.0, *np.cumsum(durations).tolist()])
+
+    @property
+    def duration(self) -> float:
+        """Duration of the whole trajectory [s]."""
+        return self._edges[-1]
+
+    @property
+    def degree(self) -> int:
+        """Polynomial degree of the segments."""
+        return self.coefficients.shape[-1] - 1
+
+    def locate(self, t: float) -> tuple[int, float]:
+        """Segment index and local argument s in [0, 1] of a time [s]; the later segment at a joint."""
+        index = min(max(bisect_right(self._edges, t) - 1, 0), len(self.durations) - 1)
+        s = (t - self._edges[index]) / self.durations[index]
+        return index, min(max(float(s), 0.0), 1.0)
+
+    def sample(self, t: float) -> FlatSample:
+        """Flat outputs with their derivatives at one time [s]; about 8 us."""
+        index, s = self.locate(t)
+        values = self._tables[index] @ bernstein.basis(self.degree, s)
+        yaw = values[:, 3].tolist()
+        return FlatSample(values[0, :3], values[1, :3], values[2, :3], values[3, :3], values[4, :3], *yaw[:3])
+
+    def sample_many(self, times: np.ndarray) -> FlatSample:
+        """Flat outputs at many times [s], shape (k,): every field gets the leading axis k."""
+        places = [self.locate(float(t)) for t in times]
+        rows = bernstein.basis(self.degree, [s for _, s in places])
+        values = np.einsum("koda,ka->kod", self._tables[[i for i, _ in places]], rows)
+        return FlatSample(*(values[:, order, :3] for order in range(5)), *(values[:, order, 3] for order in range(3)))
+
+    def derivative(self, t: float, order: int) -> np.ndarray:
+        """Derivative of any order of (x, y, z, yaw) at a time, shape (4,)."""
+        index, s = self.locate(t)
+        local = bernstein.derivative(self.coefficients[index], order)
+        return bernstein.evaluate(local, s) / self.durations[index] ** order
+
+
+@dataclass(frozen=True, slots=True)
+class StateSample:
+    """Full state at one time; fields as in `SampledTrajectory` without the leading axis."""
+
+    p: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    w: np.ndarray
+    a: np.ndarray
+    dw: np.ndarray
+    rotor_thrust: np.ndarray
+
+
+@dataclass(frozen=True)
+class SampledTrajectory:
+    """Full states at increasing times.
+
+    Attributes:
+        times: times since the start [s], shape (n,), increasing from 0.
+        p: positions p_WB [m], shape (n, 3).
+        q: attitudes q_WB, xyzw, shape (n, 4).
+        v: velocities in W [m/s], shape (n, 3).
+        w: angular velocities in B [rad/s], shape (n, 3).
+        a: accelerations in W, gravity not included [m/s^2], shape (n, 3).
+        dw: angular accelerations in B [rad/s^2], shape (n, 3).
+        rotor_thrust: [N], shape (n, 4).
+        start_time: stamp of the start on the caller's clock [s].
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, or times that do not increase.
+    """
+
+    times: np.ndarray
+    p: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    w: np.ndarray
+    a: np.ndarray
+    dw: np.ndarray
+    rotor_thrust: np.ndarray
+    start_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        widths = {"p": 3, "q": 4, "v": 3, "w": 3, "a": 3, "dw": 3, "rotor_thrust": 4}
+        times = np.array(self.times, float)
+        if times.ndim != 1 or len(times) < 2 or not (np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
+            raise ValueError("times must be at least two, finite and increasing")
+        object.__setattr__(self, "times", times)
+        for name, width in widths.items():
+            value = np.array(getattr(self, name), float)
+            if value.shape != (len(times), width) or not np.isfinite(value).all():
+                raise ValueError(f"{name}: shape {value.shape} with finite values is needed as ({len(times)}, {width})")
+            object.__setattr__(self, name, value)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the whole trajectory [s]."""
+        return float(self.times[-1])
+
+    def sample(self, t: float) -> StateSample:
+        """State at a time [s]: linear between samples, attitude along the shortest rotation."""
+        t = min(max(t, float(self.times[0])), float(self.times[-1]))
+        k = min(max(int(np.searchsorted(self.times, t, side="right")) - 1, 0), len(self.times) - 2)
+        u = float((t - self.times[k]) / (self.times[k + 1] - self.times[k]))
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return (1.0 - u) * values[k] + u * values[k + 1]
+
+        turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(self.q[k]), self.q[k + 1]))
+        q = so3.quat_multiply(self.q[k], so3.quat_exp(u * turn))
+        return StateSample(between(self.p), q, between(self.v), between(self.w), between(self.a), between(self.dw),
+                           between(self.rotor_thrust))
+
+
+def rest_to_rest(p0, p1, yaw0: float, yaw1: float, duration: float, start_time: float = 0.0) -> FlatTrajectory:
+    """Straight minimum-snap-like move between two hovers: degree 9, derivatives 1-4 vanish at both ends.
+
+    Args:
+        p0, p1: end positions in W [m], shape (3,).
+        yaw0, yaw1: end headings [rad]; the turn takes the shorter way.
+        duration: [s], > 0.
+        start_time: stamp of the start on the caller's clock [s].
+    """
+    turn = (yaw1 - yaw0 + np.pi) % (2.0 * np.pi) - np.pi
+    first, last = np.array([*p0, yaw0], float), np.array([*p1, yaw0 + turn], float)
+    coefficients = np.repeat(np.stack([first, last], axis=-1), 5, axis=-1)
+    return FlatTrajectory(np.array([duration]), coefficients[None], start_time)
