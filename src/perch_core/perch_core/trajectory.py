@@ -183,8 +183,7 @@ class SampledTrajectory:
         def between(values: np.ndarray) -> np.ndarray:
             return (1.0 - u) * values[k] + u * values[k + 1]
 
-        turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(self.q[k]), self.q[k + 1]))
-        q = so3.quat_multiply(self.q[k], so3.quat_exp(u * turn))
+        q = so3.quat_slerp(self.q[k], self.q[k + 1], u)
         return StateSample(between(self.p), q, between(self.v), between(self.w), between(self.a), between(self.dw),
                            between(self.rotor_thrust))
 
