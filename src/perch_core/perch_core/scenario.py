@@ -21,7 +21,7 @@ NODES = ("vehicle", "vio", "vio_model", "estimator", "target_localizer", "powerl
          "perching_planner", "powerline_planner", "controller", "mission", "recorder")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Start:
     """Where the vehicle stands before the flight."""
 
@@ -29,7 +29,7 @@ class Start:
     yaw_deg: float = quantity(0.0, unit="deg", low=-180.0, high=180.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Target:
     """The pad on an inclined surface."""
 
@@ -43,7 +43,7 @@ class Target:
     velocity: Vector3 = quantity((0.0, 0.0, 0.0), unit="m/s", doc="of the moving pad in map")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Cable:
     """One cable between two suspension points."""
 
@@ -54,7 +54,7 @@ class Cable:
     colour: str = choice("red", options=("red", "grey"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class World:
     """The room and what hangs in it."""
 
@@ -65,7 +65,7 @@ class World:
     cables: tuple[Cable, ...] = quantity(())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Wind:
     """Steady wind and gusts."""
 
@@ -73,7 +73,7 @@ class Wind:
     gust_sigma: float = quantity(0.0, unit="m/s", low=0.0, high=10.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """How the real vehicle differs from its file."""
 
@@ -84,7 +84,7 @@ class Disturbance:
     surface_effect: bool = quantity(False, doc="ground and wall effect near surfaces")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Adhesion:
     """When the velcro holds. Facts of the material: never changed to make a run succeed."""
 
@@ -94,7 +94,7 @@ class Adhesion:
     enabled: bool = quantity(True, doc="false: the pad never holds, to test the recovery")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Grip:
     """When the gripper holds a cable: pose and speed tolerances."""
 
@@ -104,7 +104,7 @@ class Grip:
     enabled: bool = quantity(True, doc="false: the grip fails, to test the recovery")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Latency:
     """Modelled time from a slow participant's trigger to when its result counts [s] (DESIGN: VIO 35-45 ms)."""
 
@@ -116,7 +116,7 @@ class Latency:
     powerline_planner: float = quantity(1.0, unit="s", low=0.002, high=10.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Mission:
     """The goal of the Perch action that a demo sends."""
 
@@ -129,7 +129,7 @@ class Mission:
     perception_aware: bool = quantity(False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scenario:
     """A flight that can be repeated from its file and a seed."""
 

@@ -18,7 +18,7 @@ Vector4 = tuple[float, float, float, float]
 GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CameraConfig:
     """A camera as the vehicle file describes it."""
 
@@ -49,7 +49,7 @@ class CameraConfig:
         """The camera with its place on the body."""
         common = dict(width=self.width, height=self.height, fx=self.focal[0], fy=self.focal[1],
                       cx=self.centre[0], cy=self.centre[1])
-        camera = (EquidistantCamera(**common, distortion=self.distortion) if self.model == "equidistant"
+        camera = (EquidistantCamera(**common, coefficients=self.distortion) if self.model == "equidistant"
                   else PinholeCamera(**common))
         return CameraMount(
             name=name, camera=camera, p_BC=np.array(self.position),
@@ -60,7 +60,7 @@ class CameraConfig:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImuConfig:
     """An IMU: ranges and noise, per sample at `rate`."""
 
@@ -76,7 +76,7 @@ class ImuConfig:
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Vehicle:
     """A quadrotor. Rotors in the order front-left, rear-left, rear-right, front-right unless the file says otherwise."""
 
