@@ -5,18 +5,23 @@
 _perch_root="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
 
 _perch_prepend() {  # NAME FOLDER: put FOLDER first in the path variable NAME, once
-  local rest=":${!1}:"
+  local rest=":${!1-}:"
   rest="${rest//:$2:/:}"
   rest="${rest#:}"
   rest="${rest%:}"
   export "$1=$2${rest:+:$rest}"
 }
 
-if [ ! -f "$_perch_root/install/setup.bash" ] || [ ! -f "$_perch_root/.venv/bin/activate" ]; then
+if { [ ! -f "$_perch_root/install/setup.bash" ] && [ -z "${PERCH_WITHOUT_WORKSPACE:-}" ]; } || [ ! -f "$_perch_root/.venv/bin/activate" ]; then
   echo "perch is not set up yet: run   python3 $_perch_root/scripts/setup.py   and source this file again" >&2
   unset -f _perch_prepend
   unset _perch_root
   return 1
+fi
+
+# A workspace that was built with a ROS installation needs it also where it is not sourced yet.
+if [ -z "${ROS_DISTRO:-}" ] && [ -f "$_perch_root/.perch/ros_prefix" ]; then
+  source "$(cat "$_perch_root/.perch/ros_prefix")/setup.bash"
 fi
 
 source "$_perch_root/.venv/bin/activate"
@@ -32,7 +37,9 @@ if [ -d "$_perch_root/.venv/share/rclpy" ]; then
   _perch_prepend CMAKE_PREFIX_PATH "$_perch_root/.venv"
 fi
 
-source "$_perch_root/install/setup.bash"
+if [ -z "${PERCH_WITHOUT_WORKSPACE:-}" ]; then  # set only while the workspace is being built
+  source "$_perch_root/install/setup.bash"
+fi
 
 for _perch_folder in "$_perch_root"/install/perch_*/lib/perch_*; do
   [ -d "$_perch_folder" ] && _perch_prepend PATH "$_perch_folder"

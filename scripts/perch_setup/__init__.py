@@ -1,0 +1,20 @@
+"""Turns a bare machine into one on which perch runs, and enters that environment.
+
+Only the standard library is used here, because nothing else is installed when this code first runs.
+"""
+
+from .enter import enter, leave_quietly_on_interrupt
+from .errors import SetupError
+from .layout import ROOT
+from .machine import Platform, detect_platform
+from .prepare import prepare
+
+__all__ = [
+    "ROOT",
+    "Platform",
+    "SetupError",
+    "detect_platform",
+    "enter",
+    "leave_quietly_on_interrupt",
+    "prepare",
+]

@@ -1,0 +1,49 @@
+"""Moves the running script into perch's environment."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+from .environment import variables
+from .errors import SetupError
+from .layout import ROOT, VENV, VENV_PYTHON
+from .prepare import prepare
+
+_ENTERED = "PERCH_ENTERED"
+"""Process id of the script that was started again inside. An `exec` keeps the id; children have others."""
+INTERRUPTED = 130
+
+
+def enter() -> None:
+    """Set up if necessary, then start this script again with our Python and variables.
+
+    Returns only inside the environment. Prints one line and exits where set-up cannot be done.
+    """
+    if os.environ.get(_ENTERED) == str(os.getpid()) and sys.prefix == str(VENV):
+        return
+    try:
+        environment = variables(prepare())
+    except SetupError as error:
+        sys.exit(_say(error))
+    except KeyboardInterrupt:
+        print("\nperch set-up: interrupted; the next start goes on from here", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    environment[_ENTERED] = str(os.getpid())
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(VENV_PYTHON, [str(VENV_PYTHON), *sys.argv], environment)
+
+
+def leave_quietly_on_interrupt() -> None:
+    """Let Ctrl-C end a script without a traceback, also where it is not waiting in our code."""
+    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+
+
+def _say(error: SetupError) -> int:
+    print(f"perch: {error}", file=sys.stderr)
+    return error.exit_code
+
+
+__all__ = ["INTERRUPTED", "ROOT", "enter", "leave_quietly_on_interrupt"]

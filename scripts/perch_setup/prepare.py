@@ -1,0 +1,83 @@
+"""Brings virtual environment and workspace up to date, doing only what is missing."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from . import stamps, virtualenv, workspace
+from .alone import alone
+from .layout import BUILD, INSTALL, ROOT, VENV, VENV_PYTHON
+from .machine import Platform, check_python, check_tools, detect_platform, remember
+
+
+def prepare(clean: bool = False) -> Platform:
+    """Set up whatever is not: fast where nothing is to do, and safe to interrupt and repeat.
+
+    Args:
+        clean: start from nothing.
+
+    Returns:
+        Where ROS comes from.
+
+    Raises:
+        SetupError: where the machine lacks something or a step fails.
+    """
+    wanted = detect_platform()
+    if not clean and _nothing_to_do(wanted, stamps.load()):
+        return wanted
+    check_tools()
+    with alone():
+        done = {} if clean else stamps.load()
+        if _nothing_to_do(wanted, done):
+            return wanted
+        if clean:
+            for folder in (VENV, BUILD, INSTALL):
+                shutil.rmtree(folder, ignore_errors=True)
+        _install(wanted, done)
+        _build(wanted, done)
+    return wanted
+
+
+def _install(wanted: Platform, done: dict[str, str]) -> None:
+    """Install the locked packages, unless they are."""
+    environment = stamps.environment_stamp(wanted)
+    if done.get("environment") == environment and VENV_PYTHON.exists():
+        return
+    identity = f"{wanted.ros} in {ROOT}"
+    fresh = done.get("identity", identity) != identity or not virtualenv.usable()
+    if fresh:
+        check_python(wanted)
+    done.pop("environment", None)
+    stamps.save(done)
+    virtualenv.install(wanted, fresh)
+    remember(wanted)
+    done.update(environment=environment, identity=identity)
+    stamps.save(done)
+
+
+def _build(wanted: Platform, done: dict[str, str]) -> None:
+    """Build the packages that changed, or all of them in a new environment."""
+    environment = done["environment"]
+    fresh = done.get("built_with", environment) != environment
+    current = {folder: stamps.package_stamp(folder, environment) for folder in stamps.packages()}
+    stale = [folder for folder in current if not _is_built(folder, current[folder], done)]
+    if stale:
+        workspace.build(stale, wanted, fresh)
+        done.update({folder.name: current[folder] for folder in stale}, built_with=environment)
+        stamps.save(done)
+
+
+def _nothing_to_do(wanted: Platform, done: dict[str, str]) -> bool:
+    """Whether every stamp is up to date and the folders are still there."""
+    environment = stamps.environment_stamp(wanted)
+    if done.get("environment") != environment or not VENV_PYTHON.exists():
+        return False
+    return (INSTALL / "setup.bash").exists() and all(
+        _is_built(folder, stamps.package_stamp(folder, environment), done)
+        for folder in stamps.packages()
+    )
+
+
+def _is_built(folder: Path, stamp: str, done: dict[str, str]) -> bool:
+    return done.get(folder.name) == stamp and (INSTALL / folder.name).exists()

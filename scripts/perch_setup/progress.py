@@ -1,0 +1,105 @@
+"""Shows what set-up is doing, and keeps the full output of every tool in a log file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Callable, Mapping, Optional, Sequence
+
+from .alone import held
+from .errors import FAILED, SetupError
+from .layout import STATE
+
+_TAIL = 15
+_QUIET_PERIOD_S = 10.0
+
+
+class Step:
+    """One step of the set-up, on one line of a terminal or a few lines of a log.
+
+    Args:
+        title: what is being done.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._start = time.monotonic()
+        self._shown = 0.0
+        self._terminal = sys.stderr.isatty()
+
+    def __enter__(self) -> "Step":
+        self._write("")
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        word = "done" if kind is None else "stopped"
+        self._write(f"{word} in {time.monotonic() - self._start:.0f} s", final=True)
+
+    def show(self, detail: str) -> None:
+        """Report progress; at most every ten seconds where nobody sees a terminal."""
+        now = time.monotonic()
+        if self._terminal or now - self._shown > _QUIET_PERIOD_S:
+            self._write(detail)
+
+    def run(
+        self,
+        command: Sequence[object],
+        log: str,
+        environment: Mapping[str, str],
+        describe: Callable[[str], Optional[str]] = lambda line: None,
+    ) -> None:
+        """Run a tool, log its output, show what `describe` makes of its lines.
+
+        Raises:
+            SetupError: with the last lines of its output where the tool fails.
+        """
+        file = STATE / "log" / f"{log}.log"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lines: list[str] = []
+        with file.open("w") as sink, subprocess.Popen(
+            [str(word) for word in command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            text=True,
+            errors="replace",
+            env=dict(environment),
+            pass_fds=held(),
+        ) as process:
+            try:
+                for line in process.stdout or ():
+                    sink.write(line)
+                    lines = [*lines[1 - _TAIL :], line.rstrip()]
+                    detail = describe(line)
+                    if detail:
+                        self.show(detail)
+            except KeyboardInterrupt:
+                _let_finish(process)
+                raise
+        if process.returncode:
+            raise SetupError(_failure(command, process.returncode, lines, file), FAILED)
+
+    def _write(self, detail: str, final: bool = False) -> None:
+        self._shown = time.monotonic()
+        text = f"perch set-up: {self._title}{': ' + detail if detail else ' ...'}"
+        if self._terminal:
+            sys.stderr.write(f"\r\033[K{text[:110]}" + ("\n" if final else ""))
+        else:
+            sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+
+def _let_finish(process: subprocess.Popen) -> None:
+    """After Ctrl-C, which the tool received as well: let it end, then make it end."""
+    try:
+        process.wait(timeout=5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def _failure(command: Sequence[object], code: int, lines: Sequence[str], log: Path) -> str:
+    shown = "\n".join(f"    {line}" for line in lines)
+    tool = " ".join(str(word) for word in command[:4])
+    return f"'{tool} ...' failed (exit code {code}). Its last lines:\n{shown}\nAll of them: {log}"

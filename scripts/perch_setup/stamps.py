@@ -1,0 +1,69 @@
+"""Remembers what was set up from what, so that a second start finds out quickly that all is done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Iterable
+
+from .layout import ROOT, SOURCES, STATE
+from .machine import Platform
+
+_FILE = STATE / "stamps.json"
+_BUILD_FILES = ("package.xml", "setup.py", "setup.cfg", "CMakeLists.txt")
+
+
+def environment_stamp(wanted: Platform) -> str:
+    """Changes whenever the virtual environment has to be installed anew.
+
+    The Python that runs this is not part of it: an environment keeps the one it was made with.
+    """
+    mending = Path(__file__).with_name("wheel_paths.py")
+    return _digest((*wanted.locks, mending), wanted.ros, str(ROOT))
+
+
+def package_stamp(package: Path, environment: str) -> str:
+    """Changes whenever colcon has to build a package again.
+
+    Python modules are not part of it: they are linked into the workspace, so edits are live. Of
+    configuration files, which are linked too, only the names count.
+    """
+    interfaces = (
+        file for kind in ("msg", "srv", "action") for file in sorted((package / kind).glob("*"))
+    )
+    files = [package / name for name in _BUILD_FILES] + list(interfaces)
+    linked = sorted(str(file) for file in (package / "config").glob("**/*.yaml"))
+    return _digest((file for file in files if file.exists()), environment, *linked)
+
+
+def packages() -> list[Path]:
+    """The folders of all packages in the workspace."""
+    return sorted(file.parent for file in SOURCES.glob("*/package.xml"))
+
+
+def load() -> dict[str, str]:
+    """Stamps of everything that is done; empty where nothing is, or where the file is damaged."""
+    try:
+        stamps = json.loads(_FILE.read_text())
+    except (OSError, ValueError):
+        return {}
+    return stamps if isinstance(stamps, dict) else {}
+
+
+def save(stamps: dict[str, str]) -> None:
+    """Replace all stamps at once: a reader never sees half a file."""
+    STATE.mkdir(exist_ok=True)
+    draft = _FILE.with_suffix(f".{os.getpid()}")
+    draft.write_text(json.dumps(stamps, indent=1))
+    draft.replace(_FILE)
+
+
+def _digest(files: Iterable[Path], *words: str) -> str:
+    """SHA-256 over words, and over names and contents of files."""
+    digest = hashlib.sha256("\0".join(words).encode())
+    for file in files:
+        digest.update(f"\0{file.relative_to(ROOT)}\0".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()

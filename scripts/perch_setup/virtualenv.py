@@ -1,0 +1,88 @@
+"""Makes the virtual environment `<repository>/.venv` and installs the locked packages."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+from typing import Callable, Optional
+
+from .layout import STATE, VENV, VENV_PYTHON
+from .machine import Platform
+from .progress import Step
+from .wheel_paths import mend_wheels
+
+_UNFINISHED = STATE / "installing"
+"""Exists while pip works. A killed pip leaves packages that look installed and are not."""
+_USER_SETTINGS = ("PIP_TARGET", "PIP_PREFIX", "PIP_REQUIRE_VIRTUALENV", "PYTHONHOME", "PYTHONSTARTUP")
+
+
+def install(wanted: Platform, fresh: bool) -> None:
+    """Bring the virtual environment to exactly the locked versions.
+
+    Args:
+        wanted: where ROS comes from, and the lock files.
+        fresh: start from an empty environment, as for another Python or another source of ROS.
+
+    Raises:
+        SetupError: where a tool fails.
+    """
+    environment = _environment(wanted)
+    STATE.mkdir(exist_ok=True)
+    if fresh or not usable():
+        with Step("virtual environment") as step:
+            shutil.rmtree(VENV, ignore_errors=True)
+            sight = [] if wanted.uses_wheels else ["--system-site-packages"]
+            step.run([_base_python(), "-m", "venv", *sight, VENV], "venv", environment)
+    _UNFINISHED.touch()
+    total = sum(_pins(lock.read_text()) for lock in wanted.locks)
+    with Step(f"installing {total} packages") as step:
+        arguments = [word for lock in wanted.locks for word in ("-r", str(lock))]
+        pip = [VENV_PYTHON, "-m", "pip", "install", "--progress-bar", "off", "--no-input"]
+        quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
+        step.run([*pip, *quiet, *arguments], "pip", environment, _narrator(total))
+        if wanted.uses_wheels:
+            mend_wheels(VENV)
+    _UNFINISHED.unlink()
+
+
+def usable() -> bool:
+    """Whether there is an environment that pip can go on from."""
+    return VENV_PYTHON.exists() and not _UNFINISHED.exists()
+
+
+def _base_python() -> str:
+    """The Python outside of any virtual environment: ours may be about to be removed."""
+    return getattr(sys, "_base_executable", "") or sys.executable
+
+
+def _environment(wanted: Platform) -> dict[str, str]:
+    """The caller's environment without what would lead pip astray."""
+    environment = {key: value for key, value in os.environ.items() if key not in _USER_SETTINGS}
+    environment.update(PIP_USER="0", PYTHONNOUSERSITE="1")
+    if wanted.uses_wheels:
+        environment.pop("PYTHONPATH", None)
+        environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    return environment
+
+
+def _pins(lock: str) -> int:
+    """Number of packages that a lock file names."""
+    return len(re.findall(r"^[a-zA-Z0-9]", lock, re.MULTILINE))
+
+
+def _narrator(total: int) -> Callable[[str], Optional[str]]:
+    """Turns pip's lines into a count."""
+    count = 0
+
+    def describe(line: str) -> Optional[str]:
+        nonlocal count
+        if line.startswith(("Collecting ", "Requirement already satisfied")):
+            count += 1
+            return f"{min(count, total)}/{total}"
+        if line.startswith("Installing collected"):
+            return "unpacking"
+        return None
+
+    return describe

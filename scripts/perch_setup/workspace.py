@@ -1,0 +1,82 @@
+"""Builds the colcon workspace into `<repository>/install`."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Callable, Iterable, Optional
+
+from .environment import variables
+from .errors import SetupError
+from .layout import BUILD, INSTALL, ROOT, SOURCES, STATE, VENV, VENV_PYTHON
+from .machine import Platform
+from .progress import Step
+
+_UNFINISHED = STATE / "building"
+"""Names the packages that are being built. After a kill, those start from an empty folder."""
+_COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
+"""Started through our Python, so that the executables it writes run in our Python too."""
+
+
+def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
+    """Build packages with links to their sources, so that edits of Python files are live.
+
+    Args:
+        selected: folders of the packages to build.
+        wanted: where ROS comes from.
+        fresh: throw away everything that was built before.
+
+    Raises:
+        SetupError: with the last lines of the compiler where a package does not build.
+    """
+    names = sorted(folder.name for folder in selected)
+    doubtful = _UNFINISHED.read_text().split() if _UNFINISHED.exists() else []
+    for name in doubtful:
+        shutil.rmtree(BUILD / name, ignore_errors=True)
+        shutil.rmtree(INSTALL / name, ignore_errors=True)
+    if fresh:
+        shutil.rmtree(BUILD, ignore_errors=True)
+        shutil.rmtree(INSTALL, ignore_errors=True)
+    _UNFINISHED.write_text("\n".join(names))
+    with Step(f"building {len(names)} package{'s' * (len(names) != 1)}") as step:
+        command = [
+            *(VENV_PYTHON, "-c", _COLCON, "--log-base", STATE / "log" / "colcon", "build"),
+            *("--base-paths", SOURCES, "--build-base", BUILD, "--install-base", INSTALL),
+            *("--symlink-install", "--event-handlers", "console_direct+", "desktop_notification-"),
+            *("--packages-select", *names),
+            *("--cmake-args", "-DCMAKE_BUILD_TYPE=Release", "--no-warn-unused-cli"),
+        ]
+        try:
+            step.run(command, "build", _environment(wanted), _narrator())
+        except SetupError:  # the compiler refused something; what it built is sound
+            _UNFINISHED.unlink()
+            raise
+    _UNFINISHED.unlink()
+
+
+def _environment(wanted: Platform) -> dict[str, str]:
+    """What colcon, CMake and the generators need around them."""
+    environment = variables(wanted, dict(os.environ), with_workspace=False)
+    environment["PYTHONNOUSERSITE"] = "1"
+    environment["PWD"] = str(ROOT)
+    # CMake asks for `python3` in several ways; all of them end at ours.
+    environment["VIRTUAL_ENV"] = str(VENV)
+    return environment
+
+
+def _narrator() -> Callable[[str], Optional[str]]:
+    """Turns colcon's lines into the name of the package at work, and make's percentage."""
+    package = ""
+
+    def describe(line: str) -> Optional[str]:
+        nonlocal package
+        started = re.match(r"Starting >>> (\S+)", line)
+        percentage = re.match(r"\[ *(\d+)%\]", line)
+        if started:
+            package = started.group(1)
+            return package
+        return f"perch_msgs {percentage.group(1)} %" if percentage else None
+
+    return describe

@@ -1,0 +1,42 @@
+#!/usr/bin/env python3
+"""Set perch up: virtual environment, locked packages, colcon workspace.
+
+Every other script here does this by itself when it has to; this one does nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from perch_setup import ROOT, SetupError, prepare
+
+EXAMPLES = """examples:
+  python3 scripts/setup.py            set up what is missing or out of date
+  python3 scripts/setup.py --clean    start from nothing
+  source setup.bash                   afterwards: a shell in which perch works
+"""
+
+
+def main() -> int:
+    """Set up and say how to go on."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--clean", action="store_true", help="remove .venv, build and install first")
+    arguments = parser.parse_args()
+    try:
+        platform = prepare(clean=arguments.clean)
+    except SetupError as error:
+        print(f"perch: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("\nperch set-up: interrupted; the next start goes on from here", file=sys.stderr)
+        return 130
+    source = "the ROS wheels of PyPI" if platform.uses_wheels else "the ROS installation"
+    print(f"perch is set up with {source}. A shell in which it works:  source {ROOT / 'setup.bash'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
