@@ -1,0 +1,69 @@
+#!/usr/bin/env python3
+"""Measure the speed bars of perch and say whether they hold on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+from perch_setup import ROOT, enter, leave_quietly_on_interrupt
+
+GROUPS = ("planner", "perception", "control", "powerline", "sim", "ros")
+EXAMPLES = """examples:
+  python3 scripts/bench.py                          every group
+  python3 scripts/bench.py planner                  one group
+  python3 scripts/bench.py planner --json out.json  and the figures as JSON
+  python3 scripts/bench.py planner --quick          fewer repetitions, for a first look
+
+exit code: 0 every bar holds, 1 a bar does not hold or a group could not be measured, 2 wrong arguments"""
+
+
+def group_figures(group: str, quick: bool) -> list:
+    """Load bench/<group>.py and measure it."""
+    path = ROOT / "bench" / f"{group}.py"
+    spec = importlib.util.spec_from_file_location(f"bench_{group}", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module.figures(quick)
+
+
+def main() -> int:
+    """Run the groups, print their tables, write the JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("group", nargs="?", choices=GROUPS, metavar="GROUP", help=", ".join(GROUPS) + "; all when left out")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures to FILE")
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions: the figures are rougher")
+    arguments = parser.parse_args()
+    if arguments.json and not arguments.json.resolve().parent.is_dir():
+        parser.error(f"--json {arguments.json}: its folder does not exist")
+    enter()
+    leave_quietly_on_interrupt()
+    sys.path.insert(0, str(ROOT / "bench"))
+    import harness
+
+    groups = [arguments.group] if arguments.group else [g for g in GROUPS if (ROOT / "bench" / f"{g}.py").is_file()]
+    results, failed = {}, False
+    for group in groups:
+        if not (ROOT / "bench" / f"{group}.py").is_file():
+            print(f"error: bench/{group}.py: no such group here", file=sys.stderr)
+            return 2
+        print(f"== {group}", flush=True)
+        try:
+            results[group] = group_figures(group, arguments.quick)
+        except Exception as error:  # a group that breaks must not hide the figures of the others
+            print(f"error: {group}: {type(error).__name__}: {error}", file=sys.stderr)
+            failed = True
+            continue
+        print(harness.table(results[group]), flush=True)
+        failed |= any(item.holds is False for item in results[group])
+    if arguments.json:
+        arguments.json.write_text(json.dumps(harness.as_json(results), indent=1) + "\n")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

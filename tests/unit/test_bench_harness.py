@@ -1,0 +1,43 @@
+"""The bench harness judges bars by the statistic they name."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
+import harness  # noqa: E402
+
+
+def test_bars_are_judged_by_their_statistic():
+    samples = [1.0] * 99 + [50.0]
+    assert harness.figure("a", "ms", samples, bar=2.0).holds is True
+    assert harness.figure("a", "ms", samples, bar=2.0, comparison="max <=").holds is False
+    assert harness.figure("a", "", [60.0], bar=50.0, comparison="median >=").holds is True
+    assert harness.figure("a", "", [0.0, 0.0], bar=0.0, comparison="max ==").holds is True
+    assert harness.figure("a", "", [float("nan")], bar=1.0).holds is False
+    assert harness.figure("a", "ms", samples).holds is None
+
+
+def test_malformed_figures_are_refused():
+    with pytest.raises(ValueError, match="no samples"):
+        harness.figure("a", "ms", [])
+    with pytest.raises(ValueError, match="comparison"):
+        harness.figure("a", "ms", [1.0], bar=1.0, comparison="mean <")
+
+
+def test_measure_counts_only_after_the_warm_up():
+    calls = []
+    times = harness.measure(lambda: calls.append(None), repetitions=7, warm_up=2)
+    assert len(calls) == 9 and times.shape == (7,) and (times >= 0.0).all()
+
+
+def test_json_and_table_name_every_figure():
+    items = [harness.figure("plan", "ms", [0.3], bar=0.5), harness.figure("import", "s", [1.0])]
+    written = harness.as_json({"planner": items})
+    assert written["machine"]["cores"] >= 1
+    assert [f["name"] for f in written["figures"]] == ["plan", "import"]
+    assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written["figures"][0])
+    assert "holds" in harness.table(items) and "import" in harness.table(items)
