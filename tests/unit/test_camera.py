@@ -28,7 +28,7 @@ def points_in_front(n: int, max_angle: float, seed: int = 0) -> np.ndarray:
 def test_equidistant_projection_is_opencv_fisheye():
     points = points_in_front(500, 1.5)
     expected, _ = cv2.fisheye.projectPoints(points[:, None, :], np.zeros(3), np.zeros(3), SNAPDRAGON.K,
-                                            np.array(SNAPDRAGON.distortion))
+                                            SNAPDRAGON.distortion)
     pixels, valid = SNAPDRAGON.project(points)
     assert valid.all()
     np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-8)
@@ -36,7 +36,7 @@ def test_equidistant_projection_is_opencv_fisheye():
 
 def test_pinhole_projection_is_opencv_project_points():
     points = points_in_front(500, 1.2)
-    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), PINHOLE.K, np.array(PINHOLE.distortion))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), PINHOLE.K, PINHOLE.distortion)
     np.testing.assert_allclose(PINHOLE.project(points)[0], expected[:, 0], atol=1e-8)
 
 
@@ -82,7 +82,7 @@ def test_points_behind_the_camera_are_never_projected(camera):
 
 
 def test_wide_lens_stops_before_its_polynomial_turns_over():
-    lens = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, SNAPDRAGON.distortion, angle_limit=math.pi)
+    lens = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, SNAPDRAGON.coefficients, angle_limit=math.pi)
     theta = np.linspace(0.0, math.pi, 100_001)
     turning = theta[np.argmax(np.diff(lens.radius(theta)) < 0)]
     assert math.pi / 2 < lens.max_angle < turning
@@ -146,5 +146,5 @@ def test_impossible_mounts_are_refused(change, key):
 def test_impossible_cameras_are_refused():
     with pytest.raises(ConfigError, match="fx"):
         PinholeCamera(640, 480, -1.0, 600.0, 320.0, 240.0)
-    with pytest.raises(ConfigError, match="distortion"):
+    with pytest.raises(ConfigError, match="coefficients"):
         EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.1, 0.2, math.nan, 0.0))

@@ -64,7 +64,7 @@ class PinholeCamera(_Camera):
 
     near: float = 1e-3
     model = "plumb_bob"  # the name in sensor_msgs/CameraInfo
-    distortion = (0.0,) * 5
+    distortion = np.zeros(5)
 
     @property
     def max_angle(self) -> float:
@@ -113,27 +113,31 @@ class EquidistantCamera(_Camera):
     Attributes:
         width, height: image size [px].
         fx, fy, cx, cy: focal lengths and principal point [px].
-        distortion: k1..k4.
+        coefficients: k1..k4.
         angle_limit: largest angle from the optical axis that the lens sees [rad]; the turning point of the
             polynomial limits it further.
     """
 
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    coefficients: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     angle_limit: float = math.pi / 2
     model = "equidistant"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
-        if len(self.distortion) != 4 or not np.all(np.isfinite(self.distortion)):
-            raise ConfigError("EquidistantCamera", "distortion", f"{self.distortion!r} are not four numbers")
+        if len(self.coefficients) != 4 or not np.all(np.isfinite(self.coefficients)):
+            raise ConfigError("EquidistantCamera", "coefficients", f"{self.coefficients!r} are not four numbers")
         if not 0 < self.angle_limit <= math.pi:
             raise ConfigError("EquidistantCamera", "angle_limit", f"{self.angle_limit!r} is outside (0, pi] rad")
 
     @cached_property
+    def distortion(self) -> np.ndarray:
+        """k1..k4, shape (4,)."""
+        return np.array(self.coefficients, dtype=float)
+
+    @cached_property
     def max_angle(self) -> float:
         """Largest angle from the optical axis at which a point is projected [rad]."""
-        k1, k2, k3, k4 = self.distortion
+        k1, k2, k3, k4 = self.coefficients
         slope = np.polynomial.Polynomial([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])  # d theta_d / d theta in theta^2
         roots = slope.roots()
         turning = [math.sqrt(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0]
@@ -142,13 +146,13 @@ class EquidistantCamera(_Camera):
 
     def radius(self, theta: np.ndarray) -> np.ndarray:
         """theta_d, the radius in the normalised image plane of rays at the angle theta [rad]."""
-        k1, k2, k3, k4 = self.distortion
+        k1, k2, k3, k4 = self.coefficients
         t = theta * theta
         return theta * (1.0 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
 
     def radius_slope(self, theta: np.ndarray) -> np.ndarray:
         """d theta_d / d theta."""
-        k1, k2, k3, k4 = self.distortion
+        k1, k2, k3, k4 = self.coefficients
         t = theta * theta
         return 1.0 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
 
