@@ -193,5 +193,8 @@ class Participant:
         if self._on_step is not None:
             self._on_step(step)
         for chain in self._chains:
+            msg = chain.inbox.pop(stamp, None)
+            for key in [key for key in chain.inbox if key < stamp]:
+                del chain.inbox[key]  # between the steps that this node asks for
             if step.index % chain.period == 0:
-                chain.callback(chain.inbox.pop(stamp))
+                chain.callback(msg)

@@ -1,0 +1,73 @@
+"""Does the vehicle stick? Told from the IMU and the estimated state alone."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.config import quantity
+from perch_core.vehicle import GRAVITY
+from perch_control.mission.values import State, Target
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdhesionLimits:
+    """Limits of the adhesion test."""
+
+    window: float = quantity(0.06, unit="s", above=0.0, high=1.0, doc="time over which the specific force is averaged")
+    unbalanced: float = quantity(3.0, unit="m/s^2", above=0.0, high=20.0,
+                                 doc="largest difference between the mean specific force and gravity of a body at rest")
+    speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0)
+    tilt_deg: float = quantity(25.0, unit="deg", above=0.0, high=90.0, doc="between b3 and the surface normal")
+    distance: float = quantity(0.25, unit="m", above=0.0, high=2.0, doc="from the localised pad's centre")
+
+
+class AdhesionMonitor:
+    """Compares the measured specific force with that of a body at rest.
+
+    In flight the only large force is the thrust, along b3: at a perch attitude it cannot carry the weight, so that the
+    mean specific force differs from `R_WB^T g e3` by the vehicle's acceleration (at 90 degrees: 9.8 m/s^2 of fall).
+    A vehicle that sticks is carried by the surface: the specific force is `R_WB^T g e3` whatever the motors do.
+    """
+
+    def __init__(self, limits: AdhesionLimits, imu_rate: float = 500.0) -> None:
+        self._limits = limits
+        self._samples: deque[np.ndarray] = deque(maxlen=max(3, round(limits.window * imu_rate)))
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._samples.clear()
+
+    def add(self, specific_force_B: np.ndarray) -> None:
+        """Take IMU samples in, shape (n, 3) [m/s^2]."""
+        self._samples.extend(np.asarray(specific_force_B, float).reshape(-1, 3))
+
+    @property
+    def filled(self) -> bool:
+        """The window is full."""
+        return len(self._samples) == self._samples.maxlen
+
+    def imbalance(self, q_WB: np.ndarray) -> float:
+        """Size of the mean acceleration that the IMU implies at this attitude [m/s^2]."""
+        g_B = so3.quat_rotate(so3.quat_conjugate(q_WB), np.array([0.0, 0.0, GRAVITY]))
+        return float(np.linalg.norm(np.mean(self._samples, axis=0) - g_B))
+
+    def free_fall(self) -> bool:
+        """Nothing carries the vehicle: with motors off, it has come off."""
+        return self.filled and float(np.linalg.norm(np.mean(self._samples, axis=0))) < 0.4 * GRAVITY
+
+    def attached(self, state: State, target: Target) -> bool:
+        """The vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""
+        if not self.filled:
+            return False
+        limits = self._limits
+        b3 = so3.quat_rotate(state.q_WB, np.array([0.0, 0.0, 1.0]))
+        s3 = so3.quat_rotate(target.q_WS, np.array([0.0, 0.0, 1.0]))
+        return bool(
+            np.linalg.norm(state.p_WB - target.p_WS) < limits.distance
+            and so3.angle_between(b3, s3) < np.radians(limits.tilt_deg)
+            and np.linalg.norm(state.v_WB) < limits.speed
+            and self.imbalance(state.q_WB) < limits.unbalanced)

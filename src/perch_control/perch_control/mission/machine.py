@@ -1,0 +1,320 @@
+"""The mission's state machine: one method per phase, called once per tick."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_control.mission.adhesion import AdhesionMonitor
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import (
+    Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
+
+_FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
+
+
+class MissionMachine:
+    """Find the target, plan, fly, perch, verify; recover when it fails. [M:II, Fig. 2]
+
+    `tick` maps what is known to what shall be done. Every phase ends in another phase, in an outcome, or by its own
+    time limit, so that a goal always ends; a cancelled or failed goal ends in a hover, or on the ground.
+    """
+
+    def __init__(self, settings: MissionSettings) -> None:
+        self.settings = settings
+        self.phase = Phase.IDLE
+        self.message = ""
+        self.target: Target | None = None
+        self.time_to_contact = float("nan")
+        self._adhesion = AdhesionMonitor(settings.adhesion)
+        self._goal: Goal | None = None
+        self._next_id = 1
+        self._home: tuple[np.ndarray, float] | None = None   # where the vehicle stood when it was armed
+        self._hover: tuple[np.ndarray, float] | None = None  # where the last move of the mission's own ends
+        self._asked_target: Target | None = None             # the target of the newest plan query
+        self._replanned_at = -math.inf
+
+    # -- interface ---------------------------------------------------------------------------------------------------
+
+    def start(self, goal: Goal, time: float) -> None:
+        """Take a goal; the machine must be idle."""
+        self._goal, self._attempts_left = goal, goal.attempts
+        self.target, self._failure, self._hover = None, None, None
+        self._perch: PlanAnswer | None = None
+        self._perch_id = 0
+        self._contact_time = float("nan")
+        self._cancelled = False
+        self._enter(Phase.ARMING, time, "waiting for the estimator")
+
+    def tick(self, inputs: Inputs) -> Outputs:
+        """Advance by one tick."""
+        outputs = Outputs()
+        self._adhesion.add(inputs.specific_force_B)
+        self.time_to_contact = float("nan")
+        if self.phase is Phase.IDLE:
+            return outputs
+        if inputs.cancel and not self._cancelled:
+            self._cancel(inputs, outputs)
+        elif inputs.controller is ControllerState.FAILED and self.phase is not Phase.PERCHED:
+            self._end(outputs, Result.TRACKING_LOST, f"controller gave up: {inputs.controller_message}")
+        else:
+            getattr(self, f"_{self.phase.value}")(inputs, outputs)
+        return outputs
+
+    @property
+    def progress(self) -> float:
+        """Share of the mission's phases that lie behind, 0 to 1."""
+        order = [Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING, Phase.VERIFYING, Phase.PERCHED]
+        return order.index(self.phase) / (len(order) - 1) if self.phase in order else 0.0
+
+    # -- phases ------------------------------------------------------------------------------------------------------
+
+    def _arming(self, inputs: Inputs, outputs: Outputs) -> None:
+        if inputs.controller in _FLYING:
+            self._hover = self._hold_point(inputs.state)
+            self._enter(Phase.TAKE_OFF, inputs.time, "already flying: going to the search place")
+            self._go(inputs, outputs, *self._search_place(inputs.state))
+        elif inputs.controller is ControllerState.ARMED:
+            self._hover = self._hold_point(inputs.state)
+            self._enter(Phase.TAKE_OFF, inputs.time, "taking off")
+            self._go(inputs, outputs, *self._search_place(inputs.state))
+        elif self._elapsed(inputs) > self.settings.arming_timeout:
+            outputs.commands.append((Command.DISARM, "arming took too long"))
+            why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
+            self._end(outputs, Result.TIMEOUT, f"not armed within {self.settings.arming_timeout:g} s: {why}")
+        elif inputs.estimator_ready and not self._asked:
+            outputs.commands.append((Command.ARM, "goal accepted"))
+            self._asked, self.message = True, "arming"
+
+    def _take_off(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._lost(inputs, outputs):
+            return
+        if self._arrived(inputs):
+            self._pattern = self._search_pattern()
+            self._enter(Phase.SEARCHING, inputs.time, "looking for the target")
+
+    def _searching(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._lost(inputs, outputs):
+            return
+        target = inputs.target
+        usable, why = self._usable(target)
+        if usable:
+            if self._seen_since is None:
+                self._seen_since = inputs.time
+                self.message = "target in view"
+            if inputs.time - self._seen_since >= self.settings.target_settle and self._arrived(inputs):
+                self._ask_plan(inputs, outputs, target)
+            return
+        if self._elapsed(inputs) > self._goal.search_timeout:
+            self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
+            return
+        if self._arrived(inputs) and inputs.time - self._moved_at > self._travel + self.settings.search_dwell:
+            rise, turn = self._pattern[self._place % len(self._pattern)]
+            self._place += 1
+            p, yaw = self._search_place(inputs.state)
+            self._go(inputs, outputs, p + np.array([0.0, 0.0, rise]), yaw + turn)
+            self.message = f"looking for the target ({why})"
+
+    def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._lost(inputs, outputs):
+            return
+        if inputs.plan is None:
+            return
+        if not inputs.plan.success:
+            self._end(outputs, Result.REFUSED, f"planner refused: {inputs.plan.message}")
+            return
+        self._fly(inputs.plan, outputs)
+        self._enter(Phase.TRACKING, inputs.time, f"perching, {inputs.plan.duration:.2f} s")
+
+    def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
+        end = self._perch.start_time + self._perch.duration
+        self.time_to_contact = end - inputs.time
+        if inputs.trajectory_id == self._perch_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
+            self._missed(inputs, f"perch given up: {inputs.controller_message}")
+            return
+        if self._goal.replan:
+            self._replan(inputs, outputs, end)
+        if inputs.time > end - self.settings.contact_early:
+            self._adhesion.reset()
+            self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
+
+    def _verifying(self, inputs: Inputs, outputs: Outputs) -> None:
+        end = self._perch.start_time + self._perch.duration
+        self.time_to_contact = end - inputs.time
+        if self._adhesion.attached(inputs.state, self.target):
+            self._contact_time = inputs.time
+            self._adhesion.reset()
+            outputs.commands.append((Command.ATTACHED, "the surface carries the vehicle"))
+            self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
+        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
+            self._missed(inputs, f"no adhesion: {inputs.controller_message}")
+        elif inputs.time > end + self.settings.contact_time + 0.2:
+            outputs.commands.append((Command.HOVER, "no adhesion"))
+            self._missed(inputs, "no adhesion")
+
+    def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._adhesion.free_fall():
+            outputs.commands.append((Command.ARM, "came off the surface"))
+            outputs.commands.append((Command.HOVER, "came off the surface"))
+            self._missed(inputs, "came off the surface after the motors stopped")
+        elif self._elapsed(inputs) > self.settings.rest_time:
+            self._end(outputs, Result.PERCHED, "perched", contact_time=self._contact_time)
+
+    def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
+        resting = inputs.controller is ControllerState.HOVERING and self._slow(inputs.state)
+        if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
+            self._end(outputs, Result.CANCELLED if self._cancelled else Result.CRASHED, f"{self._failure}; on the ground or descending")
+        elif self._elapsed(inputs) > self.settings.phase_timeout:
+            outputs.commands.append((Command.LAND, "recovery took too long"))
+            self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; no hover within {self.settings.phase_timeout:g} s, landing")
+        elif resting and self._elapsed(inputs) > self.settings.settle_time:
+            self._attempts_left -= 1
+            if self._cancelled:
+                self._end(outputs, Result.CANCELLED, "cancelled; hovering")
+            elif self._attempts_left > 0:
+                self._hover = self._hold_point(inputs.state)
+                self._enter(Phase.TAKE_OFF, inputs.time, f"{self._failure}; {self._attempts_left} attempts left")
+                self._go(inputs, outputs, *self._search_place(inputs.state))
+            else:
+                self._end(outputs, Result.MISSED, f"{self._failure}; recovered to a hover")
+
+    # -- planning ----------------------------------------------------------------------------------------------------
+
+    def _ask_plan(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
+        self.target = target
+        zero = np.zeros(3)
+        p, yaw = self._hover
+        outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target)
+        self._enter(Phase.PLANNING, inputs.time, "planning")
+
+    @property
+    def _lead(self) -> float:
+        return max(self.settings.plan_lead, self.settings.planner_latency + 0.02)
+
+    def _replan(self, inputs: Inputs, outputs: Outputs, end: float) -> None:
+        """Refine the target in flight and continue from the running plan's future (M's future work)."""
+        if inputs.plan is not None and inputs.plan.success and inputs.plan.start_time > inputs.time:
+            self.target = self._asked_target
+            self._fly(inputs.plan, outputs)
+            self.message = f"re-planned, {inputs.plan.duration:.2f} s"
+            return
+        usable, _ = self._usable(inputs.target)
+        start = inputs.time + self._lead
+        if (usable and inputs.target.time > self._asked_target.time and end - start > self.settings.replan_until
+                and start > self._perch.start_time and inputs.time - self._replanned_at >= self.settings.replan_period):
+            self._replanned_at, self._asked_target = inputs.time, inputs.target
+            zero = np.zeros(3)
+            outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, current=self._perch.trajectory)
+
+    def _fly(self, plan: PlanAnswer, outputs: Outputs) -> None:
+        self._perch, self._perch_id = plan, self._new_id()
+        outputs.perch, outputs.trajectory_id = plan, self._perch_id
+        if self.phase is Phase.PLANNING:
+            self._asked_target, self._replanned_at = self.target, -math.inf
+
+    def _usable(self, target: Target | None) -> tuple[bool, str]:
+        """Whether a target is fresh and certain enough to plan on, and why not."""
+        settings = self.settings
+        if target is None or target.time < self._entered_search:
+            return False, "no tags seen"
+        if target.position_sigma > settings.target_position_sigma:
+            return False, f"position uncertain by {target.position_sigma:.3f} m"
+        if target.attitude_sigma > math.radians(settings.target_attitude_sigma_deg):
+            return False, f"attitude uncertain by {math.degrees(target.attitude_sigma):.1f} deg"
+        hint = self._goal.inclination_hint
+        if hint is not None:
+            s3 = so3.quat_rotate(target.q_WS, np.array([0.0, 0.0, 1.0]))
+            inclination = math.acos(min(1.0, max(-1.0, s3[2])))
+            if abs(inclination - hint) > math.radians(settings.inclination_tolerance_deg):
+                return False, f"inclination {math.degrees(inclination):.0f} deg, expected {math.degrees(hint):.0f} deg"
+        return True, ""
+
+    # -- moving ------------------------------------------------------------------------------------------------------
+
+    def _search_place(self, state: State) -> tuple[np.ndarray, float]:
+        goal = self._goal
+        if self._home is None:
+            self._home = self._hold_point(state)
+        p, yaw = self._home
+        if goal.search_position is not None:
+            return goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
+        return p + np.array([0.0, 0.0, goal.takeoff_height]), yaw
+
+    def _search_pattern(self) -> list[tuple[float, float]]:
+        rise, turn = self.settings.search_rise, math.radians(self.settings.search_yaw_deg)
+        return [(rise, 0.0), (0.0, turn), (0.0, -turn), (-rise, 0.0), (0.0, 0.0)]
+
+    def _go(self, inputs: Inputs, outputs: Outputs, p: np.ndarray, yaw: float) -> None:
+        """Fly from the present hover to another, at rest at both ends."""
+        p0, yaw0 = self._hover
+        turn = math.remainder(yaw - yaw0, 2 * math.pi)
+        duration = max(1.0, float(np.linalg.norm(p - p0)) / self.settings.transit_speed, abs(turn) / 0.6)
+        start = inputs.time + 0.04  # after the controller has it: the mission's own latency
+        outputs.reference = rest_to_rest(p0, p, yaw0, yaw0 + turn, duration, start_time=start)
+        outputs.trajectory_id = self._new_id()
+        self._hover = (np.asarray(p, float), yaw0 + turn)
+        self._moved_at, self._travel = inputs.time, duration + 0.04
+
+    def _arrived(self, inputs: Inputs) -> bool:
+        done = inputs.time > self._moved_at + self._travel + self.settings.settle_time
+        return done and self._slow(inputs.state)
+
+    def _slow(self, state: State) -> bool:
+        return float(np.linalg.norm(state.v_WB)) < self.settings.settle_speed
+
+    @staticmethod
+    def _hold_point(state: State) -> tuple[np.ndarray, float]:
+        return np.array(state.p_WB), float(so3.yaw_of(so3.quat_to_matrix(state.q_WB)))
+
+    # -- endings -----------------------------------------------------------------------------------------------------
+
+    def _lost(self, inputs: Inputs, outputs: Outputs) -> bool:
+        """The controller fell back to recovery or descent while the mission was waiting in flight."""
+        if inputs.controller is ControllerState.RECOVERING:
+            self._attempts_left = 1
+            self._missed(inputs, f"controller recovers: {inputs.controller_message}")
+            return True
+        if inputs.controller in (ControllerState.LANDING, ControllerState.DISARMED):
+            self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
+            return True
+        if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > self.settings.phase_timeout:
+            outputs.commands.append((Command.LAND, "take-off took too long"))
+            self._end(outputs, Result.TIMEOUT, f"search hover not reached within {self.settings.phase_timeout:g} s; landing")
+            return True
+        return False
+
+    def _missed(self, inputs: Inputs, why: str) -> None:
+        self._failure = why
+        self._enter(Phase.RECOVERING, inputs.time, why)
+
+    def _cancel(self, inputs: Inputs, outputs: Outputs) -> None:
+        self._cancelled = True
+        if self.phase is Phase.PERCHED:
+            self._end(outputs, Result.CANCELLED, "cancelled; attached with motors off")
+        elif inputs.controller in (ControllerState.DISARMED, ControllerState.ARMED):
+            outputs.commands.append((Command.DISARM, "cancelled"))
+            self._end(outputs, Result.CANCELLED, "cancelled on the ground")
+        else:
+            outputs.commands.append((Command.HOVER, "cancelled"))
+            self._missed(inputs, "cancelled")
+
+    def _end(self, outputs: Outputs, result: Result, message: str, contact_time: float = float("nan")) -> None:
+        outputs.outcome = Outcome(result, message, contact_time)
+        self.phase, self.message, self._goal = Phase.IDLE, message, None
+
+    def _enter(self, phase: Phase, time: float, message: str) -> None:
+        self.phase, self.message, self._since = phase, message, time
+        if phase is Phase.ARMING:
+            self._asked, self._home, self._entered_search = False, None, time
+        if phase is Phase.SEARCHING:
+            self._seen_since, self._place, self._entered_search = None, 0, time
+
+    def _elapsed(self, inputs: Inputs) -> float:
+        return inputs.time - self._since
+
+    def _new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1

@@ -1,0 +1,36 @@
+"""Parameters of the mission."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_core.config import part, quantity
+from perch_control.mission.adhesion import AdhesionLimits
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissionSettings:
+    """Times, speeds and limits of the mission."""
+
+    takeoff_height: float = quantity(1.2, unit="m", above=0.0, high=10.0, doc="default height of the search hover")
+    transit_speed: float = quantity(0.8, unit="m/s", above=0.0, high=5.0, doc="mean speed of take-off and search moves")
+    settle_time: float = quantity(0.6, unit="s", low=0.0, high=10.0, doc="rest after a move before it counts as reached")
+    settle_speed: float = quantity(0.15, unit="m/s", above=0.0, high=1.0, doc="speed below which the vehicle rests")
+    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0)
+    search_yaw_deg: float = quantity(30.0, unit="deg", low=0.0, high=180.0, doc="sweep of the search pattern")
+    search_rise: float = quantity(0.25, unit="m", low=0.0, high=2.0, doc="height change of the search pattern")
+    search_dwell: float = quantity(2.0, unit="s", above=0.0, high=30.0, doc="look this long at each place of the pattern")
+    target_settle: float = quantity(0.5, unit="s", low=0.0, high=10.0, doc="observe the target this long before planning")
+    target_position_sigma: float = quantity(0.06, unit="m", above=0.0, high=1.0, doc="plan only on a target as certain as this")
+    target_attitude_sigma_deg: float = quantity(5.0, unit="deg", above=0.0, high=45.0)
+    inclination_tolerance_deg: float = quantity(15.0, unit="deg", above=0.0, high=90.0, doc="allowed difference from the hint")
+    planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")
+    plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
+    replan_period: float = quantity(0.1, unit="s", above=0.0, high=5.0)
+    replan_until: float = quantity(0.7, unit="s", low=0.0, high=5.0, doc="no new plan closer than this to the contact")
+    contact_time: float = quantity(0.25, unit="s", low=0.0, high=2.0, doc="how long adhesion is awaited after the planned contact")
+    contact_early: float = quantity(0.15, unit="s", low=0.0, high=1.0, doc="how long before the planned contact adhesion is looked for")
+    rest_time: float = quantity(0.6, unit="s", low=0.1, high=10.0, doc="rest with motors off that confirms the perch")
+    arming_timeout: float = quantity(10.0, unit="s", above=0.0, high=60.0)
+    phase_timeout: float = quantity(20.0, unit="s", above=0.0, high=300.0, doc="longest take-off or recovery")
+    adhesion: AdhesionLimits = part(AdhesionLimits)

@@ -1,0 +1,183 @@
+"""What goes into the mission at a tick and what comes out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+from typing import Any
+
+import numpy as np
+
+from perch_core.trajectory import FlatTrajectory
+
+
+class Phase(str, Enum):
+    """Phases as the action's feedback names them."""
+
+    IDLE = "idle"
+    ARMING = "arming"
+    TAKE_OFF = "take_off"
+    SEARCHING = "searching"
+    PLANNING = "planning"
+    TRACKING = "tracking"
+    VERIFYING = "verifying"
+    PERCHED = "perched"
+    RECOVERING = "recovering"
+    LANDING = "landing"
+
+
+class ControllerState(IntEnum):
+    """States of perch_msgs/ControllerStatus."""
+
+    DISARMED = 0
+    ARMED = 1
+    TRACKING = 2
+    HOVERING = 3
+    RECOVERING = 4
+    LANDING = 5
+    FAILED = 6
+
+
+class Command(IntEnum):
+    """Commands of perch_msgs/ControllerCommand."""
+
+    DISARM = 0
+    ARM = 1
+    HOVER = 2
+    LAND = 3
+    ATTACHED = 4
+    KILL = 5
+
+
+class Result(IntEnum):
+    """Error codes of the Perch action."""
+
+    PERCHED = 0
+    NOT_FOUND = 1
+    REFUSED = 2
+    MISSED = 3
+    TRACKING_LOST = 4
+    CANCELLED = 5
+    TIMEOUT = 6
+    BAD_GOAL = 7
+    CRASHED = 8
+
+
+@dataclass(frozen=True)
+class State:
+    """Estimated state of the vehicle.
+
+    Attributes:
+        p_WB: position [m], shape (3,).
+        q_WB: attitude xyzw, shape (4,).
+        v_WB: velocity in W [m/s], shape (3,).
+        w_WB_B: angular velocity in B [rad/s], shape (3,).
+    """
+
+    p_WB: np.ndarray
+    q_WB: np.ndarray
+    v_WB: np.ndarray
+    w_WB_B: np.ndarray
+
+
+@dataclass(frozen=True)
+class Target:
+    """The pad as localised.
+
+    Attributes:
+        time: stamp of the image [s].
+        p_WS: position in W [m], shape (3,).
+        q_WS: attitude xyzw, shape (4,).
+        position_sigma: largest 1-sigma of the position [m].
+        attitude_sigma: largest 1-sigma of the attitude [rad].
+    """
+
+    time: float
+    p_WS: np.ndarray
+    q_WS: np.ndarray
+    position_sigma: float
+    attitude_sigma: float
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is asked for: the Perch action's goal with its defaults filled in."""
+
+    takeoff_height: float
+    search_timeout: float
+    search_position: np.ndarray | None = None
+    search_yaw: float | None = None
+    inclination_hint: float | None = None
+    replan: bool = False
+    attempts: int = 1
+
+
+@dataclass(frozen=True)
+class PlanQuery:
+    """A request to the planner.
+
+    Attributes:
+        start_time: when the trajectory shall start [s].
+        p, v, a, j: start state in W, shapes (3,).
+        yaw: start yaw [rad].
+        target: the pad.
+        current: the trajectory being flown, to be continued from `start_time`; None: start from p, v, a, j.
+    """
+
+    start_time: float
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    j: np.ndarray
+    yaw: float
+    target: Target
+    current: Any = None
+
+
+@dataclass(frozen=True)
+class PlanAnswer:
+    """The planner's answer; `trajectory` is the message to pass on, `duration` its length [s]."""
+
+    success: bool
+    message: str
+    trajectory: Any = None
+    start_time: float = 0.0
+    duration: float = 0.0
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything that the mission knows at a tick."""
+
+    time: float
+    state: State
+    estimator_ready: bool
+    controller: ControllerState
+    controller_message: str
+    trajectory_id: int
+    trajectory_time: float
+    target: Target | None
+    specific_force_B: np.ndarray  # IMU samples since the last tick [m/s^2], shape (n, 3)
+    plan: PlanAnswer | None = None
+    cancel: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a goal ended."""
+
+    result: Result
+    message: str
+    contact_time: float = float("nan")
+
+
+@dataclass
+class Outputs:
+    """What the mission wants done after a tick."""
+
+    commands: list[tuple[Command, str]] = field(default_factory=list)
+    reference: FlatTrajectory | None = None    # a trajectory of the mission's own: take-off, search
+    perch: PlanAnswer | None = None            # a planned perch to be flown
+    trajectory_id: int = 0
+    query: PlanQuery | None = None
+    outcome: Outcome | None = None

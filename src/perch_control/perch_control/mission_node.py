@@ -1,0 +1,274 @@
+"""Node `mission`: the Perch action, from arming to adhesion."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from perch_msgs.action import Perch
+from perch_msgs.msg import ControllerCommand, ControllerStatus, EstimatorStatus, Step, Trajectory
+from perch_msgs.srv import PlanPerch
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.task import Future
+from sensor_msgs.msg import Imu
+
+from perch_core import so3
+from perch_core.ros.conversions import (
+    odometry_arrays, pose_arrays, to_array, to_point, to_pose, to_seconds, to_stamp, to_vector)
+from perch_core.ros.lockstep import Participant
+from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.trajectories import flat_message
+from perch_control.mission import (
+    ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Outcome, Outputs, PlanAnswer, PlanQuery, Result,
+    State, Target)
+from perch_control.mission.parameters import MissionParameters
+
+TICK_STEPS = 10  # the mission decides at 50 Hz
+
+
+class MissionNode(PerchNode[MissionParameters]):
+    """Messages to `MissionMachine` and back; the action server; the planner's client."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("mission", MissionParameters, self._change, **kwargs)
+        self._machine = MissionMachine(self.params.mission)
+        self._target: Target | None = None
+        self._status: ControllerStatus | None = None
+        self._estimator: EstimatorStatus | None = None
+        self._odometry: Odometry | None = None
+        self._imu: list[list[float]] = []
+        self._last_tick = -math.inf
+        self._pending: tuple[float, Future] | None = None   # when the answer counts, and the answer
+        self._deferred: Step | None = None                  # a tick that waits for the planner's answer
+        self._goal_handle: Any = None
+        self._done: Future | None = None
+        self._held: Step | None = None                      # the first tick, held until there is a goal
+
+        self._participant = Participant(self)
+        self._trajectories = self._participant.publisher(Trajectory, "trajectory")
+        self._commands = self._participant.publisher(ControllerCommand, "controller/command")
+        self._participant.subscribe(PoseWithCovarianceStamped, "target/pose", self._receive_target)
+        self._participant.chain(ControllerStatus, "controller/status", self._keep("_status"), TICK_STEPS)
+        self._participant.chain(EstimatorStatus, "estimator/status", self._keep("_estimator"), 5 * TICK_STEPS)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
+        self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS)
+        self._participant.greet()
+        self._planner = self.create_client(PlanPerch, "plan_perch")
+        self._server = ActionServer(self, Perch, "perch", self._execute, goal_callback=self._accept,
+                                    cancel_callback=lambda _: CancelResponse.ACCEPT)
+
+    def _change(self, value: MissionParameters) -> None:
+        self._machine.settings = value.mission
+
+    # -- inputs ------------------------------------------------------------------------------------------------------
+
+    def _keep(self, name: str):
+        return lambda msg: setattr(self, name, msg)
+
+    def _receive_target(self, msg: PoseWithCovarianceStamped) -> None:
+        p, q = pose_arrays(msg.pose.pose)
+        covariance = np.reshape(msg.pose.covariance, (6, 6))
+        if not (np.isfinite(p).all() and np.isfinite(covariance).all() and abs(np.linalg.norm(q) - 1.0) < 1e-3):
+            self.get_logger().warning("target/pose refused: not finite, or its quaternion is not of norm 1", throttle_duration_sec=1.0)
+            return
+        self._target = Target(
+            to_seconds(msg.header.stamp), p, q / np.linalg.norm(q),
+            position_sigma=math.sqrt(max(0.0, np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+            attitude_sigma=math.sqrt(max(0.0, np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
+
+    def _receive_imu(self, msg: Imu) -> None:
+        a = msg.linear_acceleration
+        self._imu.append([a.x, a.y, a.z])
+
+    def _receive_odometry(self, msg: Odometry) -> None:
+        self._odometry = msg
+        now = to_seconds(msg.header.stamp)
+        if now - self._last_tick < TICK_STEPS * 0.002 - 1e-6:
+            return
+        self._last_tick = now
+        step = self._participant.step
+        if self.params.hold_for_goal and self._goal_handle is None and self._held is None and self._participant.lockstep:
+            if step.index == 0:
+                self._held = step  # the vehicle waits for this tick's report: the flight starts with the goal
+                return
+        self._tick(step)
+
+    # -- ticks -------------------------------------------------------------------------------------------------------
+
+    def _tick(self, step: Step) -> None:
+        answer = None
+        if self._pending is not None:
+            due, future = self._pending
+            if to_seconds(step.stamp) >= due - 1e-9:
+                if not future.done():
+                    self._deferred = step
+                    return
+                self._pending, answer = None, self._answer(future)
+        outputs = self._machine.tick(self._inputs(to_seconds(step.stamp), answer))
+        self._imu.clear()
+        self._act(to_seconds(step.stamp), outputs)
+        self._participant.report(step.stamp)
+
+    def _resume(self, _: Future) -> None:
+        if self._deferred is not None:
+            step, self._deferred = self._deferred, None
+            self._tick(step)
+
+    def _inputs(self, now: float, answer: PlanAnswer | None) -> Inputs:
+        status, estimator = self._status, self._estimator
+        return Inputs(
+            time=now, state=State(*odometry_arrays(self._odometry)),
+            estimator_ready=estimator is not None and estimator.state == EstimatorStatus.RUNNING,
+            controller=ControllerState(status.state) if status else ControllerState.DISARMED,
+            controller_message=status.message if status else "no controller/status yet",
+            trajectory_id=status.trajectory_id if status else 0,
+            trajectory_time=status.trajectory_time if status else 0.0,
+            target=self._target, specific_force_B=np.array(self._imu).reshape(-1, 3), plan=answer,
+            cancel=self._goal_handle is not None and self._goal_handle.is_cancel_requested)
+
+    def _act(self, now: float, outputs: Outputs) -> None:
+        stamp = to_stamp(float(now))
+        for command, reason in outputs.commands:
+            msg = ControllerCommand(command=int(command), reason=reason)
+            msg.header.stamp = stamp
+            self._commands.publish(msg)
+        if outputs.reference is not None:
+            msg = flat_message(outputs.reference)
+            msg.id, msg.at_end = outputs.trajectory_id, Trajectory.AT_END_HOLD
+            self._trajectories.publish(msg)
+        if outputs.perch is not None:
+            msg = outputs.perch.trajectory
+            msg.id, msg.at_end = outputs.trajectory_id, Trajectory.AT_END_CONTACT
+            msg.contact_time = float(self.params.mission.contact_time)
+            self._trajectories.publish(msg)
+        if outputs.query is not None:
+            self._ask(now, outputs.query)
+        if self._goal_handle is not None and self._machine.phase.value != "idle":
+            self._goal_handle.publish_feedback(Perch.Feedback(
+                phase=self._machine.phase.value, progress=float(self._machine.progress),
+                time_to_contact=float(self._machine.time_to_contact), message=self._machine.message))
+        if outputs.outcome is not None:
+            self._finish(outputs.outcome)
+
+    # -- planner -----------------------------------------------------------------------------------------------------
+
+    def _ask(self, now: float, query: PlanQuery) -> None:
+        request = PlanPerch.Request(
+            start_time=to_stamp(float(query.start_time)), start_position=to_point(query.p),
+            start_velocity=to_vector(query.v), start_acceleration=to_vector(query.a), start_jerk=to_vector(query.j),
+            start_yaw=float(query.yaw), target=to_pose(query.target.p_WS, query.target.q_WS))
+        nan = float("nan")
+        request.impact_acceleration = request.impact_speed_min = request.impact_speed_max = nan
+        request.thrust_max = request.thrust_min = nan
+        if query.current is not None:
+            request.from_trajectory, request.current = True, query.current
+        if not self._planner.service_is_ready():
+            failed = Future()
+            failed.set_result(PlanPerch.Response(success=False, message="service plan_perch is not there"))
+            self._pending = (now, failed)
+            return
+        future = self._planner.call_async(request)
+        future.add_done_callback(self._resume)
+        self._pending = (now + self.params.mission.planner_latency, future)
+
+    @staticmethod
+    def _answer(future: Future) -> PlanAnswer:
+        response = future.result()
+        if response is None:
+            return PlanAnswer(False, f"plan_perch failed: {future.exception()}")
+        trajectory = response.trajectory
+        return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp),
+                          sum(segment.duration for segment in trajectory.segments))
+
+    # -- action ------------------------------------------------------------------------------------------------------
+
+    def _accept(self, goal: Perch.Goal) -> GoalResponse:
+        if self._goal_handle is not None:
+            self.get_logger().warning("goal refused: another goal is being flown")
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    async def _execute(self, handle: Any) -> Perch.Result:
+        problem = self._problem(handle.request)
+        if problem:
+            handle.abort()
+            return Perch.Result(success=False, error_code=Perch.Result.BAD_GOAL, message=problem)
+        self._goal_handle, self._done = handle, Future()
+        start = self._odometry.header.stamp if self._odometry else to_stamp(0)
+        self._machine.start(self._goal(handle.request), to_seconds(start))
+        if self._held is not None:
+            held, self._held = self._held, None
+            self._tick(held)
+        outcome: Outcome = await self._done
+        self._goal_handle, self._done = None, None
+        result = Perch.Result(success=outcome.result is Result.PERCHED, error_code=int(outcome.result),
+                              message=outcome.message, contact_time=float(outcome.contact_time))
+        result.final_pose = self._odometry.pose.pose
+        if outcome.result is Result.PERCHED:
+            handle.succeed()
+        elif outcome.result is Result.CANCELLED:
+            handle.canceled()
+        else:
+            handle.abort()
+        return result
+
+    def _finish(self, outcome: Outcome) -> None:
+        self.get_logger().info(f"{outcome.result.name.lower()}: {outcome.message}")
+        if self._done is not None:
+            self._done.set_result(outcome)
+
+    def _goal(self, request: Perch.Goal) -> Goal:
+        settings = self.params.mission
+
+        def given(value: float, default: float) -> float:
+            return default if math.isnan(value) else value
+
+        position = yaw = None
+        if request.search_pose.header.frame_id:
+            position = to_array(request.search_pose.pose.position)
+            yaw = float(so3.yaw_of(so3.quat_to_matrix(pose_arrays(request.search_pose.pose)[1])))
+        return Goal(
+            takeoff_height=given(request.takeoff_height, settings.takeoff_height),
+            search_timeout=given(request.search_timeout, settings.search_timeout),
+            search_position=position, search_yaw=yaw,
+            inclination_hint=None if math.isnan(request.inclination_hint) else request.inclination_hint,
+            replan=request.replan, attempts=max(1, request.attempts))
+
+    @staticmethod
+    def _problem(request: Perch.Goal) -> str:
+        """Why a goal cannot be flown, or nothing."""
+        if request.mode != Perch.Goal.MODE_SURFACE:
+            return f"mode {request.mode} is not MODE_SURFACE ({Perch.Goal.MODE_SURFACE})"
+        if not math.isnan(request.takeoff_height) and not 0.3 <= request.takeoff_height <= 10.0:
+            return f"takeoff_height {request.takeoff_height:g} m is outside [0.3, 10]"
+        if not math.isnan(request.search_timeout) and not 0.0 < request.search_timeout <= 300.0:
+            return f"search_timeout {request.search_timeout:g} s is outside (0, 300]"
+        if not math.isnan(request.inclination_hint) and not 0.0 <= request.inclination_hint <= math.pi:
+            return f"inclination_hint {request.inclination_hint:g} rad is outside [0, pi]"
+        pose = request.search_pose
+        if pose.header.frame_id not in ("", "map"):
+            return f"search_pose: frame_id {pose.header.frame_id!r} is not 'map'"
+        if pose.header.frame_id:
+            p, q = pose_arrays(pose.pose)
+            if not np.isfinite(p).all() or abs(np.linalg.norm(q) - 1.0) > 1e-3:
+                return "search_pose: position is not finite, or the quaternion is not of norm 1"
+            if p[2] < 0.3:
+                return f"search_pose: height {p[2]:g} m is below 0.3 m"
+        return ""
+
+
+def create(**kwargs: Any) -> MissionNode:
+    """The node, alone or composed."""
+    return MissionNode(**kwargs)
+
+
+def main() -> None:
+    """Entry point of `ros2 run perch_control mission`."""
+    spin_main(create)
+
+
+if __name__ == "__main__":
+    main()
