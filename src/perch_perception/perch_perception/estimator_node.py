@@ -1,0 +1,108 @@
+"""Node `estimator`: IMU and VIO in, odometry at every IMU step out."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from perch_core.ros import qos
+from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_vector
+from perch_core.ros.lockstep import Participant
+from perch_core.ros.node import PerchNode, spin_main
+from perch_msgs.msg import EstimatorStatus
+from sensor_msgs.msg import Imu
+
+from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
+from perch_perception.ukf.odometry import covariances
+
+STATUS_PERIOD = 50       # steps: 10 Hz
+DIAGNOSTICS_PERIOD = 500  # steps: 1 Hz
+
+
+class EstimatorNode(PerchNode[UkfConfig]):
+    """Publishes `odometry` with the stamp of each `imu/data_raw`, within the same lockstep step."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("estimator", UkfConfig, **kwargs)
+        self._estimator = Estimator(self.params)
+        self._steps = 0
+        self._covariance_step = -self.params.covariance_stride
+        self._step_costs: deque[float] = deque(maxlen=DIAGNOSTICS_PERIOD)
+        self._update_costs: deque[float] = deque(maxlen=60)
+        self._odometry = Odometry()
+        self._odometry.header.frame_id, self._odometry.child_frame_id = "map", "base_link"
+        self._odometry_publisher = self.create_publisher(Odometry, "odometry", qos.CHAIN)
+        self._status_publisher = self.create_publisher(EstimatorStatus, "estimator/status", qos.CHAIN)
+        self._participant = Participant(self)
+        self._participant.subscribe(Odometry, "vio/odometry", self._receive_vio)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
+
+    def _receive_vio(self, msg: Odometry) -> None:
+        begin = time.perf_counter()
+        p, q, v, _ = odometry_arrays(msg)
+        covariance = np.array(msg.pose.covariance).reshape(6, 6)
+        v = v if msg.twist.covariance[0] >= 0 else None  # -1: no velocity in this message
+        self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v))
+        self._covariance_step = self._steps - self.params.covariance_stride
+        self._update_costs.append(time.perf_counter() - begin)
+
+    def _receive_imu(self, msg: Imu) -> None:
+        w, f = msg.angular_velocity, msg.linear_acceleration
+        sample = ImuSample(nanoseconds(msg.header.stamp), (w.x, w.y, w.z), (f.x, f.y, f.z))
+        begin = time.perf_counter()
+        outcome = self._estimator.add_imu(sample)
+        self._step_costs.append(time.perf_counter() - begin)
+        if not outcome.used and self._estimator.estimate is None:
+            return
+        # a sample that was refused still gets its answer: the controller waits for this stamp
+        self._publish(msg)
+        if self._steps % STATUS_PERIOD == 0:
+            self._publish_status(msg)
+        if self._steps % DIAGNOSTICS_PERIOD == 0:
+            self._publish_costs(sample.stamp * 1e-9)
+        self._steps += 1
+
+    def _publish(self, imu: Imu) -> None:
+        estimate, out = self._estimator.estimate, self._odometry
+        out.header.stamp = imu.header.stamp
+        fill_odometry(out, estimate.p_WB, estimate.q_WB, estimate.v_WB, estimate.w_WB_B)
+        if self._steps - self._covariance_step >= self.params.covariance_stride:
+            pose, twist = covariances(estimate, self.params.imu.gyro_noise)
+            out.pose.covariance, out.twist.covariance = pose.ravel(), twist.ravel()
+            self._covariance_step = self._steps
+        self._odometry_publisher.publish(out)
+
+    def _publish_status(self, imu: Imu) -> None:
+        status, estimate = self._estimator.status, self._estimator.estimate
+        msg = EstimatorStatus(
+            state=status.health.value, vio_age=float(status.vio_age), updates_accepted=status.accepted,
+            updates_rejected=status.rejected, nis=float(status.nis), gyro_bias=to_vector(estimate.gyro_bias),
+            accel_bias=to_vector(estimate.accel_bias), position_sigma=float(status.position_sigma),
+            attitude_sigma=float(status.attitude_sigma), message=status.message)
+        msg.header.stamp, msg.header.frame_id = imu.header.stamp, "map"
+        self._status_publisher.publish(msg)
+
+    def _publish_costs(self, now: float) -> None:
+        """Cost per step and update of the last second on /diagnostics."""
+        status = self._estimator.status
+        values: dict[str, Any] = {"state": status.health.name, "vio_age_s": status.vio_age,
+                                  "updates_accepted": status.accepted, "updates_rejected": status.rejected}
+        for name, costs in (("imu_step_us", self._step_costs), ("vio_update_us", self._update_costs)):
+            if costs:
+                values[f"{name}_median"] = 1e6 * float(np.median(costs))
+                values[f"{name}_p99"] = 1e6 * float(np.percentile(costs, 99))
+        level = 0 if status.health.name == "RUNNING" else 2 if status.health.name == "DIVERGED" else 1
+        self.publish_diagnostics(now, values, level, status.message)
+
+
+def create(**kwargs: Any) -> EstimatorNode:
+    """The node, for its own process or a composed one."""
+    return EstimatorNode(**kwargs)
+
+
+def main() -> None:
+    """Entry point of the executable `estimator`."""
+    spin_main(create)

@@ -1,0 +1,71 @@
+"""Settings of the estimator's UKF, with units and ranges (`config/estimator.yaml`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_core.config import choice, part, quantity
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """What the filter assumes of the IMU: noise of one sample, bias walks, ranges."""
+
+    rate: float = quantity(500.0, unit="Hz", above=0.0, doc="nominal sample rate")
+    accel_noise: float = quantity(0.35, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
+    gyro_noise: float = quantity(0.011, unit="rad/s", above=0.0, doc="1 sigma of one sample")
+    accel_bias_walk: float = quantity(0.01, unit="m/s^2/sqrt(s)", above=0.0)
+    gyro_bias_walk: float = quantity(0.0005, unit="rad/s/sqrt(s)", above=0.0)
+    accel_bias_init: float = quantity(0.1, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
+    gyro_bias_init: float = quantity(0.02, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
+    accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, doc="saturation of one axis")
+    gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, doc="saturation of one axis")
+    integration: str = choice("midpoint", options=("midpoint", "hold"), doc=(
+        "midpoint: samples are instantaneous, the step from k to k+1 takes their mean; "
+        "hold: sample k+1 is already the mean over that step"))
+
+
+@dataclass(frozen=True)
+class ImuFaults:
+    """How unusable stretches of IMU data are bridged."""
+
+    gap: float = quantity(0.006, unit="s", above=0.0, doc="longest step between samples that counts as complete")
+    gap_accel: float = quantity(5.0, unit="m/s^2", above=0.0, doc="1 sigma of what a missing sample may have been")
+    gap_gyro: float = quantity(2.0, unit="rad/s", above=0.0, doc="1 sigma of what a missing sample may have been")
+    saturation: float = quantity(0.3, unit="-", above=0.0, high=5.0, doc="1 sigma of a saturated sample, share of its range")
+
+
+@dataclass(frozen=True)
+class VioNoise:
+    """What the filter assumes of VIO beyond the covariance that comes with each pose (`drift.py`)."""
+
+    position: float = quantity(0.002, unit="m", above=0.0, doc="1 sigma, white from pose to pose")
+    attitude: float = quantity(0.002, unit="rad", above=0.0, doc="1 sigma, white from pose to pose")
+    velocity: float = quantity(0.05, unit="m/s", above=0.0, doc="1 sigma, white, where the velocity is used")
+    correlation_time: float = quantity(30.0, unit="s", above=0.0, doc="of VIO's drift")
+    drift_position: float = quantity(0.002, unit="m/sqrt(s)", low=0.0, doc="least growth of the drift")
+    drift_attitude: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="least growth of the drift")
+
+
+@dataclass(frozen=True)
+class UkfConfig:
+    """The estimator's filter."""
+
+    imu: ImuNoise = part(ImuNoise)
+    faults: ImuFaults = part(ImuFaults)
+    vio: VioNoise = part(VioNoise)
+    alpha: float = quantity(1.0, above=0.0, high=1.0, doc="spread of the sigma points (Merwe); at 1 all weights are >= 0")
+    beta: float = quantity(2.0, low=0.0, doc="prior knowledge of the distribution; 2 for a Gaussian")
+    kappa: float = quantity(0.0, doc="secondary spread")
+    gate_probability: float = quantity(0.999, above=0.0, high=0.999999, doc="chi2 gate of the innovation")
+    gate_patience: int = quantity(15, low=1, doc="rejections in a row after which VIO is believed to have jumped")
+    use_velocity: bool = quantity(False, doc="also update with VIO's velocity")
+    history: float = quantity(0.5, unit="s", above=0.0, high=5.0, doc="IMU kept for replay: oldest usable VIO stamp")
+    future: float = quantity(0.05, unit="s", low=0.0, high=0.5, doc="VIO stamps this far ahead wait for the IMU; later ones are refused")
+    coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose")
+    rest_time: float = quantity(0.2, unit="s", above=0.0, doc="IMU needed before the start")
+    rest_gyro: float = quantity(0.06, unit="rad/s", above=0.0, doc="largest mean rate that counts as rest")
+    rest_accel: float = quantity(0.4, unit="m/s^2", above=0.0, doc="largest deviation of the mean from gravity at rest")
+    diverged_position: float = quantity(2.0, unit="m", above=0.0, doc="1 sigma beyond which the state is not to be used")
+    diverged_attitude: float = quantity(0.6, unit="rad", above=0.0, doc="1 sigma beyond which the state is not to be used")
+    covariance_stride: int = quantity(5, low=1, high=100, doc="IMU steps per update of the published covariance")

@@ -1,0 +1,63 @@
+"""VIO's error in time: a Gauss-Markov drift with VIO's own covariance, plus a little white noise.
+
+A VIO pose is not an independent measurement. Its error hardly changes from frame to frame, and a filter that takes 30 such
+poses a second for independent ones divides a drift of centimetres by sqrt(30) every second. So the filter models
+
+    z_k = pose_k (+) d_k (+) n_k,     d_k = phi d_(k-1) + w_k,     phi = exp(-dt / tau),
+    Cov(w_k) = C_k - phi^2 C_(k-1)  (eigenvalues not below a floor),     Cov(n_k) = white,
+
+with C_k the covariance that VIO reports. Then Cov(d_k) = C_k for every k, and the difference of two poses is as good
+as VIO says it is while their common error stays in the state's covariance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from perch_perception.ukf import layout as at
+from perch_perception.ukf.config import VioNoise
+from perch_perception.ukf.unscented import Belief
+
+
+def least_growth(noise: VioNoise, dt: float) -> np.ndarray:
+    """Least covariance that the drift gains in dt [s], shape (6, 6)."""
+    return np.diag(np.repeat([noise.drift_position**2 * dt, noise.drift_attitude**2 * dt], 3))
+
+
+def increment(noise: VioNoise, C_before: np.ndarray, C_now: np.ndarray, dt: float) -> np.ndarray:
+    """Covariance of the drift's step w between two VIO poses.
+
+    Args:
+        noise: the drift's parameters.
+        C_before, C_now: covariances reported with the poses, shape (6, 6).
+        dt: time between them [s].
+
+    Returns:
+        Positive definite matrix, shape (6, 6).
+    """
+    phi = math.exp(-dt / noise.correlation_time)
+    floor = least_growth(noise, dt)
+    scale = np.sqrt(np.diag(floor)) + 1e-9
+    # eigenvalues in units of the floor, so that metres and radians are not compared
+    values, vectors = np.linalg.eigh((C_now - phi * phi * C_before) / np.outer(scale, scale))
+    W = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    return W * np.outer(scale, scale)
+
+
+def advance(belief: Belief, noise: VioNoise, W: np.ndarray, dt: float) -> Belief:
+    """Belief with the drift moved on by dt [s]: exact, because the drift is linear."""
+    phi = math.exp(-dt / noise.correlation_time)
+    x, P = belief.x.copy(), belief.P.copy()
+    x[at.DRIFT] *= phi
+    P[at.D_DRIFT, :] *= phi
+    P[:, at.D_DRIFT] *= phi
+    P[at.D_DRIFT, at.D_DRIFT] += W
+    return dataclasses.replace(belief, x=x, P=P)
+
+
+def white(noise: VioNoise) -> np.ndarray:
+    """Covariance of the white part of a VIO pose, shape (6, 6)."""
+    return np.diag(np.repeat([noise.position**2, noise.attitude**2], 3))

@@ -1,0 +1,204 @@
+"""The estimator: mean at every IMU step, unscented update at VIO's stamp, replay to now. [M:IV-B]
+
+Per IMU sample the nominal state moves by one integration step (a few us). A VIO pose is applied to the belief at
+its own stamp; the IMU steps since then are replayed through a full unscented transform. The design and its
+equations are in docs/estimation.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.stats import chi2
+
+from perch_perception.ukf import drift, kernels, start
+from perch_perception.ukf import layout as at
+from perch_perception.ukf.config import UkfConfig
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
+from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
+from perch_perception.ukf.unscented import Belief, CovarianceError, Innovation, UnscentedTransform
+
+
+class Estimator:
+    """Fuses IMU samples and delayed VIO poses; owns its state alone.
+
+    Feed `add_imu` and `add_vio` in order of arrival, read `estimate` and `status`. The same inputs give the same
+    outputs to the last bit.
+    """
+
+    def __init__(self, config: UkfConfig = UkfConfig()) -> None:
+        self.config = config
+        self._transform = UnscentedTransform(config)
+        self._imu = ImuBuffer(config)
+        self._gates = {m: float(chi2.ppf(config.gate_probability, m)) for m in (6, 9)}
+        self._base: Belief | None = None  # at the stamp of the last applied pose
+        self._covariance: np.ndarray | None = None  # VIO's covariance at that pose
+        self._live: Belief | None = None  # covariance up to a few steps ago
+        self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
+        self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
+        self._lag = 0
+        self._waiting: list[VioPose] = []
+        self._refused_in_row = 0
+        self._accepted = self._rejected = 0
+        self._nis = 0.0
+        self._broken = False
+        self._message = "waiting for the IMU"
+
+    def add_imu(self, sample: ImuSample) -> ImuOutcome:
+        """Move the estimate to the sample's stamp. Bad samples are bridged or refused; the outcome says which."""
+        outcome = self._imu.add(sample)
+        if outcome is not ImuOutcome.USED:
+            self._message = f"IMU sample at {sample.stamp} ns {outcome.value}"
+        if not outcome.used or self._base is None:
+            return outcome
+        row = self._imu.latest
+        kernels.advance(self._x, row[1], row[2], row[3], row[4], row[5], row[6], row[0])
+        self._lag += 1
+        if self._lag >= self.config.covariance_stride:
+            self._refresh()
+        if self._waiting and self._waiting[0].stamp <= self._imu.last.stamp:
+            self.add_vio(self._waiting.pop(0))
+        return outcome
+
+    def add_vio(self, pose: VioPose) -> VioOutcome:
+        """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done."""
+        outcome = pose.problem() or self._timing(pose)
+        if outcome is None:
+            try:
+                outcome = self._apply(pose) if self._base is not None else self._begin(pose)
+            except CovarianceError as error:
+                self._break(str(error))
+                return VioOutcome.GATED
+        if outcome is VioOutcome.GATED:
+            self._rejected += 1
+        elif outcome.used:
+            self._accepted += 1
+        if outcome not in (VioOutcome.APPLIED, VioOutcome.WAITING):
+            self._message = f"VIO pose at {pose.stamp} ns {outcome.value}"
+        return outcome
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """State at the newest IMU stamp; None before the first sample.
+
+        Before the first VIO pose it is level by gravity, with a position that is unknown and says so (1 sigma of 1 km).
+        """
+        last = self._imu.last
+        if last is None:
+            return None
+        if self._base is None:
+            steps = self._imu.recent(0.1)
+            accel = steps[:, 4:7].mean(axis=0) if len(steps) else np.array(last.f_B)
+            belief = start.before_vio(last.stamp, accel)
+            x, P = belief.x, belief.P
+        else:
+            x, P = self._x.copy(), self._live.P
+        return Estimate(
+            stamp=last.stamp, p_WB=x[at.POSITION], v_WB=x[at.VELOCITY], q_WB=x[at.QUATERNION],
+            w_WB_B=np.array(last.w_B) - x[at.GYRO_BIAS], gyro_bias=x[at.GYRO_BIAS], accel_bias=x[at.ACCEL_BIAS],
+            P=P[: at.VEHICLE_SIZE, : at.VEHICLE_SIZE])
+
+    @property
+    def status(self) -> Status:
+        """Health and figures for people and for the mission."""
+        age, position, attitude = float("inf"), start.UNKNOWN_POSITION, start.UNKNOWN_YAW
+        health = Health.DIVERGED if self._broken else Health.INITIALISING
+        if self._base is not None:
+            age = (self._imu.last.stamp - self._base.stamp) * 1e-9
+            diagonal = np.diag(self._live.P)
+            position = float(np.sqrt(diagonal[at.D_POSITION].max()))
+            attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
+            lost = position > self.config.diverged_position or attitude > self.config.diverged_attitude
+            health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
+        return Status(health, age, self._accepted, self._rejected, self._nis, position, attitude, self._message)
+
+    def _timing(self, pose: VioPose) -> VioOutcome | None:
+        """Why the stamp cannot be applied now, or None."""
+        last = self._imu.last
+        if last is None:
+            return VioOutcome.NO_IMU
+        if self._base is not None and pose.stamp <= self._base.stamp:
+            return VioOutcome.DUPLICATE if pose.stamp == self._base.stamp else VioOutcome.OUT_OF_ORDER
+        if pose.stamp > last.stamp:
+            if pose.stamp > last.stamp + round(self.config.future * 1e9):
+                return VioOutcome.FUTURE
+            if any(w.stamp == pose.stamp for w in self._waiting):
+                return VioOutcome.DUPLICATE
+            self._waiting = sorted([*self._waiting, pose], key=lambda w: w.stamp)
+            return VioOutcome.WAITING
+        if pose.stamp < (self._anchors[0].stamp if self._anchors else self._imu.oldest):
+            return VioOutcome.TOO_OLD
+        return None
+
+    def _begin(self, pose: VioPose) -> VioOutcome:
+        steps = self._imu.run(max(self._imu.oldest, pose.stamp - round(self.config.rest_time * 1e9)), pose.stamp)
+        self._settle(start.from_vio(self.config, pose, steps), pose)
+        self._broken = False
+        return VioOutcome.STARTED
+
+    def _apply(self, pose: VioPose) -> VioOutcome:
+        noise = self.config.vio
+        anchor = next(a for a in reversed(self._anchors) if a.stamp <= pose.stamp)
+        prior = self._transform.predict(anchor, self._imu.run(anchor.stamp, pose.stamp), pose.stamp)
+        dt = (pose.stamp - self._base.stamp) * 1e-9
+        prior = drift.advance(prior, noise, drift.increment(noise, self._covariance, pose.covariance, dt), dt)
+        innovation = self._innovate(prior, pose)
+        self._nis = innovation.nis
+        outcome = VioOutcome.APPLIED
+        if innovation.nis > self._gates[len(innovation.residual)]:
+            self._refused_in_row += 1
+            if self._refused_in_row < self.config.gate_patience:
+                return VioOutcome.GATED
+            prior = self._doubt(prior, innovation)
+            innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
+        self._settle(self._transform.correct(prior, innovation), pose)
+        return outcome
+
+    def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
+        noise, R = self.config.vio, drift.white(self.config.vio)
+        if not self.config.use_velocity or pose.v_WB is None:
+            return self._transform.innovate(prior, pose.p_WB, pose.q_WB, R)
+        R9 = np.eye(9) * noise.velocity**2
+        R9[:6, :6] = R
+        return self._transform.innovate(prior, pose.p_WB, pose.q_WB, R9, pose.v_WB)
+
+    def _doubt(self, prior: Belief, innovation: Innovation) -> Belief:
+        """Belief in which the state and VIO's map may each be off by the whole disagreement.
+
+        After so many refusals one of the two is wrong, and nothing tells which: both get the variance of the
+        residual, and the velocity what would have built it up meanwhile.
+        """
+        elapsed = max((prior.stamp - self._base.stamp) * 1e-9, 0.1)
+        p, theta = (innovation.residual[:3] ** 2).sum(), (innovation.residual[3:6] ** 2).sum()
+        extra = np.repeat([p, p / elapsed**2, theta, 0.0, 0.0, p, theta], 3)
+        return dataclasses.replace(prior, P=prior.P + np.diag(extra))
+
+    def _settle(self, belief: Belief, pose: VioPose) -> None:
+        """Make a belief at a pose's stamp the new base, and bring the live state up to now."""
+        self._base, self._covariance, self._refused_in_row = belief, pose.covariance, 0
+        now = self._imu.last.stamp
+        self._live = self._transform.predict(belief, self._imu.run(belief.stamp, now), now)
+        self._x, self._lag, self._anchors = self._live.x.copy(), 0, [belief]
+
+    def _refresh(self) -> None:
+        """Bring the published covariance up to now, and keep a belief from which the kept IMU steps can be replayed."""
+        now = self._imu.last.stamp
+        try:
+            self._live = self._transform.predict(self._live, self._imu.run(self._live.stamp, now), now)
+        except CovarianceError as error:
+            self._break(str(error))
+            return
+        self._lag = 0
+        if not np.isfinite(self._x).all():
+            self._break("state is not finite")
+            return
+        half = round(0.5e9 * self.config.history)
+        if now - self._anchors[-1].stamp >= half:
+            self._anchors = [a for a in self._anchors if a.stamp >= now - 2 * half] + [self._live]
+
+    def _break(self, why: str) -> None:
+        """Start again with the next VIO pose."""
+        self._base = self._live = self._covariance = None
+        self._anchors = []
+        self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"

@@ -1,0 +1,123 @@
+"""IMU samples kept for replay: checked, turned into integration steps, cut at any stamp."""
+
+from __future__ import annotations
+
+import enum
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_perception.ukf.config import UkfConfig
+
+
+class ImuOutcome(enum.Enum):
+    """What became of an IMU sample."""
+
+    USED = "used"
+    GAP = "used after a gap in the IMU data"
+    SATURATED = "used with inflated noise: an axis is at its range"
+    NOT_FINITE = "replaced by the sample before: not finite"
+    NOT_NEWER = "refused: stamp is not newer than the sample before"
+    EMPTY = "refused: not finite and nothing to replace it with"
+
+    @property
+    def used(self) -> bool:
+        """Whether time moved on with this sample."""
+        return self not in (ImuOutcome.NOT_NEWER, ImuOutcome.EMPTY)
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """One IMU sample in B: stamp [ns], angular velocity (3) [rad/s], specific force (3) [m/s^2]."""
+
+    stamp: int
+    w_B: tuple[float, float, float]
+    f_B: tuple[float, float, float]
+
+
+class ImuBuffer:
+    """The steps between IMU samples over the last `history` seconds.
+
+    Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance).
+    """
+
+    def __init__(self, config: UkfConfig) -> None:
+        self._config = config
+        self._midpoint = config.imu.integration == "midpoint"
+        self._variances = (config.imu.gyro_noise**2, config.imu.accel_noise**2)
+        self._keep = max(2, int(config.history * config.imu.rate))
+        self._ends: list[int] = []
+        self._rows: list[tuple[float, ...]] = []
+        self.last: ImuSample | None = None
+
+    @property
+    def oldest(self) -> int:
+        """Earliest stamp from which replay is possible [ns]."""
+        if not self._rows:
+            return self.last.stamp if self.last else 0
+        return self._ends[0] - round(self._rows[0][0] * 1e9)
+
+    def add(self, sample: ImuSample) -> ImuOutcome:
+        """Take a sample; the step that leads to it is then `latest`."""
+        last, imu, faults = self.last, self._config.imu, self._config.faults
+        w, f = sample.w_B, sample.f_B
+        if last is not None and sample.stamp <= last.stamp:
+            return ImuOutcome.NOT_NEWER
+        outcome = ImuOutcome.USED
+        if not math.isfinite(w[0] + w[1] + w[2] + f[0] + f[1] + f[2]):
+            if last is None:
+                return ImuOutcome.EMPTY
+            w, f, outcome = last.w_B, last.f_B, ImuOutcome.NOT_FINITE
+            sample = ImuSample(sample.stamp, w, f)
+        self.last = sample
+        if last is None:
+            return outcome
+        dt = (sample.stamp - last.stamp) * 1e-9
+        if self._midpoint:
+            u, g = last.w_B, last.f_B
+            w = (0.5 * (w[0] + u[0]), 0.5 * (w[1] + u[1]), 0.5 * (w[2] + u[2]))
+            f = (0.5 * (f[0] + g[0]), 0.5 * (f[1] + g[1]), 0.5 * (f[2] + g[2]))
+        gyro, accel = self._variances
+        if outcome is ImuOutcome.NOT_FINITE:
+            gyro, accel = gyro + faults.gap_gyro**2, accel + faults.gap_accel**2
+        elif dt > faults.gap:
+            # the error persists over the gap: its variance must not average out over the one long step
+            gyro, accel = gyro + faults.gap_gyro**2, accel + faults.gap_accel**2
+            outcome = ImuOutcome.GAP
+        s = sample
+        if max(abs(s.w_B[0]), abs(s.w_B[1]), abs(s.w_B[2])) >= 0.99 * imu.gyro_range:
+            gyro, outcome = gyro + (faults.saturation * imu.gyro_range) ** 2, ImuOutcome.SATURATED
+        if max(abs(s.f_B[0]), abs(s.f_B[1]), abs(s.f_B[2])) >= 0.99 * imu.accel_range:
+            accel, outcome = accel + (faults.saturation * imu.accel_range) ** 2, ImuOutcome.SATURATED
+        self._ends.append(sample.stamp)
+        self._rows.append((dt, *w, *f, gyro, accel))
+        if len(self._ends) > 2 * self._keep:
+            del self._ends[: -self._keep], self._rows[: -self._keep]
+        return outcome
+
+    @property
+    def latest(self) -> tuple[float, ...]:
+        """The newest step (dt, gyro, accel, gyro variance, accel variance)."""
+        return self._rows[-1]
+
+    def run(self, start: int, end: int) -> np.ndarray:
+        """The steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9)."""
+        if end <= start or not self._ends:
+            return np.empty((0, 9))
+        first = bisect_right(self._ends, start)
+        last = min(bisect_right(self._ends, end - 1), len(self._ends) - 1)
+        rows = np.array(self._rows[first : last + 1]).reshape(-1, 9)
+        if len(rows) == 0:
+            return rows
+        begins = self._ends[first] - round(rows[0, 0] * 1e9)
+        rows[0, 0] -= max(0, start - begins) * 1e-9
+        rows[-1, 0] -= max(0, self._ends[last] - end) * 1e-9
+        return rows
+
+    def recent(self, duration: float) -> np.ndarray:
+        """Steps of the last `duration` seconds, shape (m, 9)."""
+        if self.last is None:
+            return np.empty((0, 9))
+        return self.run(max(self.oldest, self.last.stamp - round(duration * 1e9)), self.last.stamp)

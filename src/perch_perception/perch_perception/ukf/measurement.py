@@ -1,0 +1,116 @@
+"""What the estimator takes from VIO, what it gives out, and what became of each input."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+
+
+class VioOutcome(enum.Enum):
+    """What became of a VIO pose."""
+
+    STARTED = "the filter started with it"
+    APPLIED = "applied at its stamp"
+    JUMPED = "applied after a jump: many poses in a row disagreed"
+    WAITING = "kept until the IMU has reached its stamp"
+    GATED = "refused by the innovation gate"
+    DUPLICATE = "refused: a pose of this stamp was used before"
+    OUT_OF_ORDER = "refused: older than a pose that was used before"
+    TOO_OLD = "refused: older than the IMU history"
+    FUTURE = "refused: stamp lies too far in the future"
+    NOT_FINITE = "refused: not finite"
+    BAD_COVARIANCE = "refused: covariance is not positive semi-definite"
+    NO_IMU = "refused: no IMU data yet"
+
+    @property
+    def used(self) -> bool:
+        """Whether the estimate changed."""
+        return self in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.JUMPED)
+
+
+class Health(enum.Enum):
+    """State of the estimator; the values are those of perch_msgs/EstimatorStatus."""
+
+    INITIALISING = 0
+    RUNNING = 1
+    COASTING = 2
+    DIVERGED = 3
+
+
+@dataclass(frozen=True)
+class VioPose:
+    """A pose of the body from VIO.
+
+    Attributes:
+        stamp: middle of the exposure on the IMU's clock [ns].
+        p_WB: position [m], shape (3,).
+        q_WB: attitude xyzw, shape (4,).
+        covariance: of (position [m], rotation about W's axes [rad]), shape (6, 6).
+        v_WB: velocity in W [m/s], shape (3,), or None.
+    """
+
+    stamp: int
+    p_WB: np.ndarray
+    q_WB: np.ndarray
+    covariance: np.ndarray
+    v_WB: np.ndarray | None = None
+
+    def problem(self) -> VioOutcome | None:
+        """Why the pose cannot be used, or None."""
+        numbers = [self.p_WB, self.q_WB, self.covariance] + ([] if self.v_WB is None else [self.v_WB])
+        if not all(np.all(np.isfinite(n)) for n in numbers) or abs(np.linalg.norm(self.q_WB) - 1) > 1e-3:
+            return VioOutcome.NOT_FINITE
+        scale = np.abs(self.covariance).max()
+        if not np.allclose(self.covariance, self.covariance.T, atol=1e-6 * scale + 1e-15):
+            return VioOutcome.BAD_COVARIANCE
+        if np.linalg.eigvalsh(self.covariance)[0] < -1e-9 * scale - 1e-15:
+            return VioOutcome.BAD_COVARIANCE
+        return None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The vehicle's state at an IMU stamp.
+
+    Attributes:
+        stamp: time [ns].
+        p_WB, v_WB: position and velocity in W [m, m/s], shape (3,).
+        q_WB: attitude xyzw, shape (4,).
+        w_WB_B: angular velocity in B, bias removed [rad/s], shape (3,).
+        gyro_bias, accel_bias: shape (3,).
+        P: covariance of (p, v, theta, b_g, b_a), theta a rotation vector in B, shape (15, 15).
+    """
+
+    stamp: int
+    p_WB: np.ndarray
+    v_WB: np.ndarray
+    q_WB: np.ndarray
+    w_WB_B: np.ndarray
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+    P: np.ndarray
+
+
+@dataclass(frozen=True)
+class Status:
+    """How the estimator is.
+
+    Attributes:
+        health: see `Health`.
+        vio_age: time since the stamp of the last applied VIO pose [s]; inf before the first.
+        accepted, rejected: VIO poses applied and gated so far.
+        nis: normalised innovation squared of the last pose that reached the gate.
+        position_sigma, attitude_sigma: largest 1 sigma [m], [rad].
+        message: the last event, for people.
+    """
+
+    health: Health
+    vio_age: float
+    accepted: int
+    rejected: int
+    nis: float
+    position_sigma: float
+    attitude_sigma: float
+    message: str

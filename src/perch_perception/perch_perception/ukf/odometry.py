@@ -1,0 +1,34 @@
+"""The estimate's covariances in the axes of nav_msgs/Odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core import so3
+from perch_perception.ukf import layout as at
+from perch_perception.ukf.measurement import Estimate
+
+
+def covariances(estimate: Estimate, gyro_noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pose and twist covariance of an estimate.
+
+    Args:
+        estimate: the state.
+        gyro_noise: 1 sigma of one gyro sample [rad/s].
+
+    Returns:
+        pose: covariance of (position in W, rotation about W's axes), shape (6, 6).
+        twist: covariance of (velocity in B, angular velocity in B), shape (6, 6).
+    """
+    R_WB = so3.quat_to_matrix(estimate.q_WB)
+    pose_map = np.zeros((6, at.VEHICLE_SIZE))
+    pose_map[:3, at.D_POSITION] = np.eye(3)
+    pose_map[3:, at.D_ATTITUDE] = R_WB
+    # v_B = R^T v: an attitude error exp(theta) turns the velocity by v_B x theta
+    twist_map = np.zeros((6, at.VEHICLE_SIZE))
+    twist_map[:3, at.D_VELOCITY] = R_WB.T
+    twist_map[:3, at.D_ATTITUDE] = so3.hat(R_WB.T @ estimate.v_WB)
+    twist_map[3:, at.D_GYRO_BIAS] = -np.eye(3)
+    twist = twist_map @ estimate.P @ twist_map.T
+    twist[3:, 3:] += gyro_noise**2 * np.eye(3)
+    return pose_map @ estimate.P @ pose_map.T, twist
