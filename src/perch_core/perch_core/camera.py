@@ -124,6 +124,7 @@ class EquidistantCamera(_Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "coefficients", tuple(float(k) for k in self.coefficients))
         if len(self.coefficients) != 4 or not np.all(np.isfinite(self.coefficients)):
             raise ConfigError("EquidistantCamera", "coefficients", f"{self.coefficients!r} are not four numbers")
         if not 0 < self.angle_limit <= math.pi:

@@ -1,0 +1,98 @@
+"""One image that holds every face's texture at every resolution, so that one `cv2.remap` draws a whole frame.
+
+Levels are a factor sqrt(2) apart: half as much blur, or aliasing, as with the usual factor of two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from perch_sim.rendering import textures
+from perch_sim.rendering.scene import Face, Scene
+
+BORDER = 4  # texels repeated around a texture, so that interpolation never meets the neighbour
+LEVELS_PER_OCTAVE = 2
+SHELF = 8192  # width of the atlas; OpenCV's remap takes sides below 32768
+VOID = 60  # grey level where no face is hit: a camera that left the room
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Textures of all faces.
+
+    Attributes:
+        image: uint8, shape (rows, cols).
+        affine: float32, shape (faces, levels, 4): (sx, ox, sy, oy) with column = sx u + ox and row = sy v + oy,
+            u and v metres right and up from the face's centre.
+        levels: number of levels of each face, shape (faces,).
+        void: column and row of the texel that stands for "nothing".
+    """
+
+    image: np.ndarray
+    affine: np.ndarray
+    levels: np.ndarray
+    void: tuple[float, float]
+
+
+def _levels(texture: np.ndarray) -> list[np.ndarray]:
+    """The texture at scales 2^(-l/2), each even level by exact halving."""
+    rows, cols = texture.shape
+    out = [texture]
+    while min(rows, cols) * 2 ** (-len(out) / LEVELS_PER_OCTAVE) >= 4:
+        scale = 2 ** (-len(out) / LEVELS_PER_OCTAVE)
+        source = out[max(0, len(out) - LEVELS_PER_OCTAVE)]
+        size = (max(1, round(cols * scale)), max(1, round(rows * scale)))
+        out.append(cv2.resize(source, size, interpolation=cv2.INTER_AREA))
+    return out
+
+
+def _texture(face: Face, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+    if face.kind == "pad":
+        return textures.pad(scene.board, face.texel, rng)
+    cols, rows = (max(8, round(2 * half / face.texel)) for half in face.half)
+    return textures.blobs(rng, rows, cols, face.texel, scene.contrast)
+
+
+@lru_cache(maxsize=4)
+def build_atlas(scene: Scene) -> Atlas:
+    """Draw and pack the textures of a scene; both cameras of a vehicle share the result."""
+    faces = scene.faces()
+    tiles = []
+    for number, face in enumerate(faces):
+        rng = np.random.default_rng([scene.seed, number])
+        tiles += [(number, level, tile) for level, tile in enumerate(_levels(_texture(face, scene, rng)))]
+    count = np.bincount([number for number, _, _ in tiles])
+    affine = np.zeros((len(faces), count.max(), 4), np.float32)
+    tiles.append((-1, 0, np.full((8, 8), VOID, np.uint8)))
+    places, shape = _pack([tile.shape for _, _, tile in tiles])
+    image = np.full(shape, VOID, np.uint8)
+    void = (0.0, 0.0)
+    for (number, level, tile), (x, y) in zip(tiles, places):
+        rows, cols = tile.shape
+        framed = cv2.copyMakeBorder(tile, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_REPLICATE)
+        image[y: y + rows + 2 * BORDER, x: x + cols + 2 * BORDER] = framed
+        if number < 0:
+            void = (x + BORDER + cols / 2, y + BORDER + rows / 2)
+            continue
+        half_u, half_v = faces[number].half
+        affine[number, level] = (cols / (2 * half_u), x + BORDER + cols / 2 - 0.5,
+                                 -rows / (2 * half_v), y + BORDER + rows / 2 - 0.5)
+    return Atlas(image, affine, count, void)
+
+
+def _pack(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """Places (x, y) of framed tiles on shelves, tallest first, and the shape of the whole."""
+    width = max(SHELF, max(cols for _, cols in shapes) + 2 * BORDER)
+    places: list[tuple[int, int]] = [(0, 0)] * len(shapes)
+    x = y = shelf = 0
+    for index in sorted(range(len(shapes)), key=lambda i: -shapes[i][0]):
+        rows, cols = (side + 2 * BORDER for side in shapes[index])
+        if x + cols > width:
+            x, y, shelf = 0, y + shelf, 0
+        places[index] = (x, y)
+        x, shelf = x + cols, max(shelf, rows)
+    return places, (y + shelf, width)

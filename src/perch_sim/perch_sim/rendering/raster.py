@@ -1,0 +1,141 @@
+"""Draws the faces of a scene as one camera pose sees them: texture look-ups, cell by cell.
+
+Cells that show one face take one sample per pixel from the level of the atlas that fits the distance; cells of the
+pad take several; cells in which faces meet decide for every sample which face is in front.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from perch_core.camera import Camera
+from perch_sim.rendering.atlas import LEVELS_PER_OCTAVE, Atlas
+from perch_sim.rendering.grid import CELL, CellGrid, sample_weights
+from perch_sim.rendering.visibility import FaceArrays, View, look
+
+MIXED_SUPERSAMPLING = 2  # where faces meet, in each direction
+PAD_SUPERSAMPLING = 4  # of the tags, in each direction
+FINE_SAMPLES = 400_000  # the tags take fewer samples per pixel when they fill the image
+
+
+class Rasterizer:
+    """Renders the flat faces of a scene for one camera; holds nothing that changes."""
+
+    def __init__(self, faces: FaceArrays, atlas: Atlas, camera: Camera, grid: CellGrid) -> None:
+        self.faces, self.atlas, self.camera, self.grid = faces, atlas, camera, grid
+
+    def draw(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray) -> np.ndarray:
+        """Grey levels under full light, before the optics, uint8, shape (height, width).
+
+        Args:
+            p_WC, R_WC: pose of the camera in W [m].
+            shift_W: displacement of the moving faces [m], shape (3,).
+        """
+        grid, faces = self.grid, self.faces
+        view = look(faces, grid, self.camera, p_WC, R_WC, shift_W)
+        first = view.winner[:, 0]
+        uniform = (view.winner == first[:, None]).all(axis=1) & ~view.crossed.any(axis=0)
+        image = np.full((grid.rows, CELL, grid.cols, CELL), int(self.atlas.image[
+            int(self.atlas.void[1]), int(self.atlas.void[0])]), np.uint8)
+        fine_face = np.zeros(len(faces.fine) + 1, dtype=bool)
+        fine_face[:-1] = faces.fine  # the last entry answers for the winner -1
+        lit = ~grid.blind & (first >= 0)
+        fine = uniform & fine_face[first]
+        mixed = ~uniform & ~grid.blind
+        tagged = mixed & self._shows_pad(view)
+        self._draw_uniform(image, view, np.flatnonzero(uniform & lit & ~fine), first, 1)
+        fine_cells = np.flatnonzero(fine & lit)
+        self._draw_uniform(image, view, fine_cells, first, self._fine_supersampling(view, fine_cells, first))
+        self._draw_mixed(image, view, np.flatnonzero(mixed & ~tagged), MIXED_SUPERSAMPLING)
+        self._draw_mixed(image, view, np.flatnonzero(tagged), PAD_SUPERSAMPLING)
+        image = image.reshape(grid.rows * CELL, grid.cols * CELL)[: self.camera.height, : self.camera.width]
+        if grid.blind.any():
+            blind = grid.blind.reshape(grid.rows, grid.cols).repeat(CELL, 0).repeat(CELL, 1)
+            image = np.where(blind[: self.camera.height, : self.camera.width], 0, image)
+        return np.ascontiguousarray(image)
+
+    def _shows_pad(self, view: View) -> np.ndarray:
+        rows = np.flatnonzero(self.faces.fine[self.faces.bounded])
+        return (view.crossed[rows].any(axis=0) | view.inside[rows].any(axis=(0, 2)))
+
+    def _texels_per_pixel(self, view: View, cells: np.ndarray, face: np.ndarray) -> np.ndarray:
+        """Geometric mean of a pixel's footprint on faces, at the cells' centres; shape of `cells`."""
+        centre = self.grid.corners[cells].mean(axis=2)
+        inverse = np.maximum(np.sum(view.M[face, 2] * centre, axis=-1), 1e-3)
+        slant = np.clip(inverse * view.distance[face], 0.02, 1.0)  # cosine between ray and normal
+        return self.grid.pixel_angle[cells] / (inverse * self.faces.texel[face] * np.sqrt(slant))
+
+    def _fine_supersampling(self, view: View, cells: np.ndarray, first: np.ndarray) -> int:
+        if not len(cells):
+            return 1
+        footprint = float(np.median(self._texels_per_pixel(view, cells, first[cells])))
+        wanted = PAD_SUPERSAMPLING if footprint > 2.0 else 2 if footprint > 0.5 else 1
+        affordable = int(np.sqrt(FINE_SAMPLES / (len(cells) * CELL**2)))
+        return int(np.clip(wanted, 1, max(1, affordable)))
+
+    def _texture_matrices(self, view: View, cells: np.ndarray, face: np.ndarray, supersampling: int) -> np.ndarray:
+        """Ray in C -> (column, row, 1) of the atlas, up to scale: shape (cells, 3, 3)."""
+        footprint = self._texels_per_pixel(view, cells, face) / supersampling
+        level = np.rint(LEVELS_PER_OCTAVE * np.log2(footprint))
+        level = np.clip(level, 0, self.atlas.levels[face] - 1).astype(int)
+        sx, ox, sy, oy = self.atlas.affine[face, level].T[..., None]
+        M = view.M[face]
+        return np.stack([sx * M[:, 0] + ox * M[:, 2], sy * M[:, 1] + oy * M[:, 2], M[:, 2]], axis=1)
+
+    def _draw_uniform(self, image: np.ndarray, view: View, cells: np.ndarray, first: np.ndarray,
+                      supersampling: int) -> None:
+        if not len(cells):
+            return
+        T = self._texture_matrices(view, cells, first[cells], supersampling)
+        corners = np.matmul(T, self.grid.corners[cells]).transpose(1, 0, 2)  # (3, cells, 4)
+        x, y, w = np.ascontiguousarray(corners) @ sample_weights(supersampling)
+        x /= w
+        y /= w
+        self._look_up(image, cells, x, y, supersampling)
+
+    def _draw_mixed(self, image: np.ndarray, view: View, cells: np.ndarray, supersampling: int) -> None:
+        if not len(cells):
+            return
+        weights = sample_weights(supersampling)
+        nearest = np.zeros((len(cells), weights.shape[1]), np.float32)
+        x = np.full_like(nearest, self.atlas.void[0])
+        y = np.full_like(nearest, self.atlas.void[1])
+        for face, rows in self._candidates(view, cells):
+            rays = self.grid.corners[cells[rows]]
+            u, v, inverse = np.ascontiguousarray(np.matmul(view.M[face], rays).transpose(1, 0, 2)) @ weights
+            wins = inverse > np.maximum(nearest[rows], 1e-6)
+            half_u, half_v = self.faces.half[face]
+            if np.isfinite(half_u):
+                wins &= (np.abs(u) <= np.float32(half_u) * inverse) & (np.abs(v) <= np.float32(half_v) * inverse)
+            T = self._texture_matrices(view, cells[rows], np.full(len(rows), face), supersampling)
+            column, row, w = np.ascontiguousarray(np.matmul(T, rays).transpose(1, 0, 2)) @ weights
+            w = np.where(wins, w, 1.0)
+            nearest[rows] = np.where(wins, inverse, nearest[rows])
+            x[rows] = np.where(wins, column / w, x[rows])
+            y[rows] = np.where(wins, row / w, y[rows])
+        self._look_up(image, cells, x, y, supersampling)
+
+    def _candidates(self, view: View, cells: np.ndarray) -> list[tuple[int, np.ndarray]]:
+        """Faces that may show in mixed cells, each with the rows of `cells` where it may."""
+        room = self.faces.half[:, 0] == np.inf
+        found = []
+        behind = view.M[:, 2][room] @ self.grid.corners[cells]  # (cells, room faces, 4): the room behind the panels
+        behind = np.flatnonzero(room)[behind.argmax(axis=1)]
+        for face in np.flatnonzero(room & view.front):
+            found.append((int(face), np.flatnonzero((behind == face).any(axis=1))))
+        for row, face in enumerate(self.faces.bounded):
+            shown = view.crossed[row, cells] | view.inside[row, cells].any(axis=1)
+            found.append((int(face), np.flatnonzero(shown)))
+        return [(face, rows) for face, rows in found if len(rows)]
+
+    def _look_up(self, image: np.ndarray, cells: np.ndarray, x: np.ndarray, y: np.ndarray,
+                 supersampling: int) -> None:
+        """Texels at x, y (cells, samples), averaged per pixel, into the image's cells."""
+        # remap wants sides below 32768, which whole cells in rows keep
+        texels = cv2.remap(self.atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if supersampling > 1:
+            texels = texels.reshape(-1, supersampling**2)
+            texels = cv2.reduce(texels, 1, cv2.REDUCE_AVG)
+        row, col = np.divmod(cells, self.grid.cols)
+        image[row, :, col, :] = texels.reshape(-1, CELL, CELL)

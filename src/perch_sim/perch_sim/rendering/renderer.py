@@ -1,0 +1,98 @@
+"""Images of a scene from a camera on a moving vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.camera import CameraMount
+from perch_sim.rendering.atlas import build_atlas
+from perch_sim.rendering.grid import build_grid
+from perch_sim.rendering.raster import Rasterizer
+from perch_sim.rendering.scene import Scene
+from perch_sim.rendering.sensor import Sensor, control_exposure
+from perch_sim.rendering.visibility import FaceArrays
+
+BLUR_STEP = 2.0  # motion across the image that one sub-frame may stand for [px]
+MAX_SUBFRAMES = 6
+
+Pose = tuple[np.ndarray, np.ndarray]  # p_WB (3,) [m], R_WB (3, 3)
+
+
+class Renderer:
+    """Camera images of a scene.
+
+    An instance holds only what it was built from, so that several threads may call `render` at once; OpenCV
+    releases the interpreter lock in the parts that take the time. The same poses and the same state of `rng`
+    give the same bytes.
+
+    Attributes:
+        exposure: what the exposure control chose for the scene's light; `exposure.time` [s] is the time over which
+            the poses of a frame are to be spread.
+    """
+
+    def __init__(self, scene: Scene, mount: CameraMount, seed: int = 0) -> None:
+        """Draw the textures and lay out the image.
+
+        Args:
+            scene: what is seen; renderers of the same `Scene` object share its textures.
+            mount: the camera and its place on the body; `mount.colour` asks for rgb8.
+            seed: fixes the sensor's noise bank.
+        """
+        self.scene, self.mount = scene, mount
+        self.exposure = control_exposure(mount, scene.light)
+        self._faces = FaceArrays.of(scene.faces())
+        self._grid = build_grid(mount.camera)
+        self._raster = Rasterizer(self._faces, build_atlas(scene), mount.camera, self._grid)
+        self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed)
+
+    def render(self, poses: Sequence[Pose], rng: np.random.Generator,
+               target_shift: np.ndarray = np.zeros(3)) -> np.ndarray:
+        """The image of one exposure.
+
+        Args:
+            poses: (p_WB [m], R_WB) of the body, evenly spread over the exposure, one or more.
+            rng: draws this frame's noise.
+            target_shift: displacement of the target panel and its pad from where the scene has them [m], shape (3,).
+
+        Returns:
+            mono8, uint8 (height, width); rgb8, uint8 (height, width, 3), where the mount asks for colour.
+        """
+        shift_W = np.asarray(target_shift, dtype=float)
+        poses = [(np.asarray(p, dtype=float), np.asarray(R, dtype=float)) for p, R in poses]
+        frames = [self._light(*self.mount.pose(p, R), shift_W)
+                  for p, R in spread(poses, self._subframes(poses))]
+        if len(frames) == 1:
+            return self._sensor.expose(frames[0], rng)
+        mean = np.zeros(frames[0].shape, np.uint16)
+        for frame in frames:
+            mean += frame
+        return self._sensor.expose(((mean + len(frames) // 2) // len(frames)).astype(np.uint8), rng)
+
+    def _light(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray) -> np.ndarray:
+        return self._raster.draw(p_WC, R_WC, shift_W)
+
+    def _subframes(self, poses: list[Pose]) -> int:
+        """As many as the motion across the image during the exposure asks for."""
+        if len(poses) < 2:
+            return 1
+        (p0, R0), (p1, R1) = (self.mount.pose(*pose) for pose in (poses[0], poses[-1]))
+        depth = np.maximum(np.abs((self._faces.centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
+        turn = np.linalg.norm(so3.log(R0.T @ R1))
+        motion = self.mount.camera.fx * (turn + np.linalg.norm(p1 - p0) / np.median(np.sort(depth)[:3]))
+        return int(np.clip(np.ceil(motion / BLUR_STEP), 1, MAX_SUBFRAMES))
+
+
+def spread(poses: list[Pose], count: int) -> list[Pose]:
+    """`count` poses at the middles of equal shares of the time that `poses` span evenly."""
+    if len(poses) == 1:
+        return poses * count
+    out = []
+    for share in (np.arange(count) + 0.5) / count * (len(poses) - 1):
+        before = min(int(share), len(poses) - 2)
+        part = share - before
+        (p0, R0), (p1, R1) = poses[before], poses[before + 1]
+        out.append((p0 + part * (p1 - p0), R0 @ so3.exp(part * so3.log(R0.T @ R1))))
+    return out

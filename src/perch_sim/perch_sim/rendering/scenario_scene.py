@@ -1,0 +1,32 @@
+"""The scene that a scenario describes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.scenario import Scenario
+from perch_core.surface import PerchSurface
+from perch_core.tag_board import load_board
+from perch_sim.rendering.scene import Scene
+
+
+def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
+    """Room, target panel with its pad, cables and light of a scenario.
+
+    Args:
+        scenario: what is flown.
+        seed: draws the textures.
+
+    Raises:
+        ConfigError: the scenario's board does not exist.
+    """
+    world = scenario.world
+    half = np.array(world.room) / 2
+    centre = np.array([*world.room_centre, half[2]])
+    target = board = None
+    if scenario.mode == "surface":
+        surface = scenario.surface
+        target = PerchSurface(surface.p_WS, surface.R_WS, scenario.target.panel_size)
+        board = load_board(scenario.target.board)
+    return Scene(room_low=centre - half, room_high=centre + half, target=target, board=board,
+                 contrast=world.contrast, light=world.light, seed=seed)

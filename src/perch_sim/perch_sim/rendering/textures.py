@@ -1,0 +1,74 @@
+"""Procedural textures: blobs with edges at several scales, and the printed pad with its tags."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from perch_core.tag_board import TagBoard
+
+MEAN = 128  # grey level of a texture's mean under full light
+SCALES = (0.010, 0.035, 0.12, 0.4)  # sizes of the blobs [m]: some are trackable from any distance in the room
+WEIGHTS = (0.8, 1.0, 1.0, 0.8)
+EDGE = np.clip(np.rint(128 + 100 * np.tanh((np.arange(256) - 128) / 22.0)), 0, 255).astype(np.uint8)  # blobs get edges
+WHITE, BLACK, VELCRO = 235, 20, 45  # paper, ink, hook-and-loop tape
+
+
+def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast: float) -> np.ndarray:
+    """A random texture with corners at every scale.
+
+    Args:
+        rng: draws it.
+        rows, cols: size [texels].
+        texel: size of a texel [m].
+        contrast: 99 % of the texels lie within MEAN (1 +- contrast).
+
+    Returns:
+        uint8, shape (rows, cols).
+    """
+    total, weight_sum = None, 0.0
+    for scale, weight in zip(SCALES, WEIGHTS):
+        step = max(scale / texel, 1.5)
+        small = rng.normal(128.0, 40.0, (int(rows / step) + 3, int(cols / step) + 3))
+        small = np.clip(small, 0, 255).astype(np.uint8)
+        layer = cv2.LUT(cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC), EDGE)
+        weight_sum += weight
+        share = weight / weight_sum
+        total = layer if total is None else cv2.addWeighted(total, 1.0 - share, layer, share, 0.0)
+    sample = total[:: max(1, rows // 256), :: max(1, cols // 256)].astype(float)
+    mean = sample.mean()
+    spread = max(np.percentile(np.abs(sample - mean), 99), 1.0)
+    levels = MEAN * (1.0 + contrast * np.clip((np.arange(256) - mean) / spread, -1.2, 1.2))
+    return cv2.LUT(total, np.clip(np.rint(levels), 0, 255).astype(np.uint8))
+
+
+def pad(board: TagBoard, texel: float, rng: np.random.Generator) -> np.ndarray:
+    """The pad seen from outside, s1 up: black tags on white margins of one module, dark velcro between them.
+
+    Args:
+        board: what is printed.
+        texel: size of a texel [m].
+        rng: draws the fleece of the velcro.
+
+    Returns:
+        uint8, shape (rows, cols): rows run along -s1, columns along -s2.
+    """
+    oversampling = 4  # edges that fall between texels get their share of both
+    extent = np.array(board.pad_size)
+    rows, cols = np.maximum(np.rint(extent / texel).astype(int), 8)
+    fleece = cv2.GaussianBlur(rng.normal(0, 60, (rows, cols)).astype(np.float32), (0, 0), 4.0)
+    image = np.clip(VELCRO + fleece, 0, 255).astype(np.uint8)
+    image = cv2.resize(image, (cols * oversampling, rows * oversampling), interpolation=cv2.INTER_NEAREST)
+    scale = np.array([cols, rows]) * oversampling / extent[::-1]  # texels per metre along u and v
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    for tag, corners_S in zip(board.tags, board.corners_S):
+        marker = cv2.aruco.generateImageMarker(dictionary, tag.id, 8)  # one texel per module
+        print_ = np.full((10, 10), WHITE, np.uint8)
+        print_[1:9, 1:9] = np.where(marker > 127, WHITE, BLACK)
+        corners = ((extent[::-1] / 2 - corners_S[:, [1, 0]]) * scale - 0.5).astype(np.float32)
+        black_border = np.array([[0.5, 0.5], [8.5, 0.5], [8.5, 8.5], [0.5, 8.5]], np.float32)
+        warp = cv2.getPerspectiveTransform(black_border, corners)
+        size = image.shape[::-1]
+        mask = cv2.warpPerspective(np.full_like(print_, 255), warp, size, flags=cv2.INTER_NEAREST)
+        cv2.copyTo(cv2.warpPerspective(print_, warp, size, flags=cv2.INTER_NEAREST), mask, image)
+    return cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,138 @@
+"""Which face each cell of the image shows, as seen from one camera pose.
+
+For a face with normal n at the signed distance d = n . (o - c) from the camera, the inverse range along a unit ray
+r is (n . r)/d: linear in the ray, and largest for the face in front. Texture coordinates are u = (M0 . r)/(M2 . r)
+and v = (M1 . r)/(M2 . r) with M2 the inverse range, so one 3 x 3 matrix per face holds everything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.camera import Camera
+from perch_sim.rendering.grid import CellGrid
+from perch_sim.rendering.scene import Face
+
+EDGE_SAMPLES = 128  # points per edge by which the cells are found that an edge crosses
+NEAREST = 1e-3  # a camera closer to a face's plane than this sees nothing of it [m]
+
+
+@dataclass(frozen=True, eq=False)
+class FaceArrays:
+    """The faces of a scene as arrays, one row per face.
+
+    Attributes:
+        centre_W, right_W, up_W, normal_W: shape (n, 3).
+        half: half extents, shape (n, 2) [m]; infinite where the face is not bounded.
+        texel: [m], shape (n,).
+        moving, fine: bool, shape (n,): moves with the target; drawn with several samples per pixel.
+        bounded: indices of the faces with edges, shape (m,).
+        edges_W: points on their edges, shape (m, 4 * EDGE_SAMPLES, 3).
+    """
+
+    centre_W: np.ndarray
+    right_W: np.ndarray
+    up_W: np.ndarray
+    normal_W: np.ndarray
+    half: np.ndarray
+    texel: np.ndarray
+    moving: np.ndarray
+    fine: np.ndarray
+    bounded: np.ndarray
+    edges_W: np.ndarray
+
+    @classmethod
+    def of(cls, faces: tuple[Face, ...]) -> FaceArrays:
+        """From the faces of a scene."""
+        bounded = [i for i, face in enumerate(faces) if face.bounded]
+        edges = [_edge_points(faces[i]) for i in bounded]
+        return cls(
+            np.array([f.centre_W for f in faces]), np.array([f.right_W for f in faces]),
+            np.array([f.up_W for f in faces]), np.array([f.normal_W for f in faces]),
+            np.array([f.half if f.bounded else (np.inf, np.inf) for f in faces]),
+            np.array([f.texel for f in faces]), np.array([f.moving for f in faces]),
+            np.array([f.kind == "pad" for f in faces]), np.array(bounded, dtype=int),
+            np.array(edges).reshape(len(bounded), -1, 3),
+        )
+
+
+def _edge_points(face: Face) -> np.ndarray:
+    t = np.linspace(-1.0, 1.0, EDGE_SAMPLES)
+    one = np.ones_like(t)
+    uv = np.concatenate([np.stack(pair, -1) for pair in ((t, one), (t, -one), (one, t), (-one, t))])
+    return face.centre_W + uv[:, :1] * face.half[0] * face.right_W + uv[:, 1:] * face.half[1] * face.up_W
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The faces as one camera pose sees them.
+
+    Attributes:
+        M: ray in C -> (u/range, v/range, 1/range), float32, shape (n, 3, 3); zero for faces that turn away.
+        distance: of the camera from each face's plane [m], shape (n,).
+        front: faces that turn towards the camera, shape (n,) bool.
+        winner: face that each cell shows at its four corners (-1: none), shape (cells, 4).
+        inside: for each bounded face, whether the corners' rays hit it, shape (m, cells, 4).
+        crossed: for each bounded face, whether one of its edges crosses a cell, shape (m, cells).
+    """
+
+    M: np.ndarray
+    distance: np.ndarray
+    front: np.ndarray
+    winner: np.ndarray
+    inside: np.ndarray
+    crossed: np.ndarray
+
+
+def face_matrices(faces: FaceArrays, p_WC: np.ndarray, R_WC: np.ndarray,
+                  shift_W: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """M (n, 3, 3), distances (n,) [m] and the mask of faces that turn towards the camera: see `View`."""
+    offset = p_WC - faces.centre_W - faces.moving[:, None] * shift_W  # from the face's centre to the camera
+    distance = np.sum(faces.normal_W * offset, axis=1)
+    front = distance > NEAREST
+    inverse = -(faces.normal_W @ R_WC) / np.where(front, distance, 1.0)[:, None]
+    M = np.empty((len(distance), 3, 3))
+    M[:, 0] = np.sum(faces.right_W * offset, axis=1)[:, None] * inverse + faces.right_W @ R_WC
+    M[:, 1] = np.sum(faces.up_W * offset, axis=1)[:, None] * inverse + faces.up_W @ R_WC
+    M[:, 2] = inverse
+    M[~front] = 0.0
+    return M.astype(np.float32), distance, front
+
+
+def look(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_WC: np.ndarray,
+         shift_W: np.ndarray) -> View:
+    """What the corners of the cells see, and which cells the edges of faces cross.
+
+    Args:
+        faces: what there is.
+        grid, camera: cells of the image and their camera.
+        p_WC, R_WC: pose of the camera in W [m].
+        shift_W: displacement of the moving faces [m], shape (3,).
+    """
+    M, distance, front = face_matrices(faces, p_WC, R_WC, shift_W)
+    n, nodes = len(M), grid.nodes.shape[1]
+    q = (M.reshape(-1, 3) @ grid.nodes).reshape(n, 3, nodes)
+    inverse = q[:, 2]
+    hit = inverse > 1e-6
+    bounded = faces.bounded
+    limit = faces.half[bounded].astype(np.float32)[:, :, None] * inverse[bounded][:, None, :]
+    hit[bounded] &= np.all(np.abs(q[bounded, :2]) <= limit, axis=1)
+    inverse = np.where(hit, inverse, -1.0)
+    winner = np.where(inverse.max(axis=0) > 0, inverse.argmax(axis=0), -1)
+    corner = grid.corner_nodes
+    return View(M, distance, front, winner[corner], hit[bounded][:, corner],
+                _crossings(faces, grid, camera, p_WC, R_WC, shift_W, front))
+
+
+def _crossings(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_WC: np.ndarray,
+               shift_W: np.ndarray, front: np.ndarray) -> np.ndarray:
+    crossed = np.zeros((len(faces.bounded), grid.rows * grid.cols), dtype=bool)
+    for row, face in enumerate(faces.bounded):
+        if not front[face]:
+            continue
+        points_C = (faces.edges_W[row] + faces.moving[face] * shift_W - p_WC) @ R_WC
+        cells = grid.cell_of(camera.project(points_C)[0])
+        crossed[row, cells[cells >= 0]] = True
+    return crossed
