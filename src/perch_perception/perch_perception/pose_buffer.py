@@ -1,0 +1,120 @@
+"""Where the vehicle was at a stamp: a short history of the estimator's states, interpolated.
+
+Images arrive 20-30 ms after their exposure. At 3 m/s that is 9 cm, so no result may ever be combined with the pose of
+its arrival.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.errors import PerchError
+
+MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
+
+
+class StampError(PerchError):
+    """There is no state at this stamp; the message says whether it is too old, too new or in a gap."""
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """State of the body at a time.
+
+    Attributes:
+        time: [s].
+        p_WB: position [m], shape (3,).
+        q_WB: attitude, xyzw, shape (4,).
+        v_WB: velocity in W [m/s], shape (3,).
+        w_WB_B: angular velocity in B [rad/s], shape (3,).
+        covariance: of position and attitude, errors in the axes of W [m, rad], shape (6, 6).
+    """
+
+    time: float
+    p_WB: np.ndarray
+    q_WB: np.ndarray
+    v_WB: np.ndarray
+    w_WB_B: np.ndarray
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def R_WB(self) -> np.ndarray:
+        """Attitude as a matrix, shape (3, 3)."""
+        return so3.quat_to_matrix(self.q_WB)
+
+
+class PoseBuffer:
+    """The last states, by time.
+
+    Args:
+        span: how much history is kept [s].
+        reach: a stamp this much newer than the newest state is answered by moving on at constant velocity [s].
+    """
+
+    def __init__(self, span: float = 1.0, reach: float = 0.004) -> None:
+        self._span, self._reach = span, reach
+        self._states: deque[BodyState] = deque()
+        self._times: deque[float] = deque()
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def add(self, state: BodyState) -> bool:
+        """Append a state. False, and nothing happens, where it is not newer than the last or not finite."""
+        if self._times and state.time <= self._times[-1]:
+            return False
+        if not all(np.all(np.isfinite(x)) for x in (state.time, state.p_WB, state.q_WB, state.v_WB, state.w_WB_B)):
+            return False
+        self._states.append(state)
+        self._times.append(state.time)
+        while self._times[-1] - self._times[0] > self._span:
+            self._times.popleft()
+            self._states.popleft()
+        return True
+
+    def at(self, time: float) -> BodyState:
+        """The state at a time.
+
+        Raises:
+            StampError: no states yet, older than the history, newer than the newest state, or inside a gap.
+        """
+        if not self._times:
+            raise StampError("no odometry yet")
+        newest, oldest = self._times[-1], self._times[0]
+        if time > newest + self._reach:
+            raise StampError(f"stamp {time:.4f} s is {1e3 * (time - newest):.1f} ms ahead of the odometry")
+        if time < oldest:
+            raise StampError(f"stamp {time:.4f} s is {1e3 * (oldest - time):.1f} ms older than the odometry kept")
+        if time >= newest:
+            return _moved(self._states[-1], time)
+        right = bisect_left(self._times, time)
+        if self._times[right] == time:
+            return self._states[right]
+        a, b = self._states[right - 1], self._states[right]
+        if b.time - a.time > MAX_GAP:
+            raise StampError(f"stamp {time:.4f} s lies in a gap of {1e3 * (b.time - a.time):.0f} ms of the odometry")
+        return _between(a, b, (time - a.time) / (b.time - a.time))
+
+
+def _between(a: BodyState, b: BodyState, share: float) -> BodyState:
+    turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(a.q_WB), b.q_WB))
+    return BodyState(
+        time=a.time + share * (b.time - a.time),
+        p_WB=a.p_WB + share * (b.p_WB - a.p_WB),
+        q_WB=so3.quat_multiply(a.q_WB, so3.quat_exp(share * turn)),
+        v_WB=a.v_WB + share * (b.v_WB - a.v_WB),
+        w_WB_B=a.w_WB_B + share * (b.w_WB_B - a.w_WB_B),
+        covariance=a.covariance + share * (b.covariance - a.covariance),
+    )
+
+
+def _moved(state: BodyState, time: float) -> BodyState:
+    dt = time - state.time
+    return BodyState(time, state.p_WB + dt * state.v_WB,
+                     so3.quat_multiply(state.q_WB, so3.quat_exp(dt * state.w_WB_B)),
+                     state.v_WB, state.w_WB_B, state.covariance)

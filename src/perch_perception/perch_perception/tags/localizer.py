@@ -1,0 +1,170 @@
+"""From one image after another to poses of the board: search, then track. [M:sec. IV-B]
+
+Searching the whole enlarged frame costs 10 ms and is done at 10 Hz. Once the board is known it is followed in a
+virtual view aimed at where it must be, given the vehicle's motion: 3 ms, and it finds small and slanted tags.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import config
+from perch_core.camera import CameraMount
+from perch_core.tag_board import TagBoard
+from perch_perception.pose_buffer import BodyState
+from perch_perception.tags.average import average_board
+from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
+from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
+from perch_perception.tags.refinement import refine_corners
+from perch_perception.tags.view import VirtualView
+
+
+@dataclass(frozen=True)
+class LocalizerConfig:
+    """How the board is looked for and which sightings count."""
+
+    search_rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=30.0, doc="searches of the whole frame")
+    lost_after: float = config.quantity(0.4, unit="s", above=0.0, high=5.0, doc="tracking without a tag before searching")
+    max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
+                                       doc="a board further away than this is taken for one of another size")
+    min_range: float = config.quantity(0.15, unit="m", above=0.0, high=10.0, doc="and so is a nearer one")
+    view_margin: float = config.quantity(1.25, low=1.0, high=3.0, doc="what is looked at around the pad, in pad sizes")
+
+
+@dataclass(frozen=True)
+class Localization:
+    """What one image says.
+
+    Attributes:
+        board: joint pose in the camera, or None.
+        average: the paper's averaged pose, where it is asked for and all tags were seen; else None.
+        complete: all tags of the board were used.
+        searched: the whole frame was searched.
+        message: what is missing or was refused, for people; empty when all is well.
+    """
+
+    board: BoardPose | None
+    average: BoardPose | None = None
+    complete: bool = False
+    searched: bool = False
+    message: str = ""
+
+
+class BoardLocalizer:
+    """Search and tracking of one board in the images of one camera.
+
+    Args:
+        board: geometry of the tags.
+        mount: the camera.
+        settings: see `LocalizerConfig`.
+        averaging: compute the paper's average too.
+    """
+
+    def __init__(self, board: TagBoard, mount: CameraMount, settings: LocalizerConfig | None = None,
+                 averaging: bool = False) -> None:
+        self.board, self.mount = board, mount
+        self.settings = settings or LocalizerConfig()
+        self._averaging = averaging
+        self._detector = TagDetector(board, mount.camera)
+        self._tag_size = float(np.median(np.linalg.norm(board.corners_S[:, 0] - board.corners_S[:, 1], axis=-1)))
+        self._radius = float(np.linalg.norm(board.corners_S, axis=-1).max())
+        self._last: BoardPose | None = None       # last sighting ...
+        self._last_body: BodyState | None = None  # ... where the vehicle was then ...
+        self._last_time = -np.inf                 # ... and when
+        self._search_time = -np.inf
+        self._searches = 0
+
+    def process(self, image: np.ndarray, time: float, body: BodyState | None = None) -> Localization:
+        """Look for the board.
+
+        Args:
+            image: mono8, shape (height, width).
+            time: middle of the exposure [s]; must grow from image to image.
+            body: state of the vehicle then; only used to predict where to look.
+
+        Returns:
+            The sighting; `board` is None where there is none, and `message` says why.
+        """
+        tracking = self._last is not None and time - self._last_time <= self.settings.lost_after
+        if tracking:
+            p_CS, R_CS = self._predict(body)
+            detection, searched = self._look(image, p_CS, self._radius), False
+        else:
+            R_CS = None
+            if time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
+                return Localization(None, message="waiting for the next search")
+            self._search_time = time
+            detection, searched = self._search(image), True
+        try:
+            result = self._solve(image, detection, R_CS, searched)
+        except LocalizationRefusal as refusal:
+            reasons = [str(refusal), *detection.rejected]
+            return Localization(None, searched=searched, message="; ".join(reasons))
+        self._last, self._last_body, self._last_time = result.board, body, time
+        return result
+
+    def _search(self, image: np.ndarray) -> Detection:
+        """Search the frame, then look closer at what was found: the other tags are not far."""
+        first = self._detector.search(image, self._searches)
+        self._searches += 1
+        if not first.ids:
+            return first
+        rays = self.mount.camera.unproject(first.corners)
+        angles = np.linalg.norm(rays - np.roll(rays, -1, axis=1), axis=2).max(axis=1)
+        distance = self._tag_size / float(np.median(angles))
+        direction = rays.reshape(-1, 3).mean(axis=0)
+        seen = [self.board.ids.index(number) for number in first.ids]
+        centre_S = self.board.corners_S[seen].reshape(-1, 3).mean(axis=0)
+        radius = float(np.linalg.norm(self.board.corners_S - centre_S, axis=-1).max())
+        closer = self._look(image, distance * direction / np.linalg.norm(direction), radius)
+        return closer if len(closer.ids) >= len(first.ids) else first
+
+    def _look(self, image: np.ndarray, p_CS: np.ndarray, radius: float) -> Detection:
+        """Look at a place where the board should be, `radius` [m] around p_CS."""
+        distance = float(np.linalg.norm(p_CS))
+        share = min(self.settings.view_margin * radius / max(distance, 1e-3), 0.95)
+        view = VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
+        return self._detector.look(image, view)
+
+    def _predict(self, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:
+        """Where the board should be now, p_CS and R_CS: it stays in the map while the vehicle moves."""
+        p, R = self._last.p_CS, self._last.R_CS
+        if body is None or self._last_body is None:
+            return p, R
+        then, now = self._last_body, body
+        p_WC, R_WC = self.mount.pose(then.p_WB, then.R_WB)
+        p_WC_now, R_WC_now = self.mount.pose(now.p_WB, now.R_WB)
+        return R_WC_now.T @ (p_WC + R_WC @ p - p_WC_now), R_WC_now.T @ R_WC @ R
+
+    def _solve(self, image: np.ndarray, detection: Detection, prior_R_CS: np.ndarray | None,
+               searched: bool) -> Localization:
+        """Refine the corners and solve for the pose.
+
+        Raises:
+            LocalizationRefusal: no usable tag, or no plausible pose.
+        """
+        if not detection.ids:
+            raise LocalizationRefusal("no tag of the board found")
+        refined = refine_corners(image, self.mount.camera, detection.corners)
+        blurred = [i for i, valid in zip(detection.ids, refined.valid) if not valid]
+        if len(blurred) == len(detection.ids):
+            raise LocalizationRefusal(f"the edges of tags {blurred} cannot be measured")
+        ids = tuple(i for i, valid in zip(detection.ids, refined.valid) if valid)
+        corners_S = self.board.corners_S[[self.board.ids.index(i) for i in ids]]
+        rays, sigma = refined.rays_C[refined.valid], refined.sigma[refined.valid]
+        pose = solve_board(self.mount.camera, corners_S, rays, sigma, ids, prior_R_CS)
+        distance = float(np.linalg.norm(pose.p_CS))
+        if not self.settings.min_range <= distance <= self.settings.max_range:
+            raise LocalizationRefusal(
+                f"the tags' size puts the board at {distance:.2f} m, outside "
+                f"[{self.settings.min_range:g}, {self.settings.max_range:g}] m: not a board of this size")
+        complete = len(pose.ids) == len(self.board.ids)
+        average = average_board(self.mount.camera, corners_S, rays, ids) if self._averaging and complete else None
+        notes = list(detection.rejected)
+        if blurred:
+            notes.append(f"the edges of tags {blurred} cannot be measured")
+        if pose.dropped:
+            notes.append(f"tags {list(pose.dropped)} contradict the others")
+        return Localization(pose, average, complete, searched, "; ".join(notes))

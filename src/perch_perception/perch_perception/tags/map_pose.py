@@ -1,0 +1,84 @@
+"""The board's pose in the map W, and where its uncertainty comes from.
+
+Two kinds of errors: the corners' noise is new in every image; calibration, time offset and the odometry's drift are the
+same in all images of a second, and averaging does not remove them. They are kept apart: `noise` is a covariance,
+`by_shared` says how the shared errors c move the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.camera import CameraMount
+from perch_perception.pose_buffer import BodyState
+from perch_perception.tags.pose import BoardPose
+
+SHARED = 11  # extrinsic rotation (3), focal length (1), time offset (1), odometry position (3), odometry attitude (3)
+
+
+@dataclass(frozen=True)
+class CalibrationSigma:
+    """How well the camera is calibrated: 1-sigma of what stays the same from image to image."""
+
+    focal: float = config.quantity(0.003, low=0.0, high=0.1, doc="focal length, relative")
+    rotation: float = config.quantity(0.5, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis")
+    time: float = config.quantity(0.002, unit="s", low=0.0, high=0.05, doc="camera-IMU time offset")
+
+
+@dataclass(frozen=True)
+class MapPose:
+    """Pose of S in the map W from one image.
+
+    Attributes:
+        p_WS: position [m], shape (3,).
+        R_WS: attitude, shape (3, 3).
+        noise: covariance of (dp, dtheta) in the axes of W from this image alone [m, rad], shape (6, 6).
+        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 11).
+        shared: covariance of c, shape (11, 11).
+    """
+
+    p_WS: np.ndarray
+    R_WS: np.ndarray
+    noise: np.ndarray
+    by_shared: np.ndarray
+    shared: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of (dp, dtheta) from all causes, shape (6, 6)."""
+        return self.noise + self.by_shared @ self.shared @ self.by_shared.T
+
+
+def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: CalibrationSigma) -> MapPose:
+    """T_WS = T_WB T_BC T_CS with all its errors, to first order.
+
+    Args:
+        board: pose in the camera.
+        body: state of the body in the middle of the exposure.
+        mount: nominal place of the camera.
+        calibration: how well that is known.
+    """
+    R_WB = body.R_WB
+    R_WC = R_WB @ mount.R_BC
+    v_CS_W = R_WC @ board.p_CS                       # from the camera to S, in W
+    v_BS_W = R_WB @ mount.p_BC + v_CS_W              # from the body to S, in W
+    turned = np.kron(np.eye(2), R_WC)
+    by_shared = np.zeros((6, SHARED))
+    by_shared[:3, 0:3] = -so3.hat(v_CS_W)            # the camera turned by dtheta (axes of W at this moment)
+    by_shared[3:, 0:3] = np.eye(3)
+    by_shared[:, 0:3] = by_shared[:, 0:3] @ R_WB     # ... given in axes of B, where it is constant
+    by_shared[:3, 3] = v_CS_W                        # range grows with the focal length
+    w_W = R_WB @ body.w_WB_B
+    by_shared[:3, 4] = body.v_WB + np.cross(w_W, v_BS_W)
+    by_shared[3:, 4] = w_W
+    by_shared[:3, 5:8] = np.eye(3)
+    by_shared[:3, 8:11] = -so3.hat(v_BS_W)
+    by_shared[3:, 8:11] = np.eye(3)
+    shared = np.zeros((SHARED, SHARED))
+    shared[:5, :5] = np.diag(np.array([*[np.radians(calibration.rotation)] * 3, calibration.focal,
+                                       calibration.time]) ** 2)
+    shared[5:, 5:] = body.covariance
+    return MapPose(body.p_WB + v_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, shared)

@@ -1,0 +1,191 @@
+"""Pose of the board from the corners of all its visible tags together: one PnP in the fisheye model.
+
+A single small square has two nearly equally good poses (the IPPE ambiguity): averages over single-tag poses flip and
+are 12-20 deg off at 3 m. All corners together, over the pad's 0.56 m, have one clear minimum.
+
+Errors of a pose T_AB = (p_AB, R_AB) are (dp, dtheta) in the axes of A: p = p^ + dp, R = exp(dtheta) R^. That is also what
+the covariance of geometry_msgs/PoseWithCovariance means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perch_core import so3
+from perch_core.camera import Camera
+from perch_core.errors import PerchError
+
+MAX_ITERATIONS = 12
+SAME_POSE = np.radians(0.5)        # branches closer than this are one and the same minimum [rad]
+PRIOR_SIGMA = np.radians(10.0)     # how far the attitude may have turned since it was predicted [rad]
+MAX_OUTLIER_RATIO = 5.0            # residuals beyond this many sigma (RMS) mean that a tag is not where it should be
+MAX_RESIDUAL = 0.35                # ... if they also exceed this [px]
+
+
+class LocalizationRefusal(PerchError):
+    """The corners do not determine the pose of the board; the message says why."""
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """Pose of the surface frame S in the camera C.
+
+    Attributes:
+        p_CS: position of S [m], shape (3,).
+        R_CS: attitude of S, shape (3, 3).
+        covariance: of (dp, dtheta) in the axes of C [m, rad], shape (6, 6), from the corners' noise alone.
+        ids: tags used.
+        rms: residual of the corners, per image axis [px].
+        branch_gap: by how much chi^2 of the second-best pose is worse; inf where there is only one.
+        dropped: tags left out as they contradict the others.
+    """
+
+    p_CS: np.ndarray
+    R_CS: np.ndarray
+    covariance: np.ndarray
+    ids: tuple[int, ...]
+    rms: float
+    branch_gap: float = np.inf
+    dropped: tuple[int, ...] = ()
+
+
+def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
+                prior_R_CS: np.ndarray | None = None) -> BoardPose:
+    """Joint pose over all corners; a tag that contradicts the others is left out.
+
+    Args:
+        camera: the lens; residuals are formed in its pixels.
+        corners_S: corners of the n tags in S, shape (n, 4, 3) [m], all in the plane z_S = 0.
+        rays_C: measured rays, shape (n, 4, 3).
+        sigma: 1-sigma of the corners [px], shape (n, 4).
+        ids: numbers of the tags, n of them.
+        prior_R_CS: predicted attitude; only helps to choose between two minima.
+
+    Raises:
+        LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
+    """
+    best = _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS)
+    if not _contradicts(best, sigma):
+        return best
+    if len(ids) >= 3:  # of two tags that disagree, either may be the wrong one
+        trials = []
+        for out in range(len(ids)):
+            keep = np.arange(len(ids)) != out
+            rest = tuple(np.array(ids)[keep].tolist())
+            trial = _solve(camera, corners_S[keep], rays_C[keep], sigma[keep], rest, prior_R_CS)
+            trials.append((trial.rms, out, trial))
+        _, out, trial = min(trials, key=lambda entry: entry[0])
+        if not _contradicts(trial, sigma):
+            return BoardPose(**{**trial.__dict__, "dropped": (ids[out],)})
+    raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
+
+
+def _contradicts(pose: BoardPose, sigma: np.ndarray) -> bool:
+    return pose.rms > max(MAX_RESIDUAL, MAX_OUTLIER_RATIO * float(np.sqrt(np.mean(sigma**2))))
+
+
+def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS) -> BoardPose:
+    """Best of the two IPPE branches after refinement of both."""
+    points, rays, noise = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3), sigma.reshape(-1)
+    pixels, seen = camera.project(rays)
+    if not np.all(seen):
+        raise LocalizationRefusal("a corner lies beyond the lens's field of view")
+    branches = []
+    for p, R in planar_branches(points, rays):
+        refined = _refine(camera, points, pixels, noise, p, R)
+        if refined is None or refined[0][2] <= 0.0 and camera.max_angle <= np.pi / 2:
+            continue
+        p, R, chi2, information = refined
+        if R[:, 2] @ p >= 0.0:
+            continue  # the back of the board
+        cost = chi2
+        if prior_R_CS is not None:
+            cost += (np.linalg.norm(so3.log(R @ prior_R_CS.T)) / PRIOR_SIGMA) ** 2
+        branches.append((cost, chi2, p, R, information))
+    if not branches:
+        raise LocalizationRefusal(f"tags {list(ids)}: no pose shows the front of the board")
+    branches.sort(key=lambda branch: branch[0])
+    cost, chi2, p, R, information = branches[0]
+    freedom = max(2 * len(points) - 6, 1)
+    covariance = np.linalg.inv(information) * max(1.0, chi2 / freedom)
+    gap = np.inf
+    if len(branches) > 1:
+        turn = so3.log(branches[1][3] @ R.T)
+        if np.linalg.norm(turn) > SAME_POSE:
+            # Two minima: the covariance of the mixture says how sure the choice is.
+            gap = branches[1][0] - cost
+            apart = np.concatenate([branches[1][2] - p, turn])
+            covariance = covariance + np.outer(apart, apart) / (1.0 + np.exp(min(0.5 * gap, 500.0)))
+    rms = float(np.sqrt(chi2 / np.sum(2.0 / noise**2)))
+    return BoardPose(p, R, covariance, tuple(ids), rms, float(gap))
+
+
+def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS).
+
+    Args:
+        points_S: coplanar points with z_S = 0, shape (k, 3), k >= 4.
+        rays_C: their unit rays, shape (k, 3); taken to a pinhole aimed at their middle, so any lens will do.
+    """
+    z = rays_C.mean(axis=0)
+    z /= np.linalg.norm(z)
+    x = np.cross((0.0, 1.0, 0.0) if abs(z[1]) < 0.9 else (1.0, 0.0, 0.0), z)
+    x /= np.linalg.norm(x)
+    R_CV = np.stack([x, np.cross(z, x), z], axis=1)
+    rays_V = rays_C @ R_CV
+    if np.any(rays_V[:, 2] < 0.05):
+        return []
+    plane = np.ascontiguousarray(rays_V[:, :2] / rays_V[:, 2:]).reshape(-1, 1, 2)
+    count, turns, shifts, _ = cv2.solvePnPGeneric(
+        np.ascontiguousarray(points_S), plane, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    return [(R_CV @ shifts[i].ravel(), R_CV @ cv2.Rodrigues(turns[i])[0]) for i in range(count)
+            if np.all(np.isfinite(turns[i])) and np.all(np.isfinite(shifts[i]))]
+
+
+def reprojection_rms(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, p_CS: np.ndarray,
+                     R_CS: np.ndarray) -> float:
+    """Residual of measured corners (n, 4, 3) against a pose, per image axis [px]; inf where one leaves the lens."""
+    projected, seen = camera.project(corners_S @ R_CS.T + p_CS)
+    residual = projected - camera.project(rays_C)[0]
+    return float(np.sqrt(np.mean(residual**2))) if np.all(seen) else np.inf
+
+
+def _refine(camera, points, pixels, noise, p, R):
+    """Levenberg-Marquardt on SE(3); returns p, R, chi^2 and the information matrix, or None where it leaves the lens."""
+    state = _linearise(camera, points, pixels, noise, p, R)
+    if state is None:
+        return None
+    chi2, gradient, information = state
+    damping = 1e-6
+    for _ in range(MAX_ITERATIONS):
+        step = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        p_new, R_new = p + step[:3], so3.exp(step[3:]) @ R
+        trial = _linearise(camera, points, pixels, noise, p_new, R_new)
+        if trial is None or trial[0] > chi2 + 1e-9:
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e6:
+                break
+            continue
+        gain = chi2 - trial[0]
+        p, R, (chi2, gradient, information) = p_new, R_new, trial
+        damping *= 0.1
+        if gain < 1e-4 * max(chi2, 1.0) or np.abs(step).max() < 1e-7:
+            break
+    return p, R, chi2, information
+
+
+def _linearise(camera, points, pixels, noise, p, R):
+    """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals."""
+    turned = points @ R.T
+    points_C = turned + p
+    projected, valid = camera.project(points_C)
+    if not np.all(valid):
+        return None
+    residual = ((projected - pixels) / noise[:, None]).ravel()
+    by_point = camera.project_jacobian(points_C) / noise[:, None, None]
+    by_turn = -by_point @ so3.hat(turned)  # d X_C = dtheta x R X
+    jacobian = np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6)
+    return float(residual @ residual), jacobian.T @ residual, jacobian.T @ jacobian
