@@ -1,0 +1,110 @@
+"""Consistency of estimators over Monte-Carlo runs: NEES and NIS with their chi-square bounds.
+
+For a consistent filter of n dimensions, e^T P^-1 e is chi-square with n degrees of freedom, and its mean over N independent
+runs lies with probability 95 % in [chi2(0.025; N n), chi2(0.975; N n)] / N at each time (Bar-Shalom).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from perch_core import so3
+from scipy.stats import chi2
+
+
+def nees(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """Normalised estimation error squared, e^T P^-1 e.
+
+    Args:
+        errors: shape (..., n).
+        covariances: shape (..., n, n).
+
+    Returns:
+        Shape (...).
+    """
+    errors = np.asarray(errors, float)
+    return np.einsum("...i,...i->...", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
+
+
+def attitude_error(q_true: np.ndarray, q_estimate: np.ndarray) -> np.ndarray:
+    """Rotation vector in B that takes the estimate to the truth, q_true = q_estimate exp(e), shapes (..., 4) -> (..., 3)."""
+    return so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q_estimate), q_true))
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """NEES (or NIS) averaged over runs, against its bounds.
+
+    Attributes:
+        name: what was tested.
+        dimension: degrees of freedom of one sample.
+        times: shape (m,) [s].
+        mean: average over the runs at each time, shape (m,).
+        bounds: between which the average of a consistent filter lies with the given probability.
+        runs: number of runs.
+    """
+
+    name: str
+    dimension: int
+    times: np.ndarray
+    mean: np.ndarray
+    bounds: tuple[float, float]
+    runs: int
+
+    @property
+    def inside(self) -> float:
+        """Share of the time in which the average lies between its bounds."""
+        return float(np.mean((self.mean >= self.bounds[0]) & (self.mean <= self.bounds[1])))
+
+    @property
+    def above(self) -> float:
+        """Share of the time in which the filter is too sure of itself."""
+        return float(np.mean(self.mean > self.bounds[1]))
+
+
+def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int, probability: float = 0.95) -> Consistency:
+    """Average NEES or NIS samples over runs and set them against their bounds.
+
+    Args:
+        name: what was tested.
+        times: shape (m,) [s].
+        samples: shape (runs, m).
+        dimension: degrees of freedom of one sample.
+        probability: of the bounds.
+
+    Raises:
+        ValueError: shapes that do not belong together.
+    """
+    samples = np.asarray(samples, float)
+    if samples.ndim != 2 or samples.shape[1] != len(times):
+        raise ValueError(f"samples of shape {samples.shape} do not fit {len(times)} times")
+    runs, tail = len(samples), 0.5 * (1 - probability)
+    bounds = tuple(float(b) for b in chi2.ppf([tail, 1 - tail], runs * dimension) / runs)
+    return Consistency(name, dimension, np.asarray(times), samples.mean(axis=0), bounds, runs)
+
+
+def plot(results: list[Consistency], path: Path | str, marks: dict[str, float] | None = None) -> None:
+    """One panel per result: the average over the runs, its expectation and bounds, into an image file.
+
+    Args:
+        results: what `judge` returned.
+        path: file to write (png, svg, pdf).
+        marks: name -> time [s] of moments to mark.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 2.3 * len(results) + 0.5), layout="constrained")
+    for axes, result in zip(np.atleast_1d(figure.subplots(len(results), 1, sharex=True)), results):
+        axes.axhspan(*result.bounds, color="0.88", label="95 % bounds")
+        axes.axhline(result.dimension, color="0.5", lw=0.8)
+        axes.plot(result.times, result.mean, lw=1.0)
+        for name, time in (marks or {}).items():
+            axes.axvline(time, color="C3", lw=0.8, ls=":")
+            axes.annotate(name, (time, 0.98), xycoords=("data", "axes fraction"), va="top", fontsize=7, color="C3")
+        axes.set_title(f"{result.name}: {100 * result.inside:.0f} % of the time inside, {result.runs} runs", fontsize=9)
+        axes.set_ylabel("mean, should be " + str(result.dimension), fontsize=8)
+        axes.set_ylim(0, max(2.5 * result.dimension, 1.1 * float(np.nanpercentile(result.mean, 98))))
+    axes.set_xlabel("time [s]")
+    figure.savefig(path, dpi=130)

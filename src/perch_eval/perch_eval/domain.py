@@ -1,0 +1,41 @@
+"""Reserves ROS domains, so that flights and tests on one machine never hear each other."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from perch_core.errors import PerchError
+
+USABLE = range(43, 102)
+"""Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
+
+
+@contextlib.contextmanager
+def reserved_domain(candidates: Iterable[int] = USABLE, folder: Path | None = None) -> Iterator[int]:
+    """A domain id that no other reservation on this machine holds.
+
+    The kernel gives it back when the process ends, however it ends.
+
+    Args:
+        candidates: ids to choose from, best first.
+        folder: where the lock files lie; by default the machine's folder for temporary files.
+
+    Raises:
+        PerchError: every candidate is taken.
+    """
+    folder = folder or Path(tempfile.gettempdir()) / f"perch-domains-{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    for candidate in candidates:
+        with (folder / str(candidate)).open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield candidate
+            return
+    raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")

@@ -1,0 +1,163 @@
+"""The figures of a flight: what `report.json` holds."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.vehicle import Vehicle
+from perch_eval.flight import Flight, States
+
+CONTACT_STATES = {0: "none", 1: "attached", 2: "bounced", 3: "collision", 4: "ground"}
+
+
+def _rmse(difference: np.ndarray) -> list[float]:
+    return np.sqrt(np.mean(difference**2, axis=0)).tolist() if len(difference) else [math.nan] * 3
+
+
+def perch_window(flight: Flight) -> tuple[float, float] | None:
+    """Start and end [s] of the perch: the first planned perch trajectory up to the contact, or to its planned end."""
+    start = end = None
+    for _, msg in flight.messages("trajectory"):
+        if msg.at_end in (1, 3):
+            begin = msg.header.stamp.sec + 1e-9 * msg.header.stamp.nanosec
+            length = sum(s.duration for s in msg.segments) if msg.segments else msg.points[-1].time_from_start
+            if msg.at_end == 3 and msg.recovery_start > 0:
+                length = msg.recovery_start
+            start = begin if start is None else start
+            end = begin + length
+    if start is None:
+        return None
+    touch = touch_of(flight)
+    return (start, min(end, touch[0]) if touch is not None and touch[0] > start else end)
+
+
+def touch_of(flight: Flight) -> tuple[float, Any] | None:
+    """Time and message of the contact that ended the perch: the adhesion, or else the first touch after take-off."""
+    airborne = False
+    first = None
+    for t, msg in flight.messages("contact"):
+        if msg.state == 1:
+            return t, msg
+        if msg.state == 0:
+            airborne = True
+        elif airborne and first is None and msg.state in (2, 3):
+            first = (t, msg)
+    return first
+
+
+def contact_report(flight: Flight) -> dict[str, Any] | None:
+    """Speeds, tilt and offset at the contact, from the truth."""
+    touch = touch_of(flight)
+    if touch is None:
+        return None
+    t, msg = touch
+    return {"time": t, "state": CONTACT_STATES[msg.state], "body": msg.body, "normal_speed_m_s": msg.normal_speed,
+            "tangential_speed_m_s": msg.tangential_speed, "tilt_error_deg": math.degrees(msg.tilt_error),
+            "offset_m": msg.offset, "reason": msg.reason}
+
+
+def peak_acceleration(truth: States) -> float:
+    """Largest acceleration of the vehicle's path, over 20 ms [m/s^2]."""
+    if len(truth.t) < 12:
+        return math.nan
+    step = 10
+    dv = truth.v[step:] - truth.v[:-step]
+    dt = (truth.t[step:] - truth.t[:-step])[:, None]
+    return float(np.linalg.norm(dv / dt, axis=1).max())
+
+
+def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, Any]:
+    """Tracking, estimation, rates, contact and timings of a flight.
+
+    Args:
+        flight: the recording.
+        vehicle: the vehicle that flew.
+        until: end of the flight [s].
+    """
+    out: dict[str, Any] = {"contact": contact_report(flight)}
+    truth, estimate, reference = (flight.states("ground_truth/odometry"), flight.states("odometry"), flight.reference())
+    window = perch_window(flight)
+    if truth is None:
+        return out
+    span = window or (truth.t[0], until)
+    inside = (truth.t >= span[0]) & (truth.t <= span[1])
+    cut = States(truth.t[inside], truth.p[inside], truth.q[inside], truth.v[inside], truth.w[inside])
+    out["window_s"] = list(span)
+    out["perch_planned"] = window is not None
+    if len(cut.t) < 2:
+        return out
+    out["max_body_rate_deg_s"] = math.degrees(float(np.linalg.norm(cut.w, axis=1).max()))
+    out["max_acceleration_m_s2"] = peak_acceleration(cut)
+    if reference is not None:
+        wanted = reference.at(cut.t)
+        out["tracking_rmse_m"] = _rmse(cut.p - wanted.p)
+    if estimate is not None:
+        estimated = estimate.at(cut.t)
+        out["estimation_rmse_m"] = _rmse(cut.p - estimated.p)
+        out["estimation_error_at_end_m"] = (estimated.p[-1] - cut.p[-1]).tolist()
+        error = so3.quat_multiply(so3.quat_conjugate(cut.q[-1]), estimated.q[-1])
+        out["attitude_error_at_end_deg"] = math.degrees(float(np.linalg.norm(so3.quat_log(error))))
+        out["velocity_rmse_m_s"] = _rmse(cut.v - estimated.v)
+    out["target_error"] = target_error(flight)
+    return out
+
+
+def target_error(flight: Flight) -> dict[str, float] | None:
+    """Error of the target that the perch was planned on, in map."""
+    true, found = flight.messages("ground_truth/target"), flight.messages("target/pose")
+    plans = [t for t, m in flight.messages("trajectory") if m.at_end == 1]
+    if not true or not found or not plans:
+        return None
+    used = [m for t, m in found if t <= plans[0]] or [found[0][1]]
+    a, b = true[-1][1].pose, used[-1].pose.pose
+    dp = np.array([b.position.x - a.position.x, b.position.y - a.position.y, b.position.z - a.position.z])
+    qa, qb = (np.array([o.x, o.y, o.z, o.w]) for o in (a.orientation, b.orientation))
+    dq = so3.quat_multiply(so3.quat_conjugate(qa), qb)
+    return {"position_m": float(np.linalg.norm(dp)), "attitude_deg": math.degrees(float(np.linalg.norm(so3.quat_log(dq))))}
+
+
+def thrust_history(flight: Flight, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, collective thrust reached and collective thrust commanded (interpolated to the same times) [s, N, N]."""
+    t, thrust = flight.vectors("rotor_state", lambda m: float(np.sum(m.thrust)))
+    tc, commanded = flight.vectors(
+        "motor_command", lambda m: vehicle.thrust_coefficient * float(np.sum(np.square(m.rotor_speed))) if m.armed else 0.0)
+    if len(t) == 0 or len(tc) == 0:
+        return np.empty(0), np.empty(0), np.empty(0)
+    return t, thrust, np.interp(t, tc, commanded)
+
+
+def rates(flight: Flight) -> dict[str, float]:
+    """Messages per second of simulation time on each topic."""
+    out = {}
+    for topic in flight.topics:
+        times = [t for t, _ in flight.messages(topic)]
+        if len(times) > 1 and times[-1] > times[0]:
+            out[topic] = (len(times) - 1) / (times[-1] - times[0])
+    return out
+
+
+def node_timings(flight: Flight) -> dict[str, dict[str, float]]:
+    """The last diagnostics of each node: their numbers by name."""
+    out: dict[str, dict[str, float]] = {}
+    for _, array in flight.messages("diagnostics"):
+        for status in array.status:
+            values = {}
+            for item in status.values:
+                try:
+                    values[item.key] = float(item.value)
+                except ValueError:
+                    continue
+            out[status.name] = values
+    return out
+
+
+def tilt_degrees(q: np.ndarray) -> np.ndarray:
+    """Angle of b3 from the vertical, (n, 4) -> (n,) [deg]."""
+    b3 = so3.quat_rotate(q, np.array([0.0, 0.0, 1.0]))
+    return np.degrees(np.arccos(np.clip(b3[:, 2], -1.0, 1.0)))
+
+

@@ -1,0 +1,127 @@
+"""One program of a stack: its process group, its output, and how it ended."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+_TAIL = 12
+
+
+@dataclass(frozen=True)
+class Program:
+    """What is to be started.
+
+    Attributes:
+        name: for logs and messages.
+        command: executable and arguments.
+        nodes: fully qualified names of the ROS nodes that it brings into the graph.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    nodes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a program ended.
+
+    Attributes:
+        name: the program's name.
+        code: exit code, or minus the number of the signal that ended it.
+        tail: the last lines it wrote.
+        log: file with all lines.
+    """
+
+    name: str
+    code: int
+    tail: tuple[str, ...]
+    log: Path
+
+    @property
+    def reason(self) -> str:
+        """The exit code, or the signal, in words."""
+        if self.code >= 0:
+            return f"exit code {self.code}"
+        return f"killed by {signal.Signals(-self.code).name}"
+
+    def __str__(self) -> str:
+        lines = "".join(f"\n    {line}" for line in self.tail)
+        last = f". Its last lines ({self.log}):{lines}" if lines else f" without a word ({self.log})"
+        return f"{self.name} ended: {self.reason}{last}"
+
+
+class RunningProgram:
+    """A started program. It dies with the process (strictly: the thread) that started it.
+
+    Args:
+        program: what to start.
+        log: file for everything it writes.
+        environment: its environment variables.
+        on_line: receives (name, line), from a thread of its own, for each line that it writes.
+    """
+
+    def __init__(self, program: Program, log: Path, environment: Mapping[str, str],
+                 on_line: Callable[[str, str], None]) -> None:
+        self.program = program
+        self._log = log
+        self._on_line = on_line
+        self._tail: deque[str] = deque(maxlen=_TAIL)
+        self._process = subprocess.Popen(
+            [*_die_with_parent(), *program.command], env=dict(environment), start_new_session=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
+        self._reader = threading.Thread(target=self._read, name=f"log {program.name}", daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Process id, which is the id of the process group too."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._process.poll() is None
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to the whole process group."""
+        try:
+            os.killpg(self.pid, number)
+        except ProcessLookupError:
+            pass
+
+    def wait(self, timeout: float) -> bool:
+        """Whether it has ended within `timeout` seconds."""
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def ending(self) -> Ending:
+        """How it ended. Waits for the end."""
+        code = self._process.wait()
+        self._reader.join(1.0)  # a grandchild may hold the pipe open; do not wait for that
+        return Ending(self.program.name, code, tuple(self._tail), self._log)
+
+    def _read(self) -> None:
+        stream = self._process.stdout
+        with self._log.open("w", buffering=1) as file, stream:
+            for line in stream:
+                file.write(line)
+                self._tail.append(line.rstrip())
+                self._on_line(self.program.name, line.rstrip())
+
+
+def _die_with_parent() -> tuple[str, ...]:
+    """A prefix under which the kernel ends the program when its parent is killed, where the system has it."""
+    setpriv = shutil.which("setpriv")
+    return (setpriv, "--pdeathsig", "TERM", "--") if setpriv else ()

@@ -1,0 +1,139 @@
+"""`report.json` and `report.html` of one flight."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from perch_core.scenario import Scenario
+from perch_core.vehicle import load_vehicle
+from perch_eval import plots
+from perch_eval.flight import Flight
+from perch_eval.metrics import contact_report, flight_metrics, node_timings, perch_window, rates
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; } td, th { padding: 3px 12px 3px 0; text-align: left; vertical-align: top; }
+th { font-weight: 600; } .good { color: #17692b; } .bad { color: #a11; } img { max-width: 100%; }
+.frames { display: flex; flex-wrap: wrap; gap: 10px; } figure { margin: 0; } figcaption { font-size: 12px; color: #555; }
+code { background: #f4f4f4; padding: 0 3px; }
+"""
+
+
+def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, message: str, wall_time: float,
+                 end_time: float) -> dict[str, Any]:
+    """Read `flight.mcap` in `folder` and write `report.json` and `report.html` beside it.
+
+    Args:
+        folder: output folder of the flight.
+        scenario: what was flown.
+        seed: its seed.
+        outcome: `perched`, or how it failed (lower-case name of the action's error code).
+        message: the mission's own words.
+        wall_time: wall-clock duration of the flight [s].
+        end_time: simulation time at which the goal ended [s].
+
+    Returns:
+        The content of `report.json`.
+    """
+    vehicle = load_vehicle(scenario.vehicle)
+    flight = Flight(folder / "flight.mcap")
+    report: dict[str, Any] = {
+        "outcome": outcome, "message": message, "scenario": scenario.name, "seed": seed,
+        "simulated_time_s": end_time, "wall_time_s": wall_time,
+        "real_time_factor": end_time / wall_time if wall_time > 0 else math.nan,
+        **flight_metrics(flight, vehicle, end_time),
+        "flight_hash": flight.digest(end_time),
+        "rates_hz": rates(flight), "timings_ms": _timings(flight),
+    }
+    (folder / "report.json").write_text(json.dumps(_finite(report), indent=2) + "\n")
+    (folder / "report.html").write_text(_page(flight, scenario, report, vehicle))
+    return report
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no nan: null says that a figure could not be had."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _timings(flight: Flight) -> dict[str, dict[str, float]]:
+    """Latencies and durations that the nodes themselves report, in milliseconds."""
+    return {node.strip("/"): {k: v for k, v in values.items() if k.endswith("_ms")}
+            for node, values in node_timings(flight).items() if any(k.endswith("_ms") for k in values)}
+
+
+def _timeline(flight: Flight) -> list[tuple[float, str]]:
+    rows = [(t, f"controller: {m.reason}") for t, m in flight.messages("controller/command")]
+    for t, m in flight.messages("trajectory"):
+        start = m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
+        length = sum(s.duration for s in m.segments) if m.segments else m.points[-1].time_from_start
+        kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[m.at_end]
+        rows.append((start, f"trajectory {m.id} ({kind}) starts, {length:.2f} s"))
+    last = None
+    for t, m in flight.messages("controller/status"):
+        if m.message and m.message != last:
+            rows.append((t, f"controller says: {m.message}"))
+            last = m.message
+    states = {0: "free", 1: "attached to", 2: "bounced off", 3: "collided with", 4: "on"}
+    for t, m in flight.messages("contact"):
+        rows.append((t, f"contact (truth): {states[m.state]} {m.body}" + (f", {m.reason}" if m.reason else "")))
+    return sorted(rows)
+
+
+def _row(name: str, value: Any) -> str:
+    return f"<tr><th>{html.escape(name)}</th><td>{html.escape(str(value))}</td></tr>"
+
+
+def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
+    if values is None:
+        return "not measured"
+    return ", ".join("-" if v is None or not math.isfinite(v) else f"{scale * v:.1f}" for v in values) + f" {unit}"
+
+
+def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Any) -> str:
+    good = report["outcome"] == "perched"
+    contact = contact_report(flight)
+    rows = [
+        _row("scenario", f"{scenario.name}: {scenario.description}"), _row("seed", report["seed"]),
+        _row("message", report["message"]),
+        _row("tracking RMSE x, y, z", _vector(report.get("tracking_rmse_m"), 100, "cm")),
+        _row("estimation RMSE x, y, z", _vector(report.get("estimation_rmse_m"), 100, "cm")),
+        _row("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
+        _row("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
+        _row("simulated / wall time", f"{report['simulated_time_s']:.2f} s / {report['wall_time_s']:.2f} s"
+                                      f" (real-time factor {report['real_time_factor']:.2f})"),
+        _row("flight hash", report["flight_hash"][:16]),
+    ]
+    if contact:
+        rows.insert(3, _row("contact", f"{contact['state']} at {contact['time']:.3f} s: {contact['normal_speed_m_s']:.2f} m/s normal, "
+                                       f"{contact['tangential_speed_m_s']:.2f} m/s tangential, tilt error {contact['tilt_error_deg']:.1f} deg, "
+                                       f"{100 * contact['offset_m']:.1f} cm from the centre {contact['reason']}"))
+    if report.get("target_error"):
+        e = report["target_error"]
+        rows.insert(3, _row("target error", f"{100 * e['position_m']:.1f} cm, {e['attitude_deg']:.2f} deg"))
+    images = [("Tracking and estimation through the perch", plots.tracking_figure(flight)),
+              ("Path, seen from the side", plots.path_figure(flight)),
+              ("Body rates and tilt", plots.rates_figure(flight)),
+              ("Thrust against its bounds", plots.thrust_figure(flight, vehicle)),
+              ("Estimation error over the flight", plots.error_figure(flight))] if flight.states("ground_truth/odometry") else []
+    window = perch_window(flight)
+    moments = [window[0], window[0] + 0.6 * (window[1] - window[0]), window[1] - 0.05, window[1] + 0.3] if window else []
+    frames = "".join(f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+                     for caption, data in plots.camera_frames(flight, moments))
+    timeline = "".join(f"<tr><td>{t:.3f} s</td><td>{html.escape(text)}</td></tr>" for t, text in _timeline(flight))
+    nodes = "".join(_row(node, ", ".join(f"{k} {v:g}" for k, v in values.items())) for node, values in node_timings(flight).items())
+    hz = "".join(_row(topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())
+    figures = "".join(f'<h2>{title}</h2><img src="data:image/png;base64,{data}">' for title, data in images if data)
+    return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{scenario.name}, seed {report["seed"]}</title><style>{_STYLE}</style>'
+            f'<h1>{html.escape(scenario.name)}, seed {report["seed"]}: <span class="{"good" if good else "bad"}">{report["outcome"]}</span></h1>'
+            f'<table>{"".join(rows)}</table><h2>Timeline</h2><table>{timeline}</table>{figures}'
+            f'<h2>What the cameras saw</h2><div class="frames">{frames or "no images recorded"}</div>'
+            f"<h2>Rates</h2><table>{hz}</table><h2>Nodes</h2><table>{nodes}</table></html>\n")

@@ -1,0 +1,60 @@
+"""Removes the shared memory that killed ROS processes leave behind.
+
+Fast DDS removes its segments when a process ends by itself. A killed one leaves up to some megabytes in
+`/dev/shm`, until the machine is full. Other people's segments are never touched: only those that our own
+processes were seen to use, and that nobody uses any more.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+_SEGMENT = re.compile(r"(/dev/shm/(?:sem\.)?fast(?:rtps|dds)_\S+)")
+
+
+class SharedMemory:
+    """The segments of a group of processes.
+
+    Args:
+        proc: the process file system.
+    """
+
+    def __init__(self, proc: Path = Path("/proc")) -> None:
+        self._proc = proc
+        self._seen: set[str] = set()
+
+    def observe(self, pids: Iterable[int]) -> None:
+        """Remember the segments that these processes use now."""
+        for pid in pids:
+            self._seen |= self._used_by(self._proc / str(pid))
+
+    def clean(self) -> list[str]:
+        """Remove the remembered segments that no process uses any more, with their lock files.
+
+        Returns:
+            The files that were removed.
+        """
+        if not self._seen:
+            return []
+        used: set[str] = set()
+        for process in self._proc.glob("[0-9]*"):
+            used |= self._used_by(process)
+        removed = []
+        for segment in sorted(self._seen - used):
+            for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl")):
+                try:
+                    file.unlink()
+                    removed.append(str(file))
+                except OSError:  # gone already, or another user's
+                    continue
+        self._seen &= used
+        return removed
+
+    @staticmethod
+    def _used_by(process: Path) -> set[str]:
+        try:
+            return set(_SEGMENT.findall((process / "maps").read_text()))
+        except OSError:  # the process has ended, or belongs to somebody else
+            return set()

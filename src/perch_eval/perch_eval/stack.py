@@ -1,0 +1,149 @@
+"""Starts, watches and stops a group of programs, each in its own process group. Knows nothing of ROS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from perch_core.errors import PerchError
+from perch_eval.program import Ending, Program, RunningProgram
+from perch_eval.shared_memory import SharedMemory
+
+_ESCALATION = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+_PATIENCE_S = 1.0
+_POLL_S = 0.02
+
+
+class StackError(PerchError):
+    """A program ended before its time, or did not get ready.
+
+    Attributes:
+        endings: the programs that ended.
+    """
+
+    def __init__(self, message: str, endings: Sequence[Ending] = ()) -> None:
+        super().__init__(message)
+        self.endings = tuple(endings)
+
+    @property
+    def callers_mistake(self) -> bool:
+        """Whether a program refused what it was given (exit code 2)."""
+        return any(ending.code == 2 for ending in self.endings)
+
+
+class Stack:
+    """A group of programs, started together and stopped together.
+
+    Use it as a context manager: whatever happens inside, nothing is left running. Start it from a thread that
+    outlives it.
+
+    Args:
+        programs: what to start, in order.
+        log_dir: receives `<program>.log` of each.
+        environment: variables on top of the caller's.
+        on_line: receives (program name, line) for each line of output, from several threads.
+    """
+
+    def __init__(self, programs: Sequence[Program], log_dir: Path, environment: Mapping[str, str] | None = None,
+                 on_line: Callable[[str, str], None] = lambda name, line: None) -> None:
+        self._programs = tuple(programs)
+        self._log_dir = log_dir
+        self._environment = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_LOG_DIR": str(log_dir),
+                             **(environment or {})}
+        self._on_line = on_line
+        self._memory = SharedMemory()
+        self._started: dict[str, RunningProgram] = {}
+
+    def __enter__(self) -> Stack:
+        try:
+            self.start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Start every program.
+
+        Raises:
+            StackError: an executable does not exist.
+        """
+        self._log_dir.mkdir(parents=True, exist_ok=True)
+        for program in self._programs:
+            log = self._log_dir / f"{program.name}.log"
+            try:
+                self._started[program.name] = RunningProgram(program, log, self._environment, self._on_line)
+            except OSError as error:
+                raise StackError(f"{program.name} cannot be started: {error}") from None
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process id of each running program."""
+        return {name: running.pid for name, running in self._started.items() if running.running}
+
+    def endings(self) -> tuple[Ending, ...]:
+        """The programs that have ended so far."""
+        return tuple(running.ending() for running in self._started.values() if not running.running)
+
+    def wait_until_ready(self, visible: Callable[[], set[str]], timeout: float = 20.0) -> None:
+        """Wait until every node of every program is visible.
+
+        Args:
+            visible: fully qualified names of the nodes in the graph.
+            timeout: wall-clock seconds to wait at most.
+
+        Raises:
+            StackError: a program ended meanwhile, or its nodes do not appear.
+        """
+        wanted = {node for program in self._programs for node in program.nodes}
+        last = time.monotonic() + timeout
+        while not wanted <= (seen := visible()):
+            self.raise_if_ended()
+            if time.monotonic() > last:
+                missing = ", ".join(sorted(wanted - seen))
+                raise StackError(f"not ready after {timeout:g} s: {missing}. Logs: {self._log_dir}")
+            time.sleep(_POLL_S)
+        self.raise_if_ended()
+        self._memory.observe(self.pids.values())
+
+    def wait(self, done: Callable[[], bool] = lambda: False) -> tuple[Ending, ...]:
+        """Wait until `done`, or until a program ends.
+
+        Returns:
+            The programs that have ended; none where `done` came first.
+        """
+        while not (endings := self.endings()) and not done():
+            time.sleep(_POLL_S)
+        return endings
+
+    def raise_if_ended(self) -> None:
+        """Raise StackError, with reason and last lines, where a program has ended."""
+        endings = self.endings()
+        if endings:
+            raise StackError("\n".join(str(ending) for ending in endings), endings)
+
+    def stop(self) -> dict[str, Ending]:
+        """Stop everything: interrupt, after a second terminate, after another kill. Repeating it is harmless.
+
+        Returns:
+            How each program ended.
+        """
+        self._memory.observe(self.pids.values())
+        for number in _ESCALATION:
+            running = [program for program in self._started.values() if program.running]
+            for program in running:
+                program.signal(number)
+            deadline = time.monotonic() + _PATIENCE_S
+            for program in running:
+                program.wait(max(0.0, deadline - time.monotonic()))
+        for program in self._started.values():
+            program.signal(signal.SIGKILL)  # what a program may have left in its group
+        endings = {name: program.ending() for name, program in self._started.items()}
+        self._memory.clean()
+        return endings
