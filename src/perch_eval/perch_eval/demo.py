@@ -1,0 +1,102 @@
+"""Flies a scenario on the real nodes and reports it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from perch_core.errors import PerchError
+from perch_core.scenario import load_scenario
+from perch_eval.domain import free_domain
+from perch_eval.nodes import programs
+from perch_eval.pilot import FlightResult, Pilot
+from perch_eval.report import build_report
+from perch_eval.stack import Stack, StackError
+
+EXAMPLES = """examples:
+  python3 scripts/demo.py                                    perch on the wall of paper M, 1.7 m away
+  python3 scripts/demo.py --scenario surface_60_far --seed 4 --out /tmp/flight
+  python3 scripts/demo.py --scenario my_surface.yaml         your own scenario file
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of the demo."""
+    out = argparse.ArgumentParser(prog="demo.py", description=__doc__, epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a YAML file (default: %(default)s)")
+    out.add_argument("--seed", type=int, default=1, help="seed of noise, calibration and textures (default: %(default)s)")
+    out.add_argument("--out", type=Path, default=Path("out"), help="folder for report, recording and logs (default: ./%(default)s)")
+    out.add_argument("--composed", action="store_true", help="all nodes in one process")
+    out.add_argument("--realtime", action="store_true", help="paced by the wall clock instead of lockstep")
+    out.add_argument("--verbose", action="store_true", help="show the nodes' output")
+    return out
+
+
+def fly(scenario_name: str, seed: int, out: Path, composed: bool = False, realtime: bool = False,
+        verbose: bool = False) -> dict:
+    """Fly a scenario once; the report's content is returned and written to `out`.
+
+    Raises:
+        ConfigError: the scenario or a parameter is refused.
+        StackError: a node ended or did not get ready.
+    """
+    scenario = load_scenario(scenario_name)
+    out.mkdir(parents=True, exist_ok=True)
+    os.environ["ROS_DOMAIN_ID"] = str(free_domain())
+    say = (lambda name, line: print(f"  [{name}] {line}")) if verbose else (lambda name, line: None)
+    stack = Stack(programs(scenario, seed, composed=composed, lockstep=not realtime, record=out / "flight.mcap",
+                           hold_for_goal=not realtime), out / "logs", on_line=say)
+    print(f"{scenario.name}, seed {seed}: starting {'one process' if composed else 'the nodes'}", flush=True)
+    with stack:
+        pilot = Pilot()
+        try:
+            stack.wait_until_ready(pilot.visible_nodes)
+            result = pilot.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
+                               stack.raise_if_ended)
+            pilot.linger(0.5)
+        except PerchError as error:
+            if isinstance(error, StackError) and error.callers_mistake:
+                raise
+            result = FlightResult("failed", str(error), float("inf"), float("nan"))
+        finally:
+            pilot.close()
+    return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; 0 perched, 1 the flight failed, 2 the caller's mistake."""
+    args = parser().parse_args(arguments)
+    try:
+        report = fly(args.scenario, args.seed, args.out, args.composed, args.realtime, args.verbose)
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; all nodes are stopped", file=sys.stderr)
+        return 130
+    print(summary(report))
+    print(f"report: {args.out / 'report.html'}")
+    return 0 if report["outcome"] == "perched" else 1
+
+
+def summary(report: dict) -> str:
+    """A few lines for the terminal."""
+    def centimetres(key: str) -> str:
+        return ", ".join(f"{100 * v:.1f}" for v in report[key]) + " cm" if report.get(key) else "not measured"
+
+    lines = [f"outcome: {report['outcome']} ({report['message']})",
+             f"  tracking RMSE {centimetres('tracking_rmse_m')}; estimation RMSE {centimetres('estimation_rmse_m')} (x, y, z)"]
+    if report.get("contact"):
+        c = report["contact"]
+        lines.append(f"  contact: {c['normal_speed_m_s']:.2f} m/s normal, {c['tangential_speed_m_s']:.2f} m/s tangential, "
+                     f"tilt error {c['tilt_error_deg']:.1f} deg, {100 * c['offset_m']:.1f} cm off centre")
+    if report.get("max_body_rate_deg_s"):
+        lines.append(f"  largest body rate {report['max_body_rate_deg_s']:.0f} deg/s; real-time factor {report['real_time_factor']:.2f}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
