@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import fcntl
 import os
@@ -39,3 +40,10 @@ def reserved_domain(candidates: Iterable[int] = USABLE, folder: Path | None = No
             yield candidate
             return
     raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")
+
+
+def free_domain() -> int:
+    """A domain id that this process keeps to itself until it ends."""
+    stack = contextlib.ExitStack()
+    atexit.register(stack.close)
+    return stack.enter_context(reserved_domain())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -76,6 +77,8 @@ class Stack:
         """
         self._log_dir.mkdir(parents=True, exist_ok=True)
         for program in self._programs:
+            if shutil.which(program.command[0]) is None:
+                raise StackError(f"{program.name} cannot be started: there is no executable {program.command[0]}")
             log = self._log_dir / f"{program.name}.log"
             try:
                 self._started[program.name] = RunningProgram(program, log, self._environment, self._on_line)

@@ -1,0 +1,175 @@
+"""From a scenario to the nodes to start and their parameters.
+
+A node's parameters come, each over the one before, from `config/<node>.yaml`, from what the scenario as a whole says
+(vehicle, seed, who takes part), from the scenario's `parameters`, and from the caller's overrides. The result is
+written into one file per node, which is all that the node gets: so a log folder shows what was flown with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from perch_core import config
+from perch_core.errors import ConfigError, PerchError
+from perch_core.scenario import Scenario
+
+PACKAGES = {
+    "vehicle": "perch_sim",
+    "vio_model": "perch_sim",
+    "vio": "perch_perception",
+    "estimator": "perch_perception",
+    "target_localizer": "perch_perception",
+    "powerline_mapper": "perch_perception",
+    "perching_planner": "perch_planner",
+    "powerline_planner": "perch_planner",
+    "controller": "perch_control",
+    "mission": "perch_control",
+    "recorder": "perch_eval",
+}
+"""Node (which is also the name of its executable) -> package."""
+
+TRIGGERS = {
+    "vio": "camera_down",
+    "vio_model": "camera_down",
+    "target_localizer": "camera_front",
+    "powerline_mapper": "camera_front",
+    "mission": "10",
+    "recorder": "50",
+}
+"""Slow participants of the lockstep: what starts their work, an image or every n-th step."""
+
+
+@dataclass(frozen=True)
+class NodeLaunch:
+    """One node to start.
+
+    Attributes:
+        name: node and executable.
+        package: its package.
+        parameters: parameter -> value, nested or dotted.
+    """
+
+    name: str
+    package: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def module(self) -> str:
+        """Python module with the node's `create`."""
+        return f"{self.package}.{self.name}_node"
+
+    def write(self, folder: Path) -> Path:
+        """Write the parameters as a ROS parameter file, valid in every namespace."""
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / f"{self.name}.yaml"
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dict(self.parameters)}}, sort_keys=True))
+        return file
+
+
+def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence[str] = (),
+                 extra: Sequence[str] = ()) -> tuple[str, ...]:
+    """The nodes to start, in the scenario's order.
+
+    Raises:
+        PerchError: a node that does not exist, or that the scenario does not have.
+    """
+    for node in (*only, *without, *extra):
+        if node not in PACKAGES:
+            raise PerchError(f"node {node!r} is not one of {', '.join(PACKAGES)}")
+    everyone = tuple(dict.fromkeys((*scenario.nodes, *extra)))
+    for node in (*only, *without):
+        if node not in everyone:
+            raise PerchError(f"scenario {scenario.name} has no node {node!r}; its nodes: {', '.join(everyone)}")
+    chosen = tuple(n for n in everyone if (not only or n in only) and n not in without)
+    if not chosen:
+        raise PerchError("no node is left to start")
+    return chosen
+
+
+def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, scenario_source: str = "",
+                  lockstep: bool = True, overrides: Mapping[str, Mapping[str, Any]] | None = None,
+                  expected: Sequence[str] | None = None) -> tuple[NodeLaunch, ...]:
+    """The nodes with their parameters.
+
+    Args:
+        scenario: what is flown.
+        nodes: what to start.
+        seed: of every random number in the flight.
+        scenario_source: name or file of the scenario, for the nodes that read it themselves.
+        lockstep: wait for every node at every step; otherwise pace by the wall clock.
+        overrides: node -> parameter -> value, over everything else.
+        expected: nodes that take part in the flight, if others than `nodes` do (started elsewhere).
+
+    Raises:
+        ConfigError: a parameter file is no parameter file.
+        PerchError: an override for a node that is not started.
+    """
+    overrides = overrides or {}
+    for node in overrides:
+        if node not in nodes:
+            raise PerchError(f"parameter for node {node!r}, which is not started; started: {', '.join(nodes)}")
+    common = _scenario_parameters(scenario, expected or nodes, seed, scenario_source or scenario.name, lockstep)
+    launches = []
+    for node in nodes:
+        parameters = _flat(read_parameters(node)) | common.get(node, {})
+        parameters |= _flat((scenario.parameters or {}).get(node, {})) | _flat(overrides.get(node, {}))
+        launches.append(NodeLaunch(node, PACKAGES[node], parameters))
+    return tuple(launches)
+
+
+def read_parameters(node: str) -> dict[str, Any]:
+    """The parameters of `config/<node>.yaml`; none where there is no such file.
+
+    Raises:
+        ConfigError: anything else than `/**: ros__parameters:` in it.
+    """
+    file = config.config_dir() / f"{node}.yaml"
+    if not file.exists():
+        return {}
+    content = config.read_yaml(file)
+    if not isinstance(content, dict) or set(content) != {"/**"}:
+        raise ConfigError(str(file), "", "must hold one key, '/**', which is true in every namespace")
+    parameters = content["/**"]
+    if not isinstance(parameters, dict) or set(parameters) != {"ros__parameters"}:
+        raise ConfigError(str(file), "/**", "must hold one key, 'ros__parameters'")
+    return parameters["ros__parameters"] or {}
+
+
+def parse_override(text: str) -> tuple[str, str, Any]:
+    """`node.parameter:=value`, with a value in YAML, as (node, parameter, value).
+
+    Raises:
+        PerchError: text of another form.
+    """
+    target, assigned, value = text.partition(":=")
+    node, dot, parameter = target.partition(".")
+    if not (assigned and dot and node and parameter):
+        raise PerchError(f"-p {text}: expected NODE.PARAMETER:=VALUE, as in controller.position_gain:=6.0")
+    try:
+        return node, parameter, yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise PerchError(f"-p {text}: the value is not valid YAML") from None
+
+
+def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str,
+                         lockstep: bool) -> dict[str, dict[str, Any]]:
+    """What the scenario as a whole means for single nodes."""
+    participants = [f"{node}@{TRIGGERS[node]}" for node in nodes if node in TRIGGERS]
+    return {
+        "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants},
+    }
+
+
+def _flat(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested parameters under dotted names, so that later ones replace single values."""
+    flat: dict[str, Any] = {}
+    for key, value in parameters.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = list(value) if isinstance(value, tuple) else value
+    return flat

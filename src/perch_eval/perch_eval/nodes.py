@@ -1,0 +1,100 @@
+"""From a scenario to the programs that a Stack can start: one per node, or all nodes in one process."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from perch_core.errors import PerchError
+from perch_core.scenario import Scenario
+from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
+from perch_eval.program import Program
+
+Overrides = Mapping[str, Mapping[str, Any]]
+
+
+def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", composed: bool = False,
+             lockstep: bool = True, record: Path | None = None, hold_for_goal: bool = False,
+             overrides: Overrides | None = None, namespace: str = "", folder: Path | None = None) -> tuple[Program, ...]:
+    """The programs of a whole scenario.
+
+    Args:
+        scenario: what is flown.
+        seed: of every random number in the flight.
+        scenario_source: file of the scenario, where it is none of `config/scenarios`.
+        composed: run all nodes in one process.
+        lockstep: wait for every node at every step; otherwise pace by the wall clock.
+        record: add a recorder that writes this MCAP file.
+        hold_for_goal: hold simulation time at zero until the mission has a goal.
+        overrides: node -> parameter -> value, over everything else.
+        namespace: of every node, as in `/quad1`.
+        folder: receives the parameter files; by default `logs` beside the recording, or a temporary folder.
+
+    Raises:
+        PerchError: parameters or nodes are refused, or the workspace is not built.
+    """
+    nodes = choose_nodes(scenario, extra=("recorder",) if record else ())
+    own: dict[str, dict[str, Any]] = {node: dict(values) for node, values in (overrides or {}).items()}
+    if record:
+        own["recorder"] = {"file": str(record.absolute()), **own.get("recorder", {})}
+    if hold_for_goal and "mission" in nodes:
+        own["mission"] = {"hold_for_goal": True, **own.get("mission", {})}
+    if folder is None:
+        folder = record.parent / "logs" if record else Path(tempfile.mkdtemp(prefix="perch-"))
+    launches = node_launches(scenario, nodes, seed=seed, scenario_source=scenario_source, lockstep=lockstep, overrides=own)
+    return node_programs(launches, folder, namespace=namespace, composed=composed)
+
+
+def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: str = "",
+                  composed: bool = False) -> tuple[Program, ...]:
+    """The programs for some nodes. Their parameter files are written into `folder`.
+
+    Args:
+        launches: nodes with their parameters.
+        folder: receives the parameter files.
+        namespace: of every node, as in `/quad1`.
+        composed: run all nodes in one process.
+
+    Raises:
+        PerchError: the workspace is not built or not sourced.
+    """
+    arguments = {launch.name: ros_arguments(launch, folder, namespace) for launch in launches}
+    if composed:
+        plan = folder / "composed.json"
+        plan.write_text(json.dumps(
+            [{"name": n.name, "module": n.module, "arguments": arguments[n.name]} for n in launches], indent=1))
+        everyone = tuple(qualified_name(launch.name, namespace) for launch in launches)
+        return (Program("composed", (executable("perch_eval", "composed"), str(plan)), everyone),)
+    return tuple(
+        Program(n.name, (executable(n.package, n.name), *arguments[n.name]), (qualified_name(n.name, namespace),))
+        for n in launches)
+
+
+def executable(package: str, name: str) -> str:
+    """Path of an installed executable. `ros2 run` is not used: it orphans the node when it is terminated.
+
+    Raises:
+        PerchError: the package or the executable is not installed.
+    """
+    try:
+        path = Path(get_package_prefix(package)) / "lib" / package / name
+    except PackageNotFoundError:
+        raise PerchError(f"package {package} is not found: source setup.bash first") from None
+    if not path.exists():
+        raise PerchError(f"executable {name} is not installed in {path.parent}: run scripts/setup.py")
+    return str(path)
+
+
+def ros_arguments(launch: NodeLaunch, folder: Path, namespace: str = "") -> list[str]:
+    """The ROS arguments of a node; its parameter file is written into `folder`."""
+    remap = ["-r", f"__ns:={namespace}"] if namespace else []
+    return ["--ros-args", *remap, "--params-file", str(launch.write(folder))]
+
+
+def qualified_name(node: str, namespace: str = "") -> str:
+    """Fully qualified name of a node in the graph."""
+    return f"{namespace.rstrip('/')}/{node}"
