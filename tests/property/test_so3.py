@@ -1,0 +1,80 @@
+"""Rotations against scipy and against finite differences."""
+
+import numpy as np
+from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
+
+from perch_core import so3
+
+angles = st.floats(0.0, np.pi - 1e-4)
+axes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
+
+
+def rotvec(axis, angle):
+    return np.array(axis) / np.linalg.norm(axis) * angle
+
+
+@given(axes, angles)
+def test_exp_and_log_agree_with_scipy(axis, angle):
+    phi = rotvec(axis, angle)
+    R = Rotation.from_rotvec(phi)
+    assert np.allclose(so3.exp(phi), R.as_matrix(), atol=1e-12)
+    assert np.allclose(so3.log(R.as_matrix()), phi, atol=1e-7)
+    assert np.allclose(so3.quat_exp(phi), R.as_quat(canonical=True), atol=1e-12)
+
+
+@given(axes, st.sampled_from([0.0, 1e-12, 1e-9, 1e-7, 9e-7, 1.1e-6, 1e-4, 9e-3, 1.1e-2]))
+def test_small_angles_keep_precision(axis, angle):
+    phi = rotvec(axis, angle)
+    assert np.allclose(so3.quat_log(so3.quat_exp(phi)), phi, rtol=1e-9, atol=1e-16)
+    assert np.allclose(so3.exp(phi), Rotation.from_rotvec(phi).as_matrix(), atol=1e-15)
+
+
+@given(axes)
+def test_half_turns(axis):
+    R = Rotation.from_rotvec(rotvec(axis, np.pi)).as_matrix()
+    assert np.allclose(so3.exp(so3.log(R)), R, atol=1e-7)
+
+
+@given(axes, angles, axes, angles)
+def test_quaternions_compose_like_matrices(a, alpha, b, beta):
+    qa, qb = so3.quat_exp(rotvec(a, alpha)), so3.quat_exp(rotvec(b, beta))
+    v = np.array([0.3, -1.2, 2.0])
+    Ra, Rb = so3.quat_to_matrix(qa), so3.quat_to_matrix(qb)
+    assert np.allclose(so3.quat_to_matrix(so3.quat_multiply(qa, qb)), Ra @ Rb, atol=1e-12)
+    assert np.allclose(so3.quat_rotate(qa, v), Ra @ v, atol=1e-12)
+    assert np.allclose(so3.quat_multiply(qa, so3.quat_conjugate(qa)), [0, 0, 0, 1], atol=1e-12)
+    assert np.allclose(so3.quat_slerp(qa, qb, 1.0) @ qb, np.sign(so3.quat_slerp(qa, qb, 1.0) @ qb), atol=1e-7)
+
+
+@settings(deadline=None)
+@given(axes, st.floats(1e-3, 3.0))
+def test_jacobians_against_finite_differences(axis, angle):
+    phi, h = rotvec(axis, angle), 1e-6
+    for i in range(3):
+        d = np.eye(3)[i] * h
+        left = so3.log(so3.exp(phi + d) @ so3.exp(phi - d).T) / (2 * h)
+        right = so3.log(so3.exp(phi - d).T @ so3.exp(phi + d)) / (2 * h)
+        assert np.allclose(so3.left_jacobian(phi)[:, i], left, atol=1e-6)
+        assert np.allclose(so3.right_jacobian(phi)[:, i], right, atol=1e-6)
+
+
+def test_vee_inverts_hat_and_hat_is_the_cross_product():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 5, 3))
+    assert np.allclose(so3.vee(so3.hat(a)), a)
+    assert np.allclose(np.einsum("nij,nj->ni", so3.hat(a), b), np.cross(a, b))
+
+
+def test_yaw_survives_a_pitch_to_90_degrees():
+    for yaw in (-2.0, 0.3, 3.0):
+        for pitch in (0.0, -np.pi / 2, -1.0):
+            R = Rotation.from_euler("ZY", [yaw, pitch]).as_matrix()
+            assert np.isclose(np.angle(np.exp(1j * (so3.yaw_of(R) - yaw))), 0.0, atol=1e-12)
+
+
+def test_angle_between_is_accurate_at_both_ends():
+    e = np.array([0.0, 0.0, 1.0])
+    for angle in (0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-9):
+        other = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        assert np.isclose(so3.angle_between(e, other), angle, rtol=1e-6, atol=1e-15)

@@ -1,0 +1,179 @@
+"""The mission against a small model of controller, planner and pad: every phase, every ending."""
+
+import math
+
+import numpy as np
+import pytest
+
+from perch_core import so3
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import GRAVITY
+from perch_control.mission import (
+    AdhesionLimits, AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Phase,
+    PlanAnswer, Result, State, Target)
+
+TICK = 0.02
+SURFACE = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.2]), math.pi / 2)
+Q_PERCH = so3.quat_from_matrix(SURFACE.R_WS)
+
+
+class World:
+    """What the mission sees: a controller that obeys, a pad that is visible or not, velcro that holds or not."""
+
+    def __init__(self, sees=True, plans=True, sticks=True, stays=True, recovers=True, ready=True):
+        self.sees, self.plans, self.sticks, self.stays, self.recovers, self.ready = sees, plans, sticks, stays, recovers, ready
+        self.machine = MissionMachine(MissionSettings())
+        self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+        self.controller, self.trajectory_id = ControllerState.DISARMED, 0
+        self.reference = self.perch_end = self.query = None
+        self.stuck, self.off_at, self.commands, self.outcome, self.queries = False, None, [], None, 0
+
+    def force(self):
+        """Specific force in B: carried at rest, by thrust alone on the perch, by nothing with motors off in the air."""
+        g_B = so3.quat_rotate(so3.quat_conjugate(self.q), [0, 0, GRAVITY])
+        if self.off_at is not None and not self.stays and self.time > self.off_at + 0.1:
+            return np.zeros(3)
+        if np.allclose(self.q, Q_PERCH) and not self.stuck:
+            return np.array([0.0, 0.0, 3.3])
+        return g_B
+
+    def tick(self, cancel=False):
+        if self.reference is not None and self.time >= self.reference.start_time:
+            self.p = self.reference.sample(self.time - self.reference.start_time).p
+        if self.perch_end is not None and self.time >= self.perch_end:
+            self.p, self.q, self.stuck = SURFACE.p_WS, Q_PERCH, self.sticks
+            if not self.sticks and self.time > self.perch_end + 0.25 and self.recovers:
+                self.controller, self.q = ControllerState.RECOVERING, np.array([0.0, 0.0, 0.0, 1.0])
+                self.perch_end, self.hover_at = None, self.time + 1.0
+        if self.controller is ControllerState.RECOVERING and self.time > self.hover_at:
+            self.controller = ControllerState.HOVERING
+        plan = None
+        if self.query is not None:
+            plan = PlanAnswer(self.plans, "thrust floor 5.2 N > 4.05 N" if not self.plans else "ok", object(),
+                              self.query.start_time, 1.2)
+            self.query = None
+        target = Target(self.time, SURFACE.p_WS, Q_PERCH, 0.01, 0.01) if self.sees and self.time > 2.0 else None
+        out = self.machine.tick(Inputs(
+            self.time, State(self.p, self.q, np.zeros(3), np.zeros(3)), self.ready, self.controller, "says so",
+            self.trajectory_id, 0.0, target, np.tile(self.force(), (10, 1)), plan, cancel))
+        for command, _ in out.commands:
+            self.commands.append(command)
+            if command is Command.ARM:
+                self.controller = ControllerState.ARMED
+            elif command is Command.HOVER:
+                self.controller, self.hover_at, self.perch_end = ControllerState.RECOVERING, self.time + 1.0, None
+                self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
+            elif command is Command.ATTACHED:
+                self.controller, self.off_at = ControllerState.DISARMED, self.time
+            elif command is Command.DISARM:
+                self.controller = ControllerState.DISARMED
+        if out.reference is not None:
+            self.reference, self.controller, self.trajectory_id = out.reference, ControllerState.TRACKING, out.trajectory_id
+        if out.perch is not None:
+            self.reference, self.perch_end, self.trajectory_id = None, out.perch.start_time + out.perch.duration, out.trajectory_id
+        if out.query is not None:
+            self.query, self.queries = out.query, self.queries + 1
+        self.outcome = out.outcome or self.outcome
+        self.time += TICK
+        return out
+
+    def run(self, goal=None, seconds=90.0, cancel_in=None):
+        self.machine.start(goal or Goal(takeoff_height=1.2, search_timeout=6.0), self.time)
+        phases = []
+        while self.outcome is None and self.time < seconds:
+            self.tick(cancel=cancel_in is not None and cancel_in in phases)
+            if not phases or phases[-1] is not self.machine.phase:
+                phases.append(self.machine.phase)
+        return phases
+
+
+def test_a_perch_passes_through_every_phase():
+    world = World()
+    phases = world.run()
+    assert world.outcome.result is Result.PERCHED
+    assert phases == [Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING, Phase.VERIFYING,
+                      Phase.PERCHED, Phase.IDLE]
+    assert world.commands == [Command.ARM, Command.ATTACHED]
+    assert world.outcome.contact_time == pytest.approx(world.off_at)
+
+
+def test_motors_stay_on_until_adhesion_is_felt():
+    world = World(sticks=False)
+    world.run()
+    assert world.outcome.result is Result.MISSED and "recovered to a hover" in world.outcome.message
+    assert Command.ATTACHED not in world.commands
+    assert world.controller is ControllerState.HOVERING
+
+
+def test_a_second_attempt_is_flown():
+    world = World(sticks=False)
+    world.run(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=2))
+    assert world.queries == 2 and world.outcome.result is Result.MISSED
+
+
+def test_coming_off_after_the_motors_stopped_is_noticed():
+    world = World(stays=False)
+    world.run()
+    assert world.commands == [Command.ARM, Command.ATTACHED, Command.ARM, Command.HOVER]
+    assert world.outcome.result is Result.MISSED
+
+
+def test_no_target_ends_in_a_hover_after_the_pattern():
+    world = World(sees=False)
+    world.run()
+    assert world.outcome.result is Result.NOT_FOUND and "no tags seen" in world.outcome.message
+    assert world.controller is ControllerState.TRACKING  # still holding the end of the last search move
+
+
+def test_a_refusal_is_passed_on():
+    world = World(plans=False)
+    world.run()
+    assert world.outcome.result is Result.REFUSED and "thrust floor 5.2 N" in world.outcome.message
+
+
+def test_an_estimator_that_never_starts_ends_on_the_ground():
+    world = World(ready=False)
+    world.run()
+    assert world.outcome.result is Result.TIMEOUT and "estimator" in world.outcome.message
+    assert Command.ARM not in world.commands
+
+
+def test_a_hint_that_does_not_fit_is_reported():
+    world = World()
+    world.run(Goal(takeoff_height=1.2, search_timeout=4.0, inclination_hint=math.radians(45)))
+    assert world.outcome.result is Result.NOT_FOUND and "expected 45 deg" in world.outcome.message
+
+
+@pytest.mark.parametrize("phase", [Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING,
+                                   Phase.VERIFYING, Phase.PERCHED])
+def test_cancel_works_in_every_phase(phase):
+    world = World()
+    world.run(cancel_in=phase)
+    assert world.outcome.result is Result.CANCELLED
+    on_ground = phase is Phase.ARMING
+    attached = phase is Phase.PERCHED
+    assert world.controller is (ControllerState.DISARMED if on_ground or attached else ControllerState.HOVERING)
+
+
+def test_recovery_without_end_is_bounded():
+    world = World(sticks=False, recovers=False)
+    world.run()
+    assert world.outcome is not None and world.time < 60.0
+
+
+def test_adhesion_needs_place_attitude_speed_and_force():
+    target = Target(0.0, SURFACE.p_WS, Q_PERCH, 0.01, 0.01)
+    monitor = AdhesionMonitor(AdhesionLimits())
+    g_B = so3.quat_rotate(so3.quat_conjugate(Q_PERCH), [0, 0, GRAVITY])
+    at_rest = State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3))
+    monitor.add(np.tile(g_B, (29, 1)))
+    assert not monitor.attached(at_rest, target)  # the window is not full
+    monitor.add(g_B)
+    assert monitor.attached(at_rest, target)
+    assert not monitor.attached(State(SURFACE.p_WS + [0, 0, 0.4], Q_PERCH, np.zeros(3), np.zeros(3)), target)
+    assert not monitor.attached(State(SURFACE.p_WS, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), target)
+    assert not monitor.attached(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.8]), np.zeros(3)), target)
+    monitor.add(np.tile([0.0, 0.0, 3.3], (30, 1)))  # thrust alone: falling along the wall
+    assert not monitor.attached(at_rest, target)
+    monitor.add(np.zeros((30, 3)))
+    assert monitor.free_fall()
