@@ -12,12 +12,12 @@ class ImuNoise:
     """What the filter assumes of the IMU: noise of one sample, bias walks, ranges."""
 
     rate: float = quantity(500.0, unit="Hz", above=0.0, doc="nominal sample rate")
-    accel_noise: float = quantity(0.35, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
-    gyro_noise: float = quantity(0.011, unit="rad/s", above=0.0, doc="1 sigma of one sample")
-    accel_bias_walk: float = quantity(0.01, unit="m/s^2/sqrt(s)", above=0.0)
-    gyro_bias_walk: float = quantity(0.0005, unit="rad/s/sqrt(s)", above=0.0)
-    accel_bias_init: float = quantity(0.1, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
-    gyro_bias_init: float = quantity(0.02, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
+    accel_noise: float = quantity(0.32, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
+    gyro_noise: float = quantity(0.0102, unit="rad/s", above=0.0, doc="1 sigma of one sample")
+    accel_bias_walk: float = quantity(0.004, unit="m/s^2/sqrt(s)", above=0.0)
+    gyro_bias_walk: float = quantity(0.0003, unit="rad/s/sqrt(s)", above=0.0)
+    accel_bias_init: float = quantity(0.06, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
+    gyro_bias_init: float = quantity(0.01, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
     accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, doc="saturation of one axis")
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, doc="saturation of one axis")
     integration: str = choice("midpoint", options=("midpoint", "hold"), doc=(
@@ -32,7 +32,7 @@ class ImuFaults:
     gap: float = quantity(0.006, unit="s", above=0.0, doc="longest step between samples that counts as complete")
     gap_accel: float = quantity(5.0, unit="m/s^2", above=0.0, doc="1 sigma of what a missing sample may have been")
     gap_gyro: float = quantity(2.0, unit="rad/s", above=0.0, doc="1 sigma of what a missing sample may have been")
-    saturation: float = quantity(0.3, unit="-", above=0.0, high=5.0, doc="1 sigma of a saturated sample, share of its range")
+    saturation: float = quantity(1.0, unit="-", above=0.0, high=5.0, doc="1 sigma of a saturated sample, share of its range")
 
 
 @dataclass(frozen=True)

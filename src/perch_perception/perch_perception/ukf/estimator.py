@@ -50,13 +50,14 @@ class Estimator:
         outcome = self._imu.add(sample)
         if outcome is not ImuOutcome.USED:
             self._message = f"IMU sample at {sample.stamp} ns {outcome.value}"
-        if not outcome.used or self._base is None:
+        if not outcome.used:
             return outcome
-        row = self._imu.latest
-        kernels.advance(self._x, row[1], row[2], row[3], row[4], row[5], row[6], row[0])
-        self._lag += 1
-        if self._lag >= self.config.covariance_stride:
-            self._refresh()
+        if self._base is not None:
+            row = self._imu.latest
+            kernels.advance(self._x, row[1], row[2], row[3], row[4], row[5], row[6], row[0])
+            self._lag += 1
+            if self._lag >= self.config.covariance_stride:
+                self._refresh()
         if self._waiting and self._waiting[0].stamp <= self._imu.last.stamp:
             self.add_vio(self._waiting.pop(0))
         return outcome
