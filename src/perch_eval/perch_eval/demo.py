@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from pathlib import Path
 
+from perch_core import config
 from perch_core.errors import PerchError
-from perch_core.scenario import load_scenario
-from perch_eval.domain import free_domain
+from perch_core.scenario import Scenario, load_scenario
+from perch_eval.domain import reserved_domain
 from perch_eval.nodes import programs
 from perch_eval.pilot import FlightResult, Pilot
 from perch_eval.report import build_report
@@ -45,25 +47,35 @@ def fly(scenario_name: str, seed: int, out: Path, composed: bool = False, realti
     """
     scenario = load_scenario(scenario_name)
     out.mkdir(parents=True, exist_ok=True)
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain())
-    say = (lambda name, line: print(f"  [{name}] {line}")) if verbose else (lambda name, line: None)
-    stack = Stack(programs(scenario, seed, composed=composed, lockstep=not realtime, record=out / "flight.mcap",
-                           hold_for_goal=not realtime), out / "logs", on_line=say)
-    print(f"{scenario.name}, seed {seed}: starting {'one process' if composed else 'the nodes'}", flush=True)
-    with stack:
-        pilot = Pilot()
-        try:
-            stack.wait_until_ready(pilot.visible_nodes)
-            result = pilot.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
-                               stack.raise_if_ended)
-            pilot.linger(0.5)
-        except PerchError as error:
-            if isinstance(error, StackError) and error.callers_mistake:
-                raise
-            result = FlightResult("failed", str(error), float("inf"), float("nan"))
-        finally:
-            pilot.close()
+    say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
+    with reserved_domain() as domain:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        stack = Stack(programs(scenario, seed, scenario_source=str(config.find("scenarios", scenario_name)),
+                               composed=composed, lockstep=not realtime, record=out / "flight.mcap",
+                               hold_for_goal=not realtime), out / "logs", on_line=say)
+        print(f"{scenario.name}, seed {seed}: starting {'all nodes in one process' if composed else 'one process per node'}", flush=True)
+        with stack:
+            result = _pilot(scenario, stack)
     return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time)
+
+
+def _pilot(scenario: Scenario, stack: Stack) -> FlightResult:
+    """Send the goal to a started stack; a flight that breaks off is a result too, its recording is kept."""
+    pilot = Pilot()
+    try:
+        stack.wait_until_ready(pilot.visible_nodes)
+        result = pilot.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
+                           stack.raise_if_ended)
+        pilot.linger(0.5)
+        return result
+    except StackError as error:
+        if error.callers_mistake:
+            raise
+        return FlightResult("failed", str(error), pilot.time, math.nan)
+    except PerchError as error:
+        return FlightResult("failed", str(error), pilot.time, math.nan)
+    finally:
+        pilot.close()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -68,6 +68,11 @@ class Pilot:
         self._node.create_subscription(Step, "step", self._receive_step,
                                        QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
 
+    @property
+    def time(self) -> float:
+        """Newest simulation time seen [s]."""
+        return self._time
+
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
         self._executor.spin_once(timeout_sec=0.02)
