@@ -64,6 +64,11 @@ class PoseBuffer:
     def __len__(self) -> int:
         return len(self._states)
 
+    @property
+    def newest(self) -> float:
+        """Time of the newest state [s]; -inf where there is none."""
+        return self._times[-1] if self._times else -np.inf
+
     def add(self, state: BodyState) -> bool:
         """Append a state. False, and nothing happens, where it is not newer than the last or not finite."""
         if self._times and state.time <= self._times[-1]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from perch_core import so3
 from perch_core.camera import Camera
-from perch_perception.tags.pose import BoardPose, LocalizationRefusal, planar_branches, reprojection_rms
+from perch_perception.tags.pose import BoardPose, LocalizationRefusal, intrinsics_sensitivity, planar_branches, reprojection_rms
 
 
 def average_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, ids: tuple[int, ...]) -> BoardPose:
@@ -51,7 +51,10 @@ def average_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, ids
     n = len(ids)
     # with n samples of 6 unknowns the scatter is singular: keep the variances, drop what 4 tags cannot correlate
     covariance = np.diag(np.sum(error**2, axis=0) / (n * (n - 1)))
-    return BoardPose(p_CS, R_CS, covariance, tuple(ids), reprojection_rms(camera, corners_S, rays_C, p_CS, R_CS))
+    rms = reprojection_rms(camera, corners_S, rays_C, p_CS, R_CS)
+    # the lens's errors move the average much as they move the joint solution
+    by_intrinsics = intrinsics_sensitivity(camera, corners_S, np.ones(rays_C.shape[:2]), p_CS, R_CS)
+    return BoardPose(p_CS, R_CS, covariance, tuple(ids), rms, by_intrinsics)
 
 
 def _agreeing_branches(attitudes: list[list[np.ndarray]]) -> list[int]:

@@ -1,6 +1,6 @@
 """Recursive fusion of all images into one target pose in the map, with an honest covariance.
 
-A Schmidt-Kalman filter: the target's six errors are estimated, the eleven shared errors (calibration, time offset,
+A Schmidt-Kalman filter: the target's six errors are estimated, the shared errors (calibration, time offset,
 odometry) are only considered, with their correlation to the estimate. So corner noise averages out, shared errors do
 not, and near images, which they move less, weigh more.
 """
@@ -25,7 +25,7 @@ class FusedTarget:
     Attributes:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
-        joint: covariance of (dp, dtheta, c), shape (17, 17), c being the shared errors of `map_pose`.
+        joint: covariance of (dp, dtheta, c), shape (20, 20), c being the shared errors of `map_pose`.
         frames: images in it.
         refused: images in a row that contradicted it.
     """

@@ -16,15 +16,18 @@ from perch_core.camera import CameraMount
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.pose import BoardPose
 
-SHARED = 11  # extrinsic rotation (3), focal length (1), time offset (1), odometry position (3), odometry attitude (3)
+# The shared errors c, in this order
+ROTATION, INTRINSICS, TIME, BODY = slice(0, 3), slice(3, 7), 7, slice(8, 14)
+SHARED = 14
 
 
 @dataclass(frozen=True)
 class CalibrationSigma:
     """How well the camera is calibrated: 1-sigma of what stays the same from image to image."""
 
-    focal: float = config.quantity(0.003, low=0.0, high=0.1, doc="focal length, relative")
-    rotation: float = config.quantity(0.5, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis")
+    focal: float = config.quantity(0.003, low=0.0, high=0.1, doc="each focal length, relative")
+    centre: float = config.quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
+    rotation: float = config.quantity(0.29, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis of B")
     time: float = config.quantity(0.002, unit="s", low=0.0, high=0.05, doc="camera-IMU time offset")
 
 
@@ -36,8 +39,8 @@ class MapPose:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
         noise: covariance of (dp, dtheta) in the axes of W from this image alone [m, rad], shape (6, 6).
-        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 11).
-        shared: covariance of c, shape (11, 11).
+        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 14).
+        shared: covariance of c, shape (14, 14).
     """
 
     p_WS: np.ndarray
@@ -67,18 +70,16 @@ def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: C
     v_BS_W = R_WB @ mount.p_BC + v_CS_W              # from the body to S, in W
     turned = np.kron(np.eye(2), R_WC)
     by_shared = np.zeros((6, SHARED))
-    by_shared[:3, 0:3] = -so3.hat(v_CS_W)            # the camera turned by dtheta (axes of W at this moment)
-    by_shared[3:, 0:3] = np.eye(3)
-    by_shared[:, 0:3] = by_shared[:, 0:3] @ R_WB     # ... given in axes of B, where it is constant
-    by_shared[:3, 3] = v_CS_W                        # range grows with the focal length
+    # the camera turned on the vehicle by a rotation in axes of B, where it is constant
+    by_shared[:, ROTATION] = np.concatenate([-so3.hat(v_CS_W), np.eye(3)]) @ R_WB
+    by_shared[:, INTRINSICS] = turned @ board.by_intrinsics
     w_W = R_WB @ body.w_WB_B
-    by_shared[:3, 4] = body.v_WB + np.cross(w_W, v_BS_W)
-    by_shared[3:, 4] = w_W
-    by_shared[:3, 5:8] = np.eye(3)
-    by_shared[:3, 8:11] = -so3.hat(v_BS_W)
-    by_shared[3:, 8:11] = np.eye(3)
+    by_shared[:, TIME] = np.concatenate([body.v_WB + np.cross(w_W, v_BS_W), w_W])
+    by_shared[:3, BODY] = np.concatenate([np.eye(3), -so3.hat(v_BS_W)], axis=1)
+    by_shared[3:, BODY] = np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1)
     shared = np.zeros((SHARED, SHARED))
-    shared[:5, :5] = np.diag(np.array([*[np.radians(calibration.rotation)] * 3, calibration.focal,
-                                       calibration.time]) ** 2)
-    shared[5:, 5:] = body.covariance
+    sigma = [*[np.radians(calibration.rotation)] * 3, *[calibration.focal] * 2, *[calibration.centre] * 2,
+             calibration.time]
+    shared[:8, :8] = np.diag(np.square(sigma))
+    shared[BODY, BODY] = body.covariance
     return MapPose(body.p_WB + v_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, shared)

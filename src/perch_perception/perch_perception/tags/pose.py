@@ -39,6 +39,8 @@ class BoardPose:
         covariance: of (dp, dtheta) in the axes of C [m, rad], shape (6, 6), from the corners' noise alone.
         ids: tags used.
         rms: residual of the corners, per image axis [px].
+        by_intrinsics: derivative of (dp, dtheta) by errors of the lens's fx, fy (relative) and cx, cy [px] that the
+            solution does not know of, shape (6, 4).
         branch_gap: by how much chi^2 of the second-best pose is worse; inf where there is only one.
         dropped: tags left out as they contradict the others.
     """
@@ -48,6 +50,7 @@ class BoardPose:
     covariance: np.ndarray
     ids: tuple[int, ...]
     rms: float
+    by_intrinsics: np.ndarray
     branch_gap: float = np.inf
     dropped: tuple[int, ...] = ()
 
@@ -120,7 +123,8 @@ def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS) -> BoardPose:
             apart = np.concatenate([branches[1][2] - p, turn])
             covariance = covariance + np.outer(apart, apart) / (1.0 + np.exp(min(0.5 * gap, 500.0)))
     rms = float(np.sqrt(chi2 / np.sum(2.0 / noise**2)))
-    return BoardPose(p, R, covariance, tuple(ids), rms, float(gap))
+    by_intrinsics = intrinsics_sensitivity(camera, corners_S, sigma, p, R)
+    return BoardPose(p, R, covariance, tuple(ids), rms, by_intrinsics, float(gap))
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -143,6 +147,22 @@ def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.n
         np.ascontiguousarray(points_S), plane, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     return [(R_CV @ shifts[i].ravel(), R_CV @ cv2.Rodrigues(turns[i])[0]) for i in range(count)
             if np.all(np.isfinite(turns[i])) and np.all(np.isfinite(shifts[i]))]
+
+
+def intrinsics_sensitivity(camera: Camera, corners_S: np.ndarray, sigma: np.ndarray, p_CS: np.ndarray,
+                           R_CS: np.ndarray) -> np.ndarray:
+    """Derivative of the least-squares pose by the true lens's fx, fy (relative), cx, cy [px], shape (6, 4).
+
+    With residuals r(x, k), the minimum over x moves by -(J^T J)^-1 J^T dr/dk when the model's k changes; a true k that
+    is larger than the model's moves it the other way.
+    """
+    points, noise = corners_S.reshape(-1, 3), sigma.reshape(-1)
+    jacobian, pixels = _pose_jacobian(camera, points, noise, p_CS, R_CS)
+    by_k = np.zeros((len(points), 2, 4))
+    by_k[:, 0, 0], by_k[:, 1, 1] = pixels[:, 0] - camera.cx, pixels[:, 1] - camera.cy
+    by_k[:, 0, 2] = by_k[:, 1, 3] = 1.0
+    by_k = (by_k / noise[:, None, None]).reshape(-1, 4)
+    return np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ by_k)
 
 
 def reprojection_rms(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, p_CS: np.ndarray,
@@ -178,14 +198,18 @@ def _refine(camera, points, pixels, noise, p, R):
 
 
 def _linearise(camera, points, pixels, noise, p, R):
-    """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals."""
+    """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
+    jacobian, projected = _pose_jacobian(camera, points, noise, p, R)
+    residual = ((projected - pixels) / noise[:, None]).ravel()
+    if not np.all(np.isfinite(residual)):
+        return None
+    return float(residual @ residual), jacobian.T @ residual, jacobian.T @ jacobian
+
+
+def _pose_jacobian(camera, points, noise, p, R):
+    """Derivative of the whitened pixels by (dp, dtheta), shape (2k, 6), and the pixels (k, 2); NaN beyond the lens."""
     turned = points @ R.T
     points_C = turned + p
-    projected, valid = camera.project(points_C)
-    if not np.all(valid):
-        return None
-    residual = ((projected - pixels) / noise[:, None]).ravel()
     by_point = camera.project_jacobian(points_C) / noise[:, None, None]
     by_turn = -by_point @ so3.hat(turned)  # d X_C = dtheta x R X
-    jacobian = np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6)
-    return float(residual @ residual), jacobian.T @ residual, jacobian.T @ jacobian
+    return np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6), camera.project(points_C)[0]
