@@ -50,7 +50,9 @@ def _levels(texture: np.ndarray) -> list[np.ndarray]:
     return out
 
 
-def _texture(face: Face, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+def face_texture(scene: Scene, number: int, face: Face) -> np.ndarray:
+    """Full-resolution texture of `scene.faces()[number]`, uint8: rows run along -up, columns along right."""
+    rng = np.random.default_rng([scene.seed, number])
     if face.kind == "pad":
         return textures.pad(scene.board, face.texel, rng)
     cols, rows = (max(8, round(2 * half / face.texel)) for half in face.half)
@@ -63,8 +65,7 @@ def build_atlas(scene: Scene) -> Atlas:
     faces = scene.faces()
     tiles = []
     for number, face in enumerate(faces):
-        rng = np.random.default_rng([scene.seed, number])
-        tiles += [(number, level, tile) for level, tile in enumerate(_levels(_texture(face, scene, rng)))]
+        tiles += [(number, level, tile) for level, tile in enumerate(_levels(face_texture(scene, number, face)))]
     count = np.bincount([number for number, _, _ in tiles])
     affine = np.zeros((len(faces), count.max(), 4), np.float32)
     tiles.append((-1, 0, np.full((8, 8), VOID, np.uint8)))

@@ -1,8 +1,9 @@
 """The image cut into cells of 8 x 8 pixels, with the camera's rays at their corners.
 
 Between the corners of a cell rays are interpolated bilinearly. A face's texture coordinates are ratios of two
-linear functions of the ray, so perspective is exact, and what is left of the lens's curvature over 8 px
-stays below 0.03 px.
+linear functions of the ray, so perspective is exact; what the lens bends over 8 px is left out: 0.01 px
+RMS, 0.06 px in the corners of the snapdragon vehicle's image. (A pinhole's rays are kept at z = 1, where
+interpolation is exact.)
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from perch_core.camera import Camera
+from perch_core.camera import Camera, PinholeCamera
 
 CELL = 8  # [px]
 
@@ -36,9 +37,10 @@ class CellGrid:
 
     Attributes:
         rows, cols: number of cells.
-        nodes: rays in C at the corners, float32, shape (3, (rows + 1) * (cols + 1)); zero where the lens sees nothing.
+        nodes: rays in C at the corners (unit; z = 1 for a pinhole), float32, shape (3, (rows + 1) * (cols + 1)); zero where the lens sees nothing.
         corner_nodes: indices into `nodes` of each cell's TL, TR, BL, BR corner, shape (rows * cols, 4).
         corners: rays of the corners of each cell, float32, shape (rows * cols, 3, 4).
+        centres: unit rays through their centres, float32, shape (rows * cols, 3).
         blind: cells that the lens does not fill, shape (rows * cols,).
         pixel_angle: angle that a pixel spans in each cell [rad], float32, shape (rows * cols,).
     """
@@ -48,6 +50,7 @@ class CellGrid:
     nodes: np.ndarray
     corner_nodes: np.ndarray
     corners: np.ndarray
+    centres: np.ndarray
     blind: np.ndarray
     pixel_angle: np.ndarray
 
@@ -71,13 +74,15 @@ def build_grid(camera: Camera) -> CellGrid:
     index = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
     corner_nodes = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1).reshape(-1, 4)
     nodes = rays.reshape(-1, 3)
-    corners = nodes[corner_nodes]  # (cells, 4, 3)
+    corners = nodes[corner_nodes]  # (cells, 4, 3), unit rays
     across = (corners[:, 1] - corners[:, 0] + corners[:, 3] - corners[:, 2]) / 2
     along = (corners[:, 2] - corners[:, 0] + corners[:, 3] - corners[:, 1]) / 2
     solid_angle = np.linalg.norm(np.cross(across, along), axis=-1)
+    centres = corners.mean(axis=1)
+    if isinstance(camera, PinholeCamera):
+        nodes, corners = nodes / nodes[:, 2:], corners / corners[..., 2:]
     return CellGrid(
         rows, cols, np.ascontiguousarray(nodes.T, np.float32), corner_nodes,
-        np.ascontiguousarray(corners.transpose(0, 2, 1), np.float32),
-        ~seen.reshape(-1)[corner_nodes].all(axis=1),
+        np.ascontiguousarray(corners.transpose(0, 2, 1), np.float32), centres.astype(np.float32), ~seen.reshape(-1)[corner_nodes].all(axis=1),
         (np.sqrt(np.maximum(solid_angle, 1e-12)) / CELL).astype(np.float32),
     )

@@ -44,11 +44,11 @@ class Rasterizer:
         fine = uniform & fine_face[first]
         mixed = ~uniform & ~grid.blind
         tagged = mixed & self._shows_pad(view)
+        supersampling = self._fine_supersampling(view, np.flatnonzero((fine & lit) | tagged))
         self._draw_uniform(image, view, np.flatnonzero(uniform & lit & ~fine), first, 1)
-        fine_cells = np.flatnonzero(fine & lit)
-        self._draw_uniform(image, view, fine_cells, first, self._fine_supersampling(view, fine_cells, first))
+        self._draw_uniform(image, view, np.flatnonzero(fine & lit), first, supersampling)
         self._draw_mixed(image, view, np.flatnonzero(mixed & ~tagged), MIXED_SUPERSAMPLING)
-        self._draw_mixed(image, view, np.flatnonzero(tagged), PAD_SUPERSAMPLING)
+        self._draw_mixed(image, view, np.flatnonzero(tagged), max(supersampling, MIXED_SUPERSAMPLING))
         image = image.reshape(grid.rows * CELL, grid.cols * CELL)[: self.camera.height, : self.camera.width]
         if grid.blind.any():
             blind = grid.blind.reshape(grid.rows, grid.cols).repeat(CELL, 0).repeat(CELL, 1)
@@ -61,16 +61,17 @@ class Rasterizer:
 
     def _texels_per_pixel(self, view: View, cells: np.ndarray, face: np.ndarray) -> np.ndarray:
         """Geometric mean of a pixel's footprint on faces, at the cells' centres; shape of `cells`."""
-        centre = self.grid.corners[cells].mean(axis=2)
-        inverse = np.maximum(np.sum(view.M[face, 2] * centre, axis=-1), 1e-3)
+        inverse = np.maximum(np.einsum("ij,ij->i", view.M[face, 2], self.grid.centres[cells]), 1e-3)
         slant = np.clip(inverse * view.distance[face], 0.02, 1.0)  # cosine between ray and normal
         return self.grid.pixel_angle[cells] / (inverse * self.faces.texel[face] * np.sqrt(slant))
 
-    def _fine_supersampling(self, view: View, cells: np.ndarray, first: np.ndarray) -> int:
+    def _fine_supersampling(self, view: View, cells: np.ndarray) -> int:
+        """Samples per pixel and direction for the cells that show the pad."""
         if not len(cells):
             return 1
-        footprint = float(np.median(self._texels_per_pixel(view, cells, first[cells])))
-        wanted = PAD_SUPERSAMPLING if footprint > 2.0 else 2 if footprint > 0.5 else 1
+        pad = np.full(len(cells), np.flatnonzero(self.faces.fine)[0])
+        footprint = float(np.median(self._texels_per_pixel(view, cells, pad)))
+        wanted = np.ceil(PAD_SUPERSAMPLING * min(footprint, 1.0))
         affordable = int(np.sqrt(FINE_SAMPLES / (len(cells) * CELL**2)))
         return int(np.clip(wanted, 1, max(1, affordable)))
 
@@ -98,22 +99,23 @@ class Rasterizer:
         if not len(cells):
             return
         weights = sample_weights(supersampling)
-        nearest = np.zeros((len(cells), weights.shape[1]), np.float32)
+        nearest = np.full((len(cells), weights.shape[1]), 1e-6, np.float32)  # inverse range of what is in front
         x = np.full_like(nearest, self.atlas.void[0])
         y = np.full_like(nearest, self.atlas.void[1])
         for face, rows in self._candidates(view, cells):
             rays = self.grid.corners[cells[rows]]
             u, v, inverse = np.ascontiguousarray(np.matmul(view.M[face], rays).transpose(1, 0, 2)) @ weights
-            wins = inverse > np.maximum(nearest[rows], 1e-6)
+            wins = inverse > nearest[rows]
             half_u, half_v = self.faces.half[face]
             if np.isfinite(half_u):
                 wins &= (np.abs(u) <= np.float32(half_u) * inverse) & (np.abs(v) <= np.float32(half_v) * inverse)
             T = self._texture_matrices(view, cells[rows], np.full(len(rows), face), supersampling)
             column, row, w = np.ascontiguousarray(np.matmul(T, rays).transpose(1, 0, 2)) @ weights
             w = np.where(wins, w, 1.0)
-            nearest[rows] = np.where(wins, inverse, nearest[rows])
-            x[rows] = np.where(wins, column / w, x[rows])
-            y[rows] = np.where(wins, row / w, y[rows])
+            for store, value in ((nearest, inverse), (x, column / w), (y, row / w)):
+                kept = store[rows]
+                np.copyto(kept, value, where=wins)
+                store[rows] = kept
         self._look_up(image, cells, x, y, supersampling)
 
     def _candidates(self, view: View, cells: np.ndarray) -> list[tuple[int, np.ndarray]]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from perch_core.tag_board import TagBoard
 
-MEAN = 128  # grey level of a texture's mean under full light
+MEANS = (105, 150)  # range of a texture's mean grey level under full light: walls differ
 SCALES = (0.010, 0.035, 0.12, 0.4)  # sizes of the blobs [m]: some are trackable from any distance in the room
 WEIGHTS = (0.8, 1.0, 1.0, 0.8)
 EDGE = np.clip(np.rint(128 + 100 * np.tanh((np.arange(256) - 128) / 22.0)), 0, 255).astype(np.uint8)  # blobs get edges
@@ -21,7 +21,7 @@ def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast
         rng: draws it.
         rows, cols: size [texels].
         texel: size of a texel [m].
-        contrast: 99 % of the texels lie within MEAN (1 +- contrast).
+        contrast: 99 % of the texels lie within mean (1 +- contrast).
 
     Returns:
         uint8, shape (rows, cols).
@@ -38,7 +38,7 @@ def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast
     sample = total[:: max(1, rows // 256), :: max(1, cols // 256)].astype(float)
     mean = sample.mean()
     spread = max(np.percentile(np.abs(sample - mean), 99), 1.0)
-    levels = MEAN * (1.0 + contrast * np.clip((np.arange(256) - mean) / spread, -1.2, 1.2))
+    levels = rng.uniform(*MEANS) * (1.0 + contrast * np.clip((np.arange(256) - mean) / spread, -1.2, 1.2))
     return cv2.LUT(total, np.clip(np.rint(levels), 0, 255).astype(np.uint8))
 
 

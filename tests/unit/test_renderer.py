@@ -1,0 +1,180 @@
+"""Rendered images against a ray caster, the tag detector and the camera model."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perch_core.camera import CameraMount, EquidistantCamera, looking_along
+from perch_core.errors import ConfigError
+from perch_core.surface import PerchSurface
+from perch_core.tag_board import load_board
+from perch_sim.rendering import Box, Renderer, Scene
+from perch_sim.rendering.sensor import PSF_SIGMA
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "oracles"))
+from ray_caster import cast  # noqa: E402
+
+CAMERA = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.003908, -0.009574, 0.010173, -0.003329))
+FRONT = CameraMount("front", CAMERA, [0.05, 0, 0], looking_along([1, 0, 0], [0, 0, 1]))
+DOWN = CameraMount("down", CAMERA, [0.02, 0, -0.02], looking_along([0, 0, -1], [1, 0, 0]))
+BOARD = load_board("pad_four_tags")
+PAD = 8  # number of the pad's face: after six of the room and two of the panel
+DETECTOR = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
+
+
+def make_scene(inclination: float = 90.0, distance: float = 1.7, **changes) -> Scene:
+    target = PerchSurface.from_inclination([distance, 0, 1.2], np.radians(inclination), size=(1.2, 1.2))
+    return Scene(**{"room_low": [-4, -2.5, 0], "room_high": [6, 2.5, 4], "target": target, "board": BOARD} | changes)
+
+
+WALL = make_scene()
+
+
+def level(x: float, y: float, z: float, nose_up: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([x, y, z]), Rotation.from_euler("Y", -nose_up, degrees=True).as_matrix()
+
+
+def noiseless(scene: Scene, mount: CameraMount, pose, **arguments) -> np.ndarray:
+    """What falls on the sensor: no noise, vignetting or blur."""
+    return Renderer(scene, mount)._light(*mount.pose(*pose), np.zeros(3), **arguments)
+
+
+@pytest.mark.parametrize("mount, pose, window", [
+    (FRONT, level(0, 0, 1.2), (180, 300, 260, 380)),           # 1.7 m, head on
+    (DOWN, level(0.95, 0.05, 1.5, 45), (0, 220, 200, 480)),    # half way through the manoeuvre
+    (DOWN, level(1.45, 0.0, 1.3, 80), (0, 200, 60, 320)),      # 25 cm from the pad, tags in the corners of the lens
+    (DOWN, level(0, 0, 1.2), (0, 120, 0, 160)),                # floor, corner of the image
+    (FRONT, level(-1, 1, 1.6, 20), (200, 320, 200, 400))],     # panel, walls and floor meet
+    ids=["pad", "manoeuvre", "close", "floor", "edges"])
+def test_images_are_those_of_a_ray_caster(mount, pose, window):
+    truth, face = cast(WALL, CAMERA, *mount.pose(*pose), window)
+    drawn = noiseless(WALL, mount, pose)[window[0]:window[1], window[2]:window[3]].astype(float)
+    difference = cv2.GaussianBlur(drawn - truth, (5, 5), PSF_SIGMA)[3:-3, 3:-3]
+    on_pad = face[3:-3, 3:-3] == PAD
+    for region in (on_pad, ~on_pad):
+        if region.sum() > 100:
+            assert np.sqrt(np.mean(difference[region] ** 2)) <= 4.0
+
+
+@pytest.mark.parametrize("inclination", [60.0, 90.0])
+@pytest.mark.parametrize("distance, zoom", [(1.7, 1), (3.0, 2)])
+def test_detector_finds_all_tags_where_the_camera_model_puts_them(inclination, distance, zoom):
+    """Realistic images: noise, blur, low contrast. At 3 m on the frame enlarged twice, as the localizer does."""
+    scene = make_scene(inclination, distance)
+    pose = level(0, 0, 1.2)
+    image = Renderer(scene, FRONT, seed=3).render([pose], np.random.default_rng(5))
+    assert image.shape == (480, 640) and image.dtype == np.uint8
+    image = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+    corners, ids, _ = DETECTOR.detectMarkers(image)
+    assert sorted(ids.ravel()) == [0, 1, 2, 3]
+    p_WC, R_WC = FRONT.pose(*pose)
+    for tag_id, found in zip(ids.ravel(), corners):
+        tag_W = scene.target.to_world(BOARD.corners_S[BOARD.ids.index(tag_id)])
+        expected, _ = CAMERA.project((tag_W - p_WC) @ R_WC)
+        np.testing.assert_allclose((found[0] + 0.5) / zoom - 0.5, expected, atol=2.0)  # unrefined corners
+
+
+def test_pad_edges_are_where_the_camera_model_puts_them_to_a_twentieth_of_a_pixel():
+    """Sub-pixel registration of the image with a ray-cast one, over the whole pad."""
+    pose, window = level(0, 0, 1.2), (170, 310, 250, 390)
+    truth, _ = cast(WALL, CAMERA, *FRONT.pose(*pose), window)
+    drawn = noiseless(WALL, FRONT, pose)[window[0]:window[1], window[2]:window[3]]
+    shift, response = cv2.phaseCorrelate(truth.astype(float), drawn.astype(float))
+    assert response > 0.9
+    assert np.hypot(*shift) < 0.05
+
+
+def test_same_seed_and_poses_give_the_same_bytes_and_noise_differs_between_frames():
+    def images(seed: int) -> list[bytes]:
+        renderer, rng = Renderer(make_scene(), FRONT, seed), np.random.default_rng(seed)
+        return [renderer.render([level(0, 0, 1.2)], rng).tobytes() for _ in range(2)]
+
+    first, again, other = images(1), images(1), images(2)
+    assert first == again
+    assert first[0] != first[1] and first[0] != other[0]
+
+
+def test_threads_may_share_a_renderer():
+    renderer = Renderer(WALL, DOWN)
+    poses = [level(0.1 * i, 0, 1.0 + 0.1 * i, 10.0 * i) for i in range(8)]
+    alone = [renderer.render([pose], np.random.default_rng(0)) for pose in poses]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda pose: renderer.render([pose], np.random.default_rng(0)), poses))
+    for a, b in zip(alone, together):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("mount", [FRONT, DOWN], ids=["front", "down"])
+def test_every_attitude_and_place_shows_the_room_or_the_panel(mount):
+    """No void: in a closed room every ray of the lens ends on something, textured and lit."""
+    rng = np.random.default_rng(7)
+    scene = make_scene(120.0, boxes=(Box(np.array([2.5, 1.5, 0.4]), np.eye(3), (0.8, 0.8, 0.8)),))
+    renderer = Renderer(scene, mount)
+    for _ in range(12):
+        p_WB, R_WB = rng.uniform([-3.5, -2, 0.3], [5.5, 2, 3.7]), Rotation.random(random_state=rng).as_matrix()
+        window = (40, 80, 60, 100)
+        truth, face = cast(scene, CAMERA, *mount.pose(p_WB, R_WB), window)
+        drawn = renderer._light(*mount.pose(p_WB, R_WB), np.zeros(3))[40:80, 60:100].astype(float)
+        assert (face >= 0).all()
+        assert np.sqrt(np.mean(cv2.GaussianBlur(drawn - truth, (5, 5), 1.0) ** 2)) <= 5.0
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.02])
+def test_down_camera_sees_the_pad_at_contact(gap):
+    contact, R_WB = WALL.target.contact_pose(gap + 0.02)
+    image = noiseless(WALL, DOWN, (contact, R_WB))
+    assert np.mean(image[100:380, 150:490] < 90) > 0.9  # dark velcro all over the middle
+
+
+def test_target_shift_moves_panel_and_pad_together():
+    shift = np.array([0.1, -0.2, 0.15])
+    moved = make_scene(target=PerchSurface(WALL.target.p_WS + shift, WALL.target.R_WS, WALL.target.size))
+    pose = level(0, 0, 1.2)
+    by_shift = Renderer(WALL, FRONT)._light(*FRONT.pose(*pose), shift).astype(int)
+    by_scene = noiseless(moved, FRONT, pose).astype(int)
+    assert np.abs(by_shift - by_scene).max() <= 2
+    assert np.abs(by_shift - noiseless(WALL, FRONT, pose)).max() > 100
+
+
+def test_camera_that_left_the_room_still_gets_an_image():
+    image = Renderer(WALL, FRONT).render([level(9.0, 0, 1.2)], np.random.default_rng(0))
+    assert image.shape == (480, 640)
+
+
+def test_turning_blurs_along_the_motion_only():
+    """A yaw of 3 deg within the exposure: the picture keeps its rows and loses its columns."""
+    yaw = [(np.array([0, 0, 1.2]), Rotation.from_euler("Z", a, degrees=True).as_matrix()) for a in np.linspace(-1.5, 1.5, 5)]
+    renderer = Renderer(WALL, FRONT)
+    sharp = renderer.render(yaw[2:3], np.random.default_rng(0)).astype(float)[180:300, 260:380]
+    blurred = renderer.render(yaw, np.random.default_rng(0)).astype(float)[180:300, 260:380]
+
+    def energy(image: np.ndarray, axis: int) -> float:
+        return float(np.mean(np.diff(cv2.GaussianBlur(image, (3, 3), 1.0), axis=axis) ** 2))
+
+    assert energy(blurred, 1) < 0.4 * energy(sharp, 1)
+    assert energy(blurred, 0) > 0.5 * energy(sharp, 0)
+
+
+def test_standing_still_is_not_blurred():
+    pose = level(0, 0, 1.2)
+    renderer = Renderer(WALL, FRONT)
+    np.testing.assert_array_equal(renderer.render([pose] * 7, np.random.default_rng(0)),
+                                  renderer.render([pose], np.random.default_rng(0)))
+
+
+def test_scenes_that_cannot_be_are_refused():
+    with pytest.raises(ConfigError, match="room_high"):
+        Scene([0, 0, 0], [1, 1, 0])
+    with pytest.raises(ConfigError, match="contrast"):
+        make_scene(contrast=1.5)
+    with pytest.raises(ConfigError, match="light"):
+        make_scene(light=0.0)
+    with pytest.raises(ConfigError, match="board"):
+        make_scene(target=None)
