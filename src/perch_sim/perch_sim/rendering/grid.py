@@ -37,7 +37,8 @@ class CellGrid:
 
     Attributes:
         rows, cols: number of cells.
-        nodes: rays in C at the corners (unit; z = 1 for a pinhole), float32, shape (3, (rows + 1) * (cols + 1)); zero where the lens sees nothing.
+        nodes: rays in C at the corners (unit; z = 1 for a pinhole), float32, shape (3, (rows + 1) * (cols + 1));
+            zero where the lens sees nothing.
         corner_nodes: indices into `nodes` of each cell's TL, TR, BL, BR corner, shape (rows * cols, 4).
         corners: rays of the corners of each cell, float32, shape (rows * cols, 3, 4).
         centres: unit rays through their centres, float32, shape (rows * cols, 3).
@@ -83,6 +84,7 @@ def build_grid(camera: Camera) -> CellGrid:
         nodes, corners = nodes / nodes[:, 2:], corners / corners[..., 2:]
     return CellGrid(
         rows, cols, np.ascontiguousarray(nodes.T, np.float32), corner_nodes,
-        np.ascontiguousarray(corners.transpose(0, 2, 1), np.float32), centres.astype(np.float32), ~seen.reshape(-1)[corner_nodes].all(axis=1),
+        np.ascontiguousarray(corners.transpose(0, 2, 1), np.float32), centres.astype(np.float32),
+        ~seen.reshape(-1)[corner_nodes].all(axis=1),
         (np.sqrt(np.maximum(solid_angle, 1e-12)) / CELL).astype(np.float32),
     )
