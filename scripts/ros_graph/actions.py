@@ -1,0 +1,74 @@
+"""Lists actions and sends goals."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient, get_action_names_and_types
+from rclpy.action.client import ClientGoalHandle
+
+from ros_graph.commands import GraphError
+from ros_graph.connection import Visit, visit
+from ros_graph.interfaces import interface
+from ros_graph.message_text import to_yaml
+from ros_graph.message_values import fill, parse
+
+_STATUS = {
+    GoalStatus.STATUS_SUCCEEDED: "SUCCEEDED",
+    GoalStatus.STATUS_CANCELED: "CANCELED",
+    GoalStatus.STATUS_ABORTED: "ABORTED",
+}
+
+
+def list_actions(arguments: argparse.Namespace) -> int:
+    """`action.py list`"""
+    with visit() as graph:
+        actions = graph.settle(lambda: get_action_names_and_types(graph.node), arguments.spin_time)
+    for name, types in sorted(actions):
+        print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
+    return 0
+
+
+def send_goal(arguments: argparse.Namespace) -> int:
+    """`action.py send_goal`: 0 where the goal succeeds, 1 where it does not. Ctrl-C cancels the goal."""
+    cls = interface(arguments.type, "action")
+    goal = fill(cls.Goal(), parse(arguments.values, "goal"))
+    with visit() as graph:
+        action = graph.absolute(arguments.action)
+        client = ActionClient(graph.node, cls, action)
+        if not graph.spin_until(client.server_is_ready, arguments.spin_time):
+            raise GraphError(f"action {action} does not exist with type {arguments.type}; 'action.py list -t' shows all")
+
+        def show(message) -> None:
+            sys.stdout.write(f"feedback:\n{_indented(to_yaml(message.feedback))}")
+            sys.stdout.flush()
+
+        sent = client.send_goal_async(goal, feedback_callback=show if arguments.feedback else None)
+        handle = graph.answer(sent, action)
+        if not handle.accepted:
+            print("goal rejected")
+            return 1
+        print("goal accepted", flush=True)
+        outcome = _result(graph, handle)
+        client.destroy()
+    status = _STATUS.get(outcome.status, f"UNKNOWN ({outcome.status})")
+    sys.stdout.write(f"result:\n{_indented(to_yaml(outcome.result))}goal finished: {status}\n")
+    return 0 if outcome.status == GoalStatus.STATUS_SUCCEEDED else 1
+
+
+def _result(graph: Visit, handle: ClientGoalHandle):
+    """The goal's result, however long it takes; after Ctrl-C that of the cancelled goal."""
+    result = handle.get_result_async()
+    try:
+        graph.spin_until(result.done)
+    except KeyboardInterrupt:
+        print("cancelling the goal", file=sys.stderr)
+        graph.answer(handle.cancel_goal_async(), "cancel")
+        return graph.answer(result, "cancelled goal", timeout=30.0)
+    return result.result()
+
+
+def _indented(text: str) -> str:
+    return "".join(f"  {line}\n" for line in text.splitlines())

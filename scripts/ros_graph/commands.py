@@ -1,0 +1,68 @@
+"""What the graph scripts share: the frame of their command line. Standard library only."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from typing import Callable, Mapping
+
+from perch_setup import enter
+
+CALLERS_MISTAKE = 2
+INTERRUPTED = 130
+
+
+class GraphError(Exception):
+    """Something in the graph is not as the caller thinks. The message is one line."""
+
+
+def parser(description: str, examples: str) -> argparse.ArgumentParser:
+    """A command line with examples below its help."""
+    return argparse.ArgumentParser(
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+
+
+def add_spin_time(target: argparse.ArgumentParser) -> None:
+    """How long to wait for the graph to become known."""
+    target.add_argument(
+        "--spin-time", type=float, default=3.0, metavar="S", help="wait at most so long for discovery [s] (default: 3)"
+    )
+
+
+def main(command_line: argparse.ArgumentParser, handlers: Mapping[str, str]) -> int:
+    """Parse, set up if necessary, and run one sub-command.
+
+    Args:
+        command_line: with sub-commands that set `command`.
+        handlers: sub-command -> `module:function` in this package; imported only inside the environment.
+    """
+    arguments = command_line.parse_args()
+    enter()
+    module, function = handlers[arguments.command].split(":")
+    return run(lambda: getattr(importlib.import_module(f"ros_graph.{module}"), function)(arguments))
+
+
+def run(command: Callable[[], int]) -> int:
+    """Run a command; errors become one line, Ctrl-C and a closed pipe end it quietly.
+
+    Returns:
+        The exit code: that of the command, or 2 for the caller's mistakes.
+    """
+    try:
+        code = command()
+        sys.stdout.flush()
+        return code
+    except GraphError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return CALLERS_MISTAKE
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:  # `topic.py echo ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0

@@ -1,0 +1,112 @@
+"""A short visit to the ROS graph."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+
+from ros_graph.commands import GraphError
+
+T = TypeVar("T")
+_SETTLED_S = 0.7
+"""Discovery counts as finished when nothing new has come for so long."""
+
+
+class Visit:
+    """A hidden node, and what is needed to wait for answers with it."""
+
+    def __init__(self, node: Node, executor: EventsExecutor, context: Context) -> None:
+        self.node = node
+        self._executor = executor
+        self._context = context
+
+    def spin_until(self, done: Callable[[], bool], timeout: float | None = None) -> bool:
+        """Handle what arrives until `done`.
+
+        Returns:
+            Whether `done` came before the timeout.
+        """
+        last = None if timeout is None else time.monotonic() + timeout
+        while self._context.ok() and not done():
+            if last is not None and time.monotonic() > last:
+                return False
+            try:
+                self._executor.spin_once(timeout_sec=0.05)
+            except ExternalShutdownException:
+                break
+        return done()
+
+    def answer(self, future: Future, what: str, timeout: float = 10.0) -> Any:
+        """The result of a future.
+
+        Raises:
+            GraphError: no answer in time.
+        """
+        if not self.spin_until(future.done, timeout):
+            raise GraphError(f"{what}: no answer within {timeout:g} s")
+        return future.result()
+
+    def settle(self, observe: Callable[[], T], timeout: float) -> T:
+        """An observation of the graph, made once discovery brings nothing new any more."""
+        seen, since = observe(), time.monotonic()
+        end = since + timeout
+
+        def settled() -> bool:
+            nonlocal seen, since
+            now = observe()
+            if now != seen:
+                seen, since = now, time.monotonic()
+            return time.monotonic() - since > _SETTLED_S or time.monotonic() > end
+
+        self.spin_until(settled)
+        return seen
+
+    def find(self, observe: Callable[[], T | None], timeout: float) -> T | None:
+        """An observation as soon as there is one; None after the timeout."""
+        found: T | None = None
+
+        def appeared() -> bool:
+            nonlocal found
+            found = observe()
+            return found is not None
+
+        self.spin_until(appeared, timeout)
+        return found
+
+    def absolute(self, name: str) -> str:
+        """A name as the graph knows it."""
+        return name if name.startswith("/") else f"/{name}"
+
+
+@contextmanager
+def visit() -> Iterator[Visit]:
+    """Join the graph with a hidden node, and leave it again."""
+    context = Context()
+    rclpy.init(args=[], context=context)
+    node = Node(
+        f"_perch_{time.time_ns() % 1_000_000_000}",
+        context=context,
+        start_parameter_services=False,
+        enable_rosout=False,
+    )
+    executor = EventsExecutor(context=context)
+    executor.add_node(node)
+    try:
+        yield Visit(node, executor, context)
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def hidden(name: str) -> bool:
+    """Whether a part of a name begins with an underscore, which ROS keeps out of lists."""
+    return any(part.startswith("_") for part in name.split("/"))

@@ -1,0 +1,112 @@
+"""Reads and sets parameters of running nodes."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import yaml
+from rcl_interfaces.msg import ParameterType
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+
+from ros_graph.commands import GraphError
+from ros_graph.connection import Visit, hidden, visit
+
+
+def list_parameters(arguments: argparse.Namespace) -> int:
+    """`param.py list`: of one node, or of all."""
+    with visit() as graph:
+        nodes = [graph.absolute(arguments.node)] if arguments.node else _nodes(graph, arguments.spin_time)
+        for node in nodes:
+            names = _names(graph, _client(graph, node, arguments.spin_time), node)
+            print(f"{node}:")
+            print("".join(f"  {name}\n" for name in names), end="")
+    return 0
+
+
+def get_parameter(arguments: argparse.Namespace) -> int:
+    """`param.py get`"""
+    with visit() as graph:
+        node = graph.absolute(arguments.node)
+        value = _values(graph, _client(graph, node, arguments.spin_time), node, [arguments.parameter])[0]
+        if value.type == ParameterType.PARAMETER_NOT_SET:
+            raise GraphError(f"{node} has no parameter {arguments.parameter!r}; 'param.py list {node}' shows all")
+        shown = _plain(parameter_value_to_python(value))
+        print(shown if not isinstance(shown, str) else repr(shown))
+    return 0
+
+
+def set_parameter(arguments: argparse.Namespace) -> int:
+    """`param.py set`: 1 where the node refuses the value."""
+    try:
+        value = yaml.safe_load(arguments.value)
+    except yaml.YAMLError:
+        raise GraphError(f"value {arguments.value!r} is not valid YAML") from None
+    with visit() as graph:
+        node = graph.absolute(arguments.node)
+        client = _client(graph, node, arguments.spin_time)
+        name = arguments.parameter
+        present = _values(graph, client, node, [name])[0]
+        if present.type == ParameterType.PARAMETER_DOUBLE and type(value) is int:
+            value = float(value)
+        if present.type == ParameterType.PARAMETER_DOUBLE_ARRAY and isinstance(value, list):
+            value = [float(item) if type(item) is int else item for item in value]
+        try:
+            parameter = Parameter(name, value=value)
+        except (TypeError, ValueError, AssertionError):
+            raise GraphError(f"{name}: {value!r} is not a value that a parameter can have") from None
+        result = graph.answer(client.set_parameters([parameter]), node).results[0]
+    if not result.successful:
+        print(f"{node} refused {name}: {result.reason}")
+        return 1
+    print(f"{node}: {name} is now {value!r}")
+    return 0
+
+
+def dump_parameters(arguments: argparse.Namespace) -> int:
+    """`param.py dump`: as a parameter file."""
+    with visit() as graph:
+        node = graph.absolute(arguments.node)
+        client = _client(graph, node, arguments.spin_time)
+        names = _names(graph, client, node)
+        values = _values(graph, client, node, names)
+    tree: dict[str, Any] = {}
+    for name, value in zip(names, values):
+        if value.type == ParameterType.PARAMETER_NOT_SET:
+            continue
+        *groups, leaf = name.split(".")
+        branch = tree
+        for group in groups:
+            branch = branch.setdefault(group, {})
+        branch[leaf] = _plain(parameter_value_to_python(value))
+    print(yaml.safe_dump({node: {"ros__parameters": tree}}, sort_keys=False), end="")
+    return 0
+
+
+def _nodes(graph: Visit, timeout: float) -> list[str]:
+    found = graph.settle(graph.node.get_node_names_and_namespaces, timeout)
+    return sorted(f"{space.rstrip('/')}/{name}" for name, space in found if not hidden(name))
+
+
+def _client(graph: Visit, node: str, timeout: float) -> AsyncParameterClient:
+    client = AsyncParameterClient(graph.node, node)
+    if not graph.spin_until(client.services_are_ready, timeout):
+        raise GraphError(f"node {node} does not exist or has no parameters; nodes: {', '.join(_nodes(graph, 1.0))}")
+    return client
+
+
+def _names(graph: Visit, client: AsyncParameterClient, node: str) -> list[str]:
+    return sorted(graph.answer(client.list_parameters([], 0), node).result.names)
+
+
+def _values(graph: Visit, client: AsyncParameterClient, node: str, names: list[str]) -> list[Any]:
+    values = list(graph.answer(client.get_parameters(names), node).values)
+    if len(values) != len(names):  # how a node says that it does not know one of them
+        raise GraphError(f"{node} does not know {', '.join(names)}; 'param.py list {node}' shows all")
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, bytes as numbers."""
+    return list(value) if hasattr(value, "__len__") and not isinstance(value, str) else value

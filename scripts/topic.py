@@ -1,0 +1,86 @@
+#!/usr/bin/env python3
+"""Look at topics, with the arguments of `ros2 topic`, on machines without the `ros2` command."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from ros_graph.commands import add_spin_time, main, parser
+from ros_graph.qos_options import add_qos_options
+
+EXAMPLES = """examples:
+  python3 scripts/topic.py list -t
+  python3 scripts/topic.py echo /odometry --field pose.pose.position
+  python3 scripts/topic.py echo /camera_front/image_raw --once --no-arr
+  python3 scripts/topic.py hz /imu/data_raw --window 500
+  python3 scripts/topic.py info /trajectory -v
+"""
+HANDLERS = {
+    "list": "topics:list_topics",
+    "type": "topics:show_type",
+    "info": "topics:show_info",
+    "echo": "echo:echo",
+    "hz": "rate:measure_rate",
+    "pub": "publish:publish",
+}
+
+
+def command_line() -> argparse.ArgumentParser:
+    """Sub-commands and their arguments."""
+    top = parser(__doc__ or "", EXAMPLES)
+    commands = top.add_subparsers(dest="command", required=True, metavar="|".join(HANDLERS))
+
+    listing = commands.add_parser("list", help="the topics of the graph")
+    listing.add_argument("-t", "--show-types", action="store_true")
+    listing.add_argument("-c", "--count-topics", action="store_true")
+    listing.add_argument("--include-hidden-topics", action="store_true")
+
+    commands.add_parser("type", help="a topic's type").add_argument("topic")
+
+    info = commands.add_parser("info", help="a topic's type, publishers and subscribers")
+    info.add_argument("topic")
+    info.add_argument("-v", "--verbose", action="store_true", help="nodes and QoS")
+
+    echo = commands.add_parser("echo", help="print messages as they come")
+    _add_topic(echo)
+    echo.add_argument("--once", action="store_true", help="end after one message")
+    echo.add_argument("-n", type=int, metavar="N", help="end after N messages")
+    echo.add_argument("--timeout", type=float, metavar="S", help="end after so long [s]; exit code 1 if nothing came")
+    echo.add_argument("--field", metavar="PATH", help="only a part, as in pose.pose.position.x or rotor_speed[0]")
+    echo.add_argument("--csv", action="store_true", help="one line per message")
+    echo.add_argument("--no-arr", action="store_true", help="do not print arrays")
+    echo.add_argument("--no-str", action="store_true", help="do not print strings")
+    echo.add_argument("--flow-style", action="store_true", help="short arrays on one line")
+    echo.add_argument("-f", "--full-length", action="store_true", help="print arrays and strings to their end")
+    echo.add_argument("-l", "--truncate-length", type=int, default=128, metavar="N", help="default: 128")
+    add_qos_options(echo)
+
+    rate = commands.add_parser("hz", help="measure the rate")
+    _add_topic(rate)
+    rate.add_argument("-w", "--window", type=int, default=10_000, metavar="N", help="messages to average over")
+    rate.add_argument("-n", type=int, metavar="N", help="end after N messages")
+    add_qos_options(rate)
+
+    publish = commands.add_parser("pub", help="publish a message")
+    publish.add_argument("topic")
+    publish.add_argument("type")
+    publish.add_argument("values", nargs="?", default="", help="fields in YAML, as in '{data: 1.0}'")
+    publish.add_argument("-r", "--rate", type=float, default=1.0, metavar="HZ")
+    publish.add_argument("-1", "--once", action="store_true")
+    publish.add_argument("-t", "--times", type=int, metavar="N")
+    publish.add_argument("-w", "--wait-matching-subscriptions", type=int, metavar="N")
+    add_qos_options(publish)
+
+    for command in commands.choices.values():
+        add_spin_time(command)
+    return top
+
+
+def _add_topic(command: argparse.ArgumentParser) -> None:
+    command.add_argument("topic")
+    command.add_argument("type", nargs="?", help="its type; by default the graph is asked")
+
+
+if __name__ == "__main__":
+    sys.exit(main(command_line(), HANDLERS))
