@@ -1,0 +1,171 @@
+"""The rules of contact: when the velcro holds, what is a bounce, a landing, a collision or a crash.
+
+Forces are in `dynamics`; here it is decided what a touch means. The limits of adhesion are facts of the material and
+come from the scenario.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.scenario import Adhesion
+from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.dynamics import Hold
+from perch_sim.obstacles import Obstacles
+
+SEPARATION = 0.05      # a touch is over when nothing has touched for so long [s]
+CRASH_SPEED = 2.0      # rotors and frame do not survive a faster impact [m/s]
+LANDING_TILT = math.radians(45.0)  # steeper on the floor is no landing
+SETTLING = 0.02        # time constant with which the velcro draws the plate flat [s]
+FREE = Hold(False, -1, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+class Impact(NamedTuple):
+    """How the plate meets a surface."""
+
+    normal_speed: float      # into the surface [m/s]
+    tangential_speed: float  # [m/s]
+    tilt_error: float        # between b3 and s3 [rad]
+    offset_S: np.ndarray     # plate's centre from the surface's origin along s1, s2, s3, (3,) [m]
+
+
+def impact_of(x: np.ndarray, plate_offset: float, p_WS: np.ndarray, R_WS: np.ndarray, v_WS: np.ndarray) -> Impact:
+    """The impact of the plate's centre on a surface.
+
+    Args:
+        x: state (13,).
+        plate_offset: plate below the centre of mass [m].
+        p_WS, R_WS, v_WS: the surface's origin [m], axes and velocity [m/s].
+    """
+    R_WB = so3.quat_to_matrix(x[3:7])
+    arm_B = np.array([0.0, 0.0, -plate_offset])
+    velocity_S = R_WS.T @ (x[7:10] + R_WB @ np.cross(x[10:13], arm_B) - v_WS)
+    return Impact(float(-velocity_S[2]), float(np.hypot(velocity_S[0], velocity_S[1])),
+                  float(so3.angle_between(R_WB[:, 2], R_WS[:, 2])), R_WS.T @ (x[:3] + R_WB @ arm_B - p_WS))
+
+
+def adhesion_refusal(impact: Impact, adhesion: Adhesion, pad_half: np.ndarray) -> str:
+    """Why the velcro does not hold, one clause per missed limit; empty: it holds."""
+    low, high = adhesion.normal_speed
+    beside = float(np.max(np.abs(impact.offset_S[:2]) - pad_half))
+    tilt = math.degrees(impact.tilt_error)
+    problems = [
+        (beside > 0.0, f"touched {beside:.3f} m outside the pad"),
+        (not low <= impact.normal_speed <= high,
+         f"normal speed {impact.normal_speed:.2f} is outside [{low:g}, {high:g}] m/s"),
+        (impact.tangential_speed > adhesion.tangential_speed_max,
+         f"tangential speed {impact.tangential_speed:.2f} is above {adhesion.tangential_speed_max:g} m/s"),
+        (tilt > adhesion.tilt_error_max_deg, f"tilt error {tilt:.1f} is above {adhesion.tilt_error_max_deg:g} deg"),
+        (not adhesion.enabled, "adhesion is switched off in the scenario"),
+    ]
+    return "; ".join(text for missed, text in problems if missed)
+
+
+class ContactMonitor:
+    """Follows touches over time. Owns what holds the vehicle and whether it has crashed."""
+
+    def __init__(self, plate_offset: float, obstacles: Obstacles, adhesion: Adhesion) -> None:
+        self._plate_offset, self._obstacles, self._adhesion = plate_offset, obstacles, adhesion
+        self._touched: dict[int, tuple[float, ContactState]] = {}  # surface -> last touch, its state
+        self._attached_at = 0.0
+        self._settle: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(3))
+        self._final: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(4))
+        self.hold: Hold = FREE
+        self.crashed = False
+
+    @property
+    def attached(self) -> bool:
+        """Whether the velcro holds."""
+        return self.hold.active
+
+    def update(self, time: float, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
+        """What changed at this instant.
+
+        Args:
+            time: [s].
+            x: state (13,).
+            distances: of the plate and of everything else to each surface (m, 2) [m]; negative touches.
+        """
+        events = []
+        for s in range(len(distances)):
+            plate, rest = distances[s, 0] < 0.0, distances[s, 1] < 0.0
+            if self.attached and s == self.hold.surface:
+                continue
+            if plate or rest:
+                event = self._touch(time, s, x, plate, rest)
+                events += [event] if event else []
+        events += self._separations(time)
+        if self.attached:
+            self._draw_flat(time)
+        return events
+
+    def _touch(self, time: float, s: int, x: np.ndarray, plate: bool, rest: bool) -> ContactEvent | None:
+        known = self._touched.get(s)
+        if known is not None and (known[1] is ContactState.COLLISION or not rest):
+            self._touched[s] = (time, known[1])
+            return None
+        surfaces = self._obstacles.surfaces
+        p_WS = surfaces.origin[s] + surfaces.velocity[s] * time
+        impact = impact_of(x, self._plate_offset, p_WS, surfaces.axes[s], surfaces.velocity[s])
+        state, reason = self._judge(s, impact, plate, rest)
+        self._touched[s] = (time, state)
+        if state is ContactState.ATTACHED:
+            self._attach(time, s, x, impact, p_WS)
+        offset = float(np.hypot(impact.offset_S[0], impact.offset_S[1])) if s == self._obstacles.pad else 0.0
+        return ContactEvent(time, state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
+                            impact.tilt_error, offset, reason)
+
+    def _judge(self, s: int, impact: Impact, plate: bool, rest: bool) -> tuple[ContactState, str]:
+        name = self._obstacles.names[s]
+        fast = impact.normal_speed > CRASH_SPEED
+        too_fast = f"hit the {name} with {impact.normal_speed:.2f} m/s, above {CRASH_SPEED:g} m/s"
+        if self.crashed:
+            return ContactState.COLLISION, f"the wreck touched the {name}"
+        if name == "floor":
+            self.crashed = rest or fast or impact.tilt_error > LANDING_TILT
+            if not self.crashed:
+                return ContactState.GROUND, ""
+            tilt = f"touched the floor tilted by {math.degrees(impact.tilt_error):.0f} deg"
+            return ContactState.COLLISION, f"crashed: {too_fast if fast else tilt}"
+        self.crashed = fast
+        if rest or s != self._obstacles.pad:
+            part = "a rotor" if rest else "the plate"
+            return ContactState.COLLISION, f"crashed: {too_fast}" if fast else f"{part} touched the {name}"
+        refusal = adhesion_refusal(impact, self._adhesion, self._obstacles.pad_half)
+        return (ContactState.BOUNCED, refusal) if refusal else (ContactState.ATTACHED, "")
+
+    def _separations(self, time: float) -> list[ContactEvent]:
+        over = [s for s, (last, _) in self._touched.items()
+                if time - last > SEPARATION and not (self.attached and s == self.hold.surface)]
+        for s in over:
+            del self._touched[s]
+        if not over or self._touched:
+            return []
+        return [ContactEvent(time, ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
+
+    def _attach(self, time: float, s: int, x: np.ndarray, impact: Impact, p_WS: np.ndarray) -> None:
+        """Hold the plate where it touched; it is then drawn flat on the surface."""
+        R_WS = self._obstacles.surfaces.axes[s]
+        R_WB = so3.quat_to_matrix(x[3:7])
+        plate_W = p_WS + R_WS @ impact.offset_S
+        flat_W = plate_W - impact.offset_S[2] * R_WS[:, 2]
+        axis = np.cross(R_WB[:, 2], R_WS[:, 2])
+        sine = float(np.linalg.norm(axis))
+        turn = so3.quat_exp(axis / sine * impact.tilt_error) if sine > 1e-9 else np.array([0.0, 0.0, 0.0, 1.0])
+        q_flat = so3.quat_multiply(turn, x[3:7])
+        velocity = self._obstacles.surfaces.velocity[s]
+        self._final = (flat_W, q_flat)
+        self._settle = (plate_W - flat_W, so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q_flat), x[3:7])))
+        self._attached_at = time
+        self.hold = Hold(True, s, plate_W.copy(), velocity.copy(), x[3:7].copy())
+
+    def _draw_flat(self, time: float) -> None:
+        age = time - self._attached_at
+        fade = math.exp(-age / SETTLING)
+        anchor = self._final[0] + self.hold.velocity * age + fade * self._settle[0]
+        attitude = so3.quat_multiply(self._final[1], so3.quat_exp(fade * self._settle[1])) if fade > 1e-6 else self._final[1]
+        self.hold = self.hold._replace(anchor_W=anchor, attitude=np.ascontiguousarray(attitude))

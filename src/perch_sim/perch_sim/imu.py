@@ -1,0 +1,44 @@
+"""The IMU: noise, turn-on bias, bias walk, saturation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from perch_core.vehicle import ImuConfig
+
+
+class ImuSample(NamedTuple):
+    """What the board reads; both in the axes of B."""
+
+    accel: np.ndarray  # specific force, (3,) [m/s^2]
+    gyro: np.ndarray   # angular velocity, (3,) [rad/s]
+
+
+class Imu:
+    """Turns true specific force and angular velocity into samples.
+
+    The sensor averages over its sample period, so its truth is the mean of the period that ends at the stamp. At rest
+    and level it reads +g along z.
+    """
+
+    def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
+        self._config, self._rng = config, rng
+        walk = 1.0 / math.sqrt(config.rate)  # standard deviation of a walk over one period, per sqrt(s)
+        self._noise = np.repeat([config.accel_noise, config.gyro_noise], 3)
+        self._walk = walk * np.repeat([config.accel_bias_walk, config.gyro_bias_walk], 3)
+        self._range = np.repeat([config.accel_range, config.gyro_range], 3)
+        self.bias = rng.standard_normal(6) * np.repeat([config.accel_bias_init, config.gyro_bias_init], 3)
+
+    def sample(self, inertial: np.ndarray) -> ImuSample:
+        """One sample.
+
+        Args:
+            inertial: mean specific force [m/s^2] and angular velocity [rad/s] at the IMU in B, (6,).
+        """
+        draw = self._rng.standard_normal(12)
+        self.bias = self.bias + self._walk * draw[:6]
+        reading = np.clip(inertial + self.bias + self._noise * draw[6:], -self._range, self._range)
+        return ImuSample(reading[:3], reading[3:])

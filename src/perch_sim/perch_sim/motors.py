@@ -1,0 +1,49 @@
+"""The motor controllers' side of a command: arming, limits, and stopping when commands cease."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.errors import PerchError
+
+
+class MotorCommandError(PerchError):
+    """A command that no motor controller would follow."""
+
+
+class Motors:
+    """Holds the last good command and says what the rotors aim at."""
+
+    def __init__(self, speed_min: float, speed_max: float, timeout: int) -> None:
+        """
+        Args:
+            speed_min, speed_max: of an armed rotor [rad/s].
+            timeout: armed motors stop when no good command came for so long [ns].
+        """
+        self._low, self._high, self._timeout = speed_min, speed_max, timeout
+        self._speeds, self._armed, self._received = np.zeros(4), False, 0
+        self.timed_out = False
+
+    def command(self, now: int, armed: bool, speeds: np.ndarray) -> None:
+        """Take a command.
+
+        Args:
+            now: simulation time [ns].
+            armed: false stops the motors.
+            speeds: rotor speeds (4,) [rad/s], limited to the armed range.
+
+        Raises:
+            MotorCommandError: a speed is not finite; the command before it stays until it times out.
+        """
+        speeds = np.asarray(speeds, float)
+        if armed and not np.all(np.isfinite(speeds)):
+            raise MotorCommandError(f"motor_command: rotor_speed {speeds.tolist()} is not finite")
+        self._armed, self._received, self.timed_out = armed, now, False
+        if armed:
+            self._speeds = np.clip(speeds, self._low, self._high)
+
+    def target(self, now: int) -> np.ndarray:
+        """Speeds that the rotors aim at, (4,) [rad/s]."""
+        if self._armed and now - self._received > self._timeout:
+            self._armed, self.timed_out = False, True
+        return self._speeds if self._armed else np.zeros(4)

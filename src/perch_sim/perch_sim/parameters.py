@@ -1,0 +1,27 @@
+"""Parameters of the node `vehicle`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_core.config import choice, quantity, text
+
+CAMERAS = {"all": ("down", "front"), "down": ("down",), "front": ("front",), "none": ()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleParameters:
+    """All are read once, at the start."""
+
+    scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
+    lockstep: bool = quantity(True, doc="false: paced by the wall clock")
+    participants: tuple[str, ...] = text(
+        ("controller",), doc="nodes that the lockstep waits for: controller, vio, vio_model, target_localizer, "
+        "powerline_mapper, mission, recorder; an empty name: none")
+    lockstep_timeout: float = quantity(10.0, unit="s", above=0.0, high=3600.0,
+                                       doc="wall-clock time after which a silent participant is dropped")
+    start_timeout: float = quantity(60.0, unit="s", above=0.0, high=3600.0,
+                                    doc="wall-clock time after which a participant that never came is dropped")
+    cameras: str = choice("all", options=tuple(CAMERAS), doc="cameras that take images; none: for fast runs")
+    render_threads: int = quantity(2, low=1, high=8, doc="images drawn at once")

@@ -1,0 +1,115 @@
+"""The simulated vehicle without ROS: plant, motors, IMU and camera times of a scenario and a seed.
+
+The same scenario, seed and commands give the same flight, bit by bit. The vehicle node drives it in lockstep or in
+real time; tests and studies can drive it with any controller in a loop:
+
+    flight = Simulation(load_scenario("surface_90"), seed=1)
+    while flight.time < 5 * SECOND:
+        flight.motors.command(flight.time, True, controller(flight.state))
+        output = flight.advance()
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from typing import Collection, NamedTuple
+
+import numpy as np
+
+from perch_core.errors import ConfigError
+from perch_core.scenario import Scenario
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import Vehicle, load_vehicle
+from perch_sim import seeding
+from perch_sim.calibration import true_mount
+from perch_sim.camera_stream import CameraStream
+from perch_sim.camera_timing import CameraTiming
+from perch_sim.contact_event import ContactEvent
+from perch_sim.imu import Imu, ImuSample
+from perch_sim.motors import Motors
+from perch_sim.obstacles import pad_surface
+from perch_sim.plant import PERIOD, SUBSTEPS, Plant
+from perch_sim.rendering import Renderer, build_scene
+from perch_sim.rendering.sensor import control_exposure
+from perch_sim.state_history import StateHistory, TrueState
+
+SECOND = 1_000_000_000
+START = SECOND          # ROS reads a time of zero as "no time yet", so the flight starts at 1 s
+MEMORY = 60_000_000     # how far back an exposure may reach [ns]
+MOTOR_TIMEOUT = 100_000_000  # a motor controller stops without commands for so long [ns]
+
+
+class Output(NamedTuple):
+    """One control period of the vehicle."""
+
+    time: int                           # end of the period [ns]
+    imu: ImuSample
+    state: TrueState
+    contacts: tuple[ContactEvent, ...]
+
+
+class Simulation:
+    """A vehicle in flight. `time` [ns] is the IMU's clock."""
+
+    def __init__(self, scenario: Scenario, seed: int, render: Collection[str] = (), pool: Executor | None = None,
+                 motor_timeout: int = MOTOR_TIMEOUT) -> None:
+        """
+        Args:
+            scenario: what is flown.
+            seed: of everything that is random.
+            render: names of the cameras that take images, by `pool`; the others keep only their times.
+            pool: where images are drawn.
+            motor_timeout: armed motors stop without a command for so long [ns].
+
+        Raises:
+            ConfigError: the scenario's vehicle or board does not exist, or its IMU does not run at the control rate.
+        """
+        self.scenario = scenario
+        self.vehicle: Vehicle = load_vehicle(scenario.vehicle)
+        if round(SECOND / self.vehicle.imu.rate) != PERIOD:
+            raise ConfigError(f"vehicles/{scenario.vehicle}", "imu.rate",
+                              f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / PERIOD:g} Hz")
+        self.plant = Plant(scenario, self.vehicle, seed, START)
+        self.motors = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout)
+        self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
+        self._history = StateHistory(MEMORY * SUBSTEPS // PERIOD)
+        self._history.append(self.plant.state)
+        self.cameras = self._make_cameras(seed, render, pool)
+
+    def _make_cameras(self, seed: int, render: Collection[str], pool: Executor | None) -> dict[str, CameraStream]:
+        scene = build_scene(self.scenario, seed) if render else None
+        cameras = {}
+        for name, mount in self.vehicle.mounts.items():
+            true = mount
+            if self.scenario.realism == "default":
+                true = true_mount(mount, seeding.stream(seed, f"calibration_{name}"))
+            exposure = control_exposure(true, self.scenario.world.light).time
+            timing = CameraTiming(true, exposure, START, seeding.stream(seed, f"timing_{name}"))
+            renderer = Renderer(scene, true, seed) if name in render else None
+            cameras[name] = CameraStream(mount, timing, renderer, pool, seeding.stream(seed, f"noise_{name}"),
+                                         np.array(self.scenario.target.velocity), START)
+        return cameras
+
+    @property
+    def time(self) -> int:
+        """Simulation time [ns]."""
+        return self.plant.time
+
+    @property
+    def state(self) -> TrueState:
+        """True state."""
+        return self.plant.state
+
+    @property
+    def pad(self) -> PerchSurface:
+        """The true pad at this time."""
+        return pad_surface(self.scenario, (self.time - START) * 1e-9)
+
+    def advance(self) -> Output:
+        """One control period with the motors' present command."""
+        result = self.plant.advance(self.motors.target(self.time))
+        for state in result.states:
+            self._history.append(state)
+        for camera in self.cameras.values():
+            camera.expose(self.time, self._history)
+        return Output(self.time, self._imu.sample(result.inertial), result.states[-1], result.contacts)

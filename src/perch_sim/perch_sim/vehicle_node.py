@@ -1,0 +1,240 @@
+"""Node `vehicle`: the simulated vehicle. It owns time; see docs/architecture.md, "Lockstep"."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+from perch_msgs.msg import MotorCommand, Release, Step, StepReport
+from rclpy.clock import Clock, ClockType
+
+from perch_core.errors import ConfigError
+from perch_core.ros import qos
+from perch_core.ros.conversions import nanoseconds, to_stamp
+from perch_core.ros.node import PerchNode, spin_main
+from perch_core.scenario import load_scenario
+from perch_sim.camera_stream import Delivery
+from perch_sim.lockstep_watch import LockstepWatch
+from perch_sim.motors import MotorCommandError
+from perch_sim.pacing import Pacing
+from perch_sim.parameters import CAMERAS, VehicleParameters
+from perch_sim.participants import CONTROLLER, triggers
+from perch_sim.phase_times import PhaseTimes
+from perch_sim.plant import PERIOD
+from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
+from perch_sim.vehicle_topics import VehicleTopics
+
+CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
+REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
+
+
+class VehicleNode(PerchNode[VehicleParameters]):
+    """Drives a `Simulation`: by motor commands in lockstep, by the wall clock in real time."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("vehicle", VehicleParameters, **kwargs)
+        cv2.setNumThreads(1)
+        params = self.params
+        try:
+            scenario = load_scenario(params.scenario)
+            names = tuple(name for name in params.participants if name)
+            slow = triggers(names, scenario.latency)
+            self._pool = ThreadPoolExecutor(params.render_threads, thread_name_prefix="render")
+            self._simulation = Simulation(
+                scenario, params.seed, CAMERAS[params.cameras], self._pool,
+                MOTOR_TIMEOUT if params.lockstep else REAL_TIME_MOTOR_TIMEOUT)
+        except ConfigError:
+            self.destroy_node()
+            raise
+        self._topics = VehicleTopics(self, self._simulation.vehicle.imu, self._simulation.vehicle.mounts)
+        self._steps = self.create_publisher(Step, "step", qos.STEP)
+        self._output: Output | None = None     # of the step that is to be published next
+        self._index = 0
+        self._asked: set[int] = set()          # images whose end of drawing will wake the node
+        self._times = PhaseTimes()
+        self._last_command = 0
+        self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
+        self._busy = False
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_subscription(MotorCommand, "motor_command", self._receive_command, qos.CHAIN)
+        self.create_timer(1.0, self._diagnose, clock=steady)
+        self._watch: LockstepWatch | None = None
+        self._pacing: Pacing | None = None
+        if params.lockstep:
+            self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps],
+                                        params.lockstep_timeout, params.start_timeout)
+            self.create_subscription(StepReport, "step_report", self._receive_report, qos.GATED)
+            self.create_timer(0.05, self._look_after, clock=steady)
+        else:
+            self._pacing = Pacing(PERIOD, time.monotonic_ns())
+            self.create_timer(PERIOD * 1e-9, self._keep_pace, clock=steady)
+
+    # -- inputs ------------------------------------------------------------------------------------------------------
+
+    def _receive_command(self, msg: MotorCommand) -> None:
+        stamp = nanoseconds(msg.header.stamp)
+        try:
+            self._simulation.motors.command(self._simulation.time, msg.armed, msg.rotor_speed)
+        except MotorCommandError as error:
+            self._counts["commands_refused"] += 1
+            self.get_logger().error(str(error), throttle_duration_sec=1.0)
+        self._last_command = max(self._last_command, stamp)
+        if self._watch is not None:
+            self._watch.command(stamp)
+            self._advance()
+
+    def _receive_report(self, msg: StepReport) -> None:
+        self._watch.report(msg.node, nanoseconds(msg.trigger), {r.topic: r.count for r in msg.published})
+        self._advance()
+
+    # -- lockstep ----------------------------------------------------------------------------------------------------
+
+    def _look_after(self) -> None:
+        self._watch.look_after(self._output.time if self._output else 0)
+        self._advance()
+
+    def _advance(self) -> None:
+        """Go as far as the participants allow."""
+        if self._busy:
+            return
+        self._busy = True
+        try:
+            while self._step_in_lockstep():
+                pass
+        finally:
+            self._busy = False
+
+    def _step_in_lockstep(self) -> bool:
+        """One transition; false when something has to be waited for."""
+        watch = self._watch
+        if self._output is None:
+            if not watch.may_advance():
+                return False
+            self._times.end("waiting")
+            self._output = self._simulation.advance()
+            self._times.end("physics")
+        stamp = self._output.time
+        frames = self._arrived(stamp)
+        if frames is None or not watch.may_publish(stamp):
+            return False
+        for name, delivery in frames:
+            for trigger in watch.triggers:
+                if trigger.camera == name and (delivery.image is not None or not trigger.needs_image):
+                    due = max(delivery.frame.middle + round(trigger.latency * 1e9), stamp + PERIOD)
+                    watch.trigger(trigger.node, delivery.frame.stamp, due)
+        for trigger in watch.triggers:
+            if trigger.period and self._index % trigger.period == 0:
+                watch.trigger(trigger.node, stamp, stamp + round(trigger.latency * 1e9))
+        released = watch.begin(stamp)
+        self._publish(frames, [Release(topic=topic, count=count) for topic, count in released.items()])
+        return True
+
+    def _arrived(self, stamp: int) -> list[tuple[str, Delivery]] | None:
+        """Frames that arrive at this step; None while one of them is still being drawn."""
+        frames = []
+        for name, camera in self._simulation.cameras.items():
+            delivery = camera.due(stamp)
+            if delivery is None:
+                continue
+            if delivery.image is not None and not delivery.image.done():
+                if id(delivery.image) not in self._asked:
+                    self._asked.add(id(delivery.image))
+                    delivery.image.add_done_callback(self._wake)
+                return None
+            frames.append((name, delivery))
+        return frames
+
+    def _wake(self, image: Any) -> None:
+        """On a drawing thread: go on in the executor's."""
+        self._asked.discard(id(image))
+        executor = self.executor
+        if executor is not None:
+            executor.create_task(self._advance)
+
+    # -- real time ---------------------------------------------------------------------------------------------------
+
+    def _keep_pace(self) -> None:
+        for _ in range(self._pacing.due(time.monotonic_ns())):
+            self._times.end("waiting")
+            if self._output is None and self._index > 0 and self._last_command < self._simulation.time:
+                self._counts["commands_missed"] += 1
+            self._output = self._simulation.advance()
+            self._times.end("physics")
+            frames = []
+            for name, camera in self._simulation.cameras.items():
+                delivery = camera.due(self._output.time)
+                if delivery is None:
+                    continue
+                if delivery.image is None or delivery.image.done():
+                    frames.append((name, delivery))
+                else:
+                    self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
+            self._publish(frames, [])
+
+    # -- output ------------------------------------------------------------------------------------------------------
+
+    def _publish(self, frames: list[tuple[str, Delivery]], released: list[Release]) -> None:
+        """Publish what this step shows, then the step itself."""
+        output, topics, index = self._output, self._topics, self._index
+        if index % CLOCK_STEPS == 0:
+            topics.publish_clock(output.time)
+        topics.publish_truth(output.state)
+        for event in output.contacts:
+            topics.publish_contact(event)
+            self._log_contact(event)
+        if index == 0 or (index % TARGET_STEPS == 0 and any(self._simulation.scenario.target.velocity)):
+            if self._simulation.scenario.mode == "surface":
+                topics.publish_target(output.time, self._simulation.pad)
+        if index % ROTOR_STEPS == 0:
+            plant = self._simulation.plant
+            topics.publish_rotors(output.time, plant.rotor_speed, plant.rotor_thrust)
+        for name, delivery in frames:
+            self._simulation.cameras[name].take()
+            topics.cameras[name].publish(delivery.frame.stamp, delivery.image.result() if delivery.image else None)
+        topics.publish_imu(output.time, output.imu)
+        self._steps.publish(Step(stamp=to_stamp(output.time), index=index, lockstep=self._watch is not None,
+                                 released=released))
+        self._index, self._output = index + 1, None
+        self._times.count_step()
+        self._times.end("publishing")
+
+    def _log_contact(self, event: Any) -> None:
+        self.get_logger().info(f"t = {event.time:.3f} s: {event.body}: {event.state.name.lower()}"
+                               + (f" ({event.reason})" if event.reason else ""))
+
+    def _diagnose(self) -> None:
+        self._times.end("waiting")
+        values: dict[str, Any] = {"time_s": self._simulation.time * 1e-9, "steps": self._index,
+                                  **self._times.report(PERIOD * 1e-9), **self._counts,
+                                  "motors_timed_out": self._simulation.motors.timed_out,
+                                  "crashed": self._simulation.plant.contact.crashed}
+        level, message = 0, "ok"
+        if self._pacing is not None:
+            values |= {"deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
+        elif self._watch.waiting:
+            message = f"waiting for {self._watch.waiting}"
+        if self._simulation.motors.timed_out:
+            level, message = 1, "motors stopped: no motor_command"
+        if self._simulation.plant.contact.crashed:
+            level, message = 2, "crashed"
+        self.publish_diagnostics(self._simulation.time * 1e-9, values, level, message)
+
+    def close(self) -> None:
+        """Stop the drawing threads."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def create(**kwargs: Any) -> VehicleNode:
+    """The node, alone or composed."""
+    return VehicleNode(**kwargs)
+
+
+def main() -> None:
+    """Entry point of `ros2 run perch_sim vehicle`."""
+    spin_main(create)
+
+
+if __name__ == "__main__":
+    main()
