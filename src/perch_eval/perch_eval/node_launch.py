@@ -32,15 +32,8 @@ PACKAGES = {
 }
 """Node (which is also the name of its executable) -> package."""
 
-TRIGGERS = {
-    "vio": "camera_down",
-    "vio_model": "camera_down",
-    "target_localizer": "camera_front",
-    "powerline_mapper": "camera_front",
-    "mission": "10",
-    "recorder": "50",
-}
-"""Slow participants of the lockstep: what starts their work, an image or every n-th step."""
+PARTICIPANTS = ("controller", "vio", "vio_model", "target_localizer", "powerline_mapper", "mission", "recorder")
+"""Nodes that the vehicle's lockstep waits for, where they are started."""
 
 
 @dataclass(frozen=True)
@@ -158,9 +151,14 @@ def parse_override(text: str) -> tuple[str, str, Any]:
 def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str,
                          lockstep: bool) -> dict[str, dict[str, Any]]:
     """What the scenario as a whole means for single nodes."""
-    participants = [f"{node}@{TRIGGERS[node]}" for node in nodes if node in TRIGGERS]
+    participants = [node for node in PARTICIPANTS if node in nodes]
+    vehicle = {"vehicle": scenario.vehicle}
     return {
-        "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants},
+        "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants or [""]},
+        "vio": vehicle, "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,
+        "target_localizer": vehicle | {"board": scenario.target.board},
+        "perching_planner": vehicle, "powerline_planner": vehicle, "controller": vehicle,
+        "mission": {"mission.planner_latency": scenario.latency.perching_planner},
     }
 
 
