@@ -1,0 +1,228 @@
+"""A cable hanging between two points: the catenary, and the straight segments that stand for it. [P:sec. IV-A]
+
+In the plane of the cable, x along the horizontal and z against gravity, z(x) = a cosh((x - x0)/a) + const with the
+parameter a = H/w: horizontal tension over weight per length. Arc length is closed form, so is its inverse.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import brentq
+
+from perch_core.errors import PerchError
+from perch_core.lines import Segment
+
+DOWN = (0.0, 0.0, -1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Catenary:
+    """A cable of constant weight per length between two supports.
+
+    Attributes:
+        start, end: supports in W [m], shape (3,).
+        parameter: a = H/w [m]; inf is a straight cable.
+        down: unit vector of the load in W, shape (3,): gravity, or gravity and steady wind together.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    parameter: float
+    down: np.ndarray = DOWN
+
+    def __post_init__(self) -> None:
+        for name in ("start", "end", "down"):
+            vector = np.array(getattr(self, name), dtype=float)
+            if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+                raise PerchError(f"cable: {name} needs three finite numbers, got {getattr(self, name)!r}")
+            object.__setattr__(self, name, vector)
+        object.__setattr__(self, "down", self.down / np.linalg.norm(self.down))
+        if not np.linalg.norm(self.end - self.start) > 0:
+            raise PerchError(f"cable: both ends are at {self.start.tolist()} m")
+        if not self.parameter > 0:
+            raise PerchError(f"cable: parameter {self.parameter!r} is not > 0 m")
+        if math.isfinite(self.parameter) and not self._span > 1e-6:
+            raise PerchError("cable: the ends are one above the other, so that it hangs straight: parameter must be inf")
+        if math.isfinite(self.parameter) and self._span / self.parameter > 100.0:
+            raise PerchError(f"cable: parameter {self.parameter:g} m is too small for a span of {self._span:g} m")
+
+    @classmethod
+    def from_sag(cls, start: np.ndarray, end: np.ndarray, sag: float, down: np.ndarray = DOWN) -> Catenary:
+        """The cable whose middle (of the span) hangs `sag` [m] below the chord.
+
+        Raises:
+            PerchError: the sag is negative, or the ends are one above the other.
+        """
+        if not (math.isfinite(sag) and sag >= 0):
+            raise PerchError(f"cable: sag {sag!r} is not a length >= 0 m")
+        straight = cls(start, end, math.inf, down)
+        if sag < 1e-9:
+            return straight
+        span = straight._span
+        if not span > 1e-6:
+            raise PerchError(f"cable: a sag of {sag:g} m needs ends that are not one above the other")
+        largest = cls(start, end, span / 60.0, down).sag
+        if sag > largest:
+            raise PerchError(f"cable: sag {sag:g} m is outside [0, {largest:g}] m for a span of {span:g} m")
+        log_a = brentq(lambda x: math.log(cls(start, end, math.exp(x), down).sag / sag),
+                       math.log(span / 60.0), math.log(span**2 / sag + span) + 2.0, xtol=1e-14)
+        return cls(start, end, math.exp(log_a), down)
+
+    @classmethod
+    def from_tension(cls, start: np.ndarray, end: np.ndarray, horizontal_tension: float, weight_per_length: float,
+                     down: np.ndarray = DOWN) -> Catenary:
+        """The cable under a horizontal tension [N] with a weight per length [N/m]."""
+        if not (horizontal_tension > 0 and weight_per_length > 0):
+            raise PerchError(f"cable: tension {horizontal_tension!r} N and weight {weight_per_length!r} N/m must be > 0")
+        return cls(start, end, horizontal_tension / weight_per_length, down)
+
+    @property
+    def _rise(self) -> float:
+        return float(-(self.end - self.start) @ self.down)
+
+    @cached_property
+    def _span(self) -> float:
+        chord = self.end - self.start
+        return float(np.linalg.norm(chord - (chord @ self.down) * self.down))
+
+    @cached_property
+    def _x0(self) -> float:
+        """Place of the lowest point, from the start along the horizontal [m]; may lie outside the span."""
+        a, h = self.parameter, self._span
+        return h / 2 - a * math.asinh(self._rise / (2 * a * math.sinh(h / (2 * a))))
+
+    @property
+    def straight(self) -> bool:
+        """Whether the cable has no sag at all."""
+        return math.isinf(self.parameter)
+
+    @property
+    def sag(self) -> float:
+        """Drop below the chord at mid-span [m]."""
+        if self.straight:
+            return 0.0
+        a, h = self.parameter, self._span
+        return a * math.cosh((h / 2 - self._x0) / a) * 2 * math.sinh(h / (4 * a)) ** 2
+
+    @cached_property
+    def length(self) -> float:
+        """Length of the cable [m]."""
+        if self.straight:
+            return float(np.linalg.norm(self.end - self.start))
+        return math.hypot(self._rise, 2 * self.parameter * math.sinh(self._span / (2 * self.parameter)))
+
+    def _at(self, x: np.ndarray) -> np.ndarray:
+        """Points in W at distances x along the horizontal, (...) -> (..., 3)."""
+        a, x0 = self.parameter, self._x0
+        # cosh(p) - cosh(q) as a product: a is often a thousand times the sag
+        z = 2 * a * np.sinh((x - 2 * x0) / (2 * a)) * np.sinh(x / (2 * a))
+        chord = self.end - self.start
+        along = (chord - (chord @ self.down) * self.down) / self._span
+        return self.start + x[..., None] * along - z[..., None] * self.down
+
+    def _x_of(self, s: np.ndarray) -> np.ndarray:
+        a, x0 = self.parameter, self._x0
+        return x0 + a * np.arcsinh(s / a - math.sinh(x0 / a))
+
+    def point(self, s: np.ndarray | float) -> np.ndarray:
+        """Points in W [m] at arc lengths s from the start [m]: shape (...) -> (..., 3)."""
+        s = np.asarray(s, dtype=float)
+        if self.straight:
+            return self.start + (s / self.length)[..., None] * (self.end - self.start)
+        return self._at(self._x_of(s))
+
+    def tangent(self, s: np.ndarray | float) -> np.ndarray:
+        """Unit tangents in W at arc lengths s [m]: shape (...) -> (..., 3)."""
+        s = np.asarray(s, dtype=float)
+        if self.straight:
+            return np.broadcast_to((self.end - self.start) / self.length, (*s.shape, 3)).copy()
+        angle = np.arctan(s / self.parameter - math.sinh(self._x0 / self.parameter))
+        chord = self.end - self.start
+        along = (chord - (chord @ self.down) * self.down) / self._span
+        return np.cos(angle)[..., None] * along - np.sin(angle)[..., None] * self.down
+
+    def sample(self, count: int) -> np.ndarray:
+        """`count` points in W from start to end, evenly spread along the cable [m], shape (count, 3)."""
+        return self.point(np.linspace(0.0, self.length, count))
+
+    def tension(self, s: np.ndarray | float, weight_per_length: float) -> np.ndarray:
+        """Tension [N] at arc lengths s [m] of a cable with this weight per length [N/m]."""
+        if self.straight:
+            raise PerchError("cable: a straight cable's tension is unbounded")
+        slope = np.asarray(s, dtype=float) / self.parameter - math.sinh(self._x0 / self.parameter)
+        return weight_per_length * self.parameter * np.sqrt(1 + slope**2)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentFit:
+    """Straight pieces that stand for a cable.
+
+    Attributes:
+        vertices: their ends in W [m], shape (count + 1, 3), on the cable.
+        max_error: greatest distance between cable and pieces [m].
+        mean_error: mean distance along the pieces [m].
+    """
+
+    vertices: np.ndarray
+    max_error: float
+    mean_error: float
+
+    def segments(self, radius: float, first_id: int = 0) -> list[Segment]:
+        """The pieces as lines of a map, numbered from `first_id`."""
+        return [Segment.between(a, b, radius, first_id + i)
+                for i, (a, b) in enumerate(zip(self.vertices[:-1], self.vertices[1:]))]
+
+
+def fit_segments(cable: Catenary, count: int) -> SegmentFit:
+    """`count` chords of a cable, placed so that all are equally wrong.
+
+    The sagitta of a short chord is curvature * length^2 / 8, and a catenary's curvature is a/(a^2 + s^2) at the
+    arc length s from the lowest point; the integral of its root is x/sqrt(a). So vertices that are evenly
+    spaced along the *horizontal* spread the error evenly. Both errors are exact, not sampled.
+
+    Raises:
+        PerchError: the count is below 1.
+    """
+    if count < 1:
+        raise PerchError(f"cable: {count!r} segments are not >= 1")
+    if cable.straight:
+        return SegmentFit(cable.sample(count + 1), 0.0, 0.0)
+    a, x0 = cable.parameter, cable._x0
+    x = np.linspace(0.0, cable._span, count + 1)
+    vertices = cable._at(x)
+    half = (x[1] - x[0]) / 2
+    middle = (x[:-1] + x[1:]) / 2 - x0
+    ratio = math.sinh(half / a) * a / half
+    slope = np.sinh(middle / a) * ratio  # of each chord
+    length = 2 * half * np.sqrt(1 + slope**2)
+    # the gap below a chord is greatest where the cable runs parallel to it; gaps are measured against the
+    # middle's height a cosh(middle/a), to keep their digits
+    parallel = a * np.arcsinh(slope) - middle
+    chord_height = 2 * a * np.cosh(middle / a) * math.sinh(half / (2 * a)) ** 2 + slope * parallel
+    cable_height = 2 * a * np.sinh((2 * middle + parallel) / (2 * a)) * np.sinh(parallel / (2 * a))
+    gap = (chord_height - cable_height) / np.sqrt(1 + slope**2)
+    # area between chord and cable: half * (sum of end heights) - a^2 (sinh(right/a) - sinh(left/a))
+    q = half / a
+    area = 2 * a**2 * np.cosh(middle / a) * (q * math.cosh(q) - math.sinh(q))
+    return SegmentFit(vertices, float(gap.max()), float(area.sum() / length.sum()))
+
+
+def fit_within(cable: Catenary, max_error: float) -> SegmentFit:
+    """The fewest chords that stay within `max_error` [m] of the cable.
+
+    Raises:
+        PerchError: the error is not positive.
+    """
+    if not max_error > 0:
+        raise PerchError(f"cable: an error of {max_error!r} m is not > 0")
+    low, high = 0, 1
+    while fit_segments(cable, high).max_error > max_error:
+        low, high = high, 2 * high
+    while high - low > 1:
+        count = (low + high) // 2
+        low, high = (low, count) if fit_segments(cable, count).max_error <= max_error else (count, high)
+    return fit_segments(cable, high)
