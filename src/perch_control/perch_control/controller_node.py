@@ -1,0 +1,199 @@
+"""Node `controller`: odometry in, rotor speeds out, one command per step; trajectories, commands, services."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from perch_msgs.msg import ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, Trajectory
+from perch_msgs.srv import SetController
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+
+from perch_control.admission import AtEnd, Order
+from perch_control.flight import FlightController
+from perch_control.geometric import GeometricController
+from perch_control.modes import Command, StepResult
+from perch_control.parameters import ControllerParameters
+from perch_control.reference import FlatReference, SampledReference
+from perch_core.errors import PerchError
+from perch_core.ros import qos
+from perch_core.ros.conversions import to_pose, to_seconds, to_stamp, to_vector
+from perch_core.ros.lockstep import Participant
+from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.trajectories import from_message
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import load_vehicle
+
+STATUS_STEPS = 10        # 50 Hz: the mission takes controller/status at every tenth step
+DIAGNOSTICS_STEPS = 500  # 1 Hz
+PERIOD = 0.002
+_OFF_TIME_LOG = 1.0      # the same refusal is logged at most once in this time [s]
+
+
+class ControllerNode(PerchNode[ControllerParameters]):
+    """Messages to `FlightController` and back."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("controller", ControllerParameters, self._change, **kwargs)
+        self._vehicle = load_vehicle(self.params.vehicle)
+        gains = self.params.gain_set(self._vehicle.name)
+        self._flight = FlightController(self._vehicle, GeometricController(self._vehicle, gains), gains, self.params.flight)
+        self._costs: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
+        self._arrivals: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
+        self._missed = 0
+        self._steps = 0
+        self._blind_since: float | None = None
+        self._last_odometry = time.monotonic()
+
+        self._command = MotorCommand()
+        self._command.header.frame_id = "base_link"
+        self._motors = self.create_publisher(MotorCommand, "motor_command", qos.CHAIN)
+        self._references = self.create_publisher(ControlReference, "controller/reference", qos.CHAIN)
+        self._status = self.create_publisher(ControllerStatus, "controller/status", qos.CHAIN)
+        self._participant = Participant(self)
+        self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
+        self._participant.subscribe(ControllerCommand, "controller/command", self._receive_command)
+        self._participant.chain(Odometry, "odometry", self._receive_odometry)
+        self.create_subscription(EstimatorStatus, "estimator/status", self._receive_estimator, qos.CHAIN)
+        self.create_subscription(Imu, "imu/data_raw", self._receive_imu, qos.SENSOR)
+        self.create_service(SetController, "set_controller", self._set_controller)
+        self.create_service(Trigger, "abort", self._abort)
+
+    def _change(self, value: ControllerParameters) -> None:
+        """New gains and limits count from the next step."""
+        if value.vehicle != self.params.vehicle:
+            raise PerchError("vehicle: fixed after the start")
+        gains = value.gain_set(self._vehicle.name)
+        self._flight.settings = value.flight
+        self._flight.use(GeometricController(self._vehicle, gains), gains)
+
+    # -- inputs ------------------------------------------------------------------------------------------------------
+
+    def _receive_trajectory(self, msg: Trajectory) -> None:
+        try:
+            trajectory = from_message(msg)
+            source = (FlatReference(trajectory) if isinstance(trajectory, FlatTrajectory)
+                      else SampledReference(trajectory, self._vehicle.mass))
+            try:
+                at_end = AtEnd(msg.at_end)
+            except ValueError:
+                raise PerchError(f"at_end {msg.at_end} is not one of 0..3") from None
+            self._flight.follow(Order(msg.id, source, trajectory.start_time, at_end, float(msg.contact_time),
+                                      float(msg.recovery_start)))
+        except PerchError as error:
+            self._flight.message = f"trajectory {msg.id} refused: {error}"
+            self.get_logger().warning(self._flight.message)
+
+    def _receive_command(self, msg: ControllerCommand) -> None:
+        try:
+            self._flight.command(Command(msg.command), msg.reason)
+        except ValueError as error:  # CommandRefused, or no such command
+            self._flight.message = str(error)
+            self.get_logger().warning(f"command: {error}")
+
+    def _receive_estimator(self, msg: EstimatorStatus) -> None:
+        self._flight.estimator(msg.state, float(msg.vio_age), msg.message)
+
+    def _receive_imu(self, msg: Imu) -> None:
+        w, f = msg.angular_velocity, msg.linear_acceleration
+        stamp = to_seconds(msg.header.stamp)
+        self._flight.imu(stamp, (w.x, w.y, w.z), (f.x, f.y, f.z))
+        # Odometry that has stopped altogether would stop the lockstep: then the IMU's steps are answered instead.
+        if time.monotonic() - self._last_odometry > self.params.blind_after and stamp > self._flight.now + PERIOD / 2:
+            self._answer(msg.header.stamp, self._flight.step_blind(stamp))
+
+    def _receive_odometry(self, msg: Odometry) -> None:
+        begin = time.perf_counter()
+        self._last_odometry = time.monotonic()
+        p, q = msg.pose.pose.position, msg.pose.pose.orientation
+        v, w = msg.twist.twist.linear, msg.twist.twist.angular
+        x, y, z, s = q.x, q.y, q.z, q.w
+        # The twist is in B: v_W = v + 2 s (u x v) + 2 u x (u x v).
+        tx, ty, tz = 2.0 * (y * v.z - z * v.y), 2.0 * (z * v.x - x * v.z), 2.0 * (x * v.y - y * v.x)
+        sample = (p.x, p.y, p.z, v.x + s * tx + y * tz - z * ty, v.y + s * ty + z * tx - x * tz,
+                  v.z + s * tz + x * ty - y * tx, x, y, z, s, w.x, w.y, w.z)
+        result = self._flight.step(to_seconds(msg.header.stamp), sample)
+        self._costs.append(time.perf_counter() - begin)
+        self._answer(msg.header.stamp, result)
+        self._arrivals.append(begin)
+        self._missed += time.perf_counter() - begin > PERIOD
+
+    # -- outputs -----------------------------------------------------------------------------------------------------
+
+    def _answer(self, stamp: Any, result: StepResult) -> None:
+        self._command.header.stamp = stamp
+        self._command.armed = result.armed
+        self._command.rotor_speed = np.array(result.rotor_speed)
+        self._motors.publish(self._command)
+        if result.event:
+            self.get_logger().info(result.event)
+        # In lockstep the vehicle counts steps; the same steps carry the status in every run.
+        step = self._participant.step
+        index = step.index if step is not None else self._steps
+        if index % STATUS_STEPS == 0:
+            self._publish_status(stamp)
+        if result.setpoint is not None and index % self.params.controller.reference_period == 0:
+            self._publish_reference(stamp, result)
+        if index % DIAGNOSTICS_STEPS == 0:
+            self._publish_diagnostics(to_seconds(stamp))
+        self._steps += 1
+
+    def _publish_status(self, stamp: Any) -> None:
+        flight = self._flight
+        running = flight.order
+        msg = ControllerStatus(
+            state=int(flight.state), controller=flight.law_name, trajectory_id=flight.trajectory_id,
+            trajectory_time=float(flight.trajectory_time), trajectory_duration=float(running.source.duration) if running else 0.0,
+            position_error=float(flight.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
+            thrust_margin=float(flight.margin), message=flight.message)
+        msg.header.stamp, msg.header.frame_id = stamp, "map"
+        self._status.publish(msg)
+
+    def _publish_reference(self, stamp: Any, result: StepResult) -> None:
+        x = result.setpoint
+        msg = ControlReference(
+            trajectory_id=self._flight.trajectory_id, pose=to_pose(x.p, result.q_C), linear_velocity=to_vector(x.v),
+            linear_acceleration=to_vector(x.a), angular_velocity=to_vector(result.w_C),
+            angular_acceleration=to_vector(result.dw_C), thrust=float(result.wrench[0]), moment=to_vector(result.wrench[1:4]))
+        msg.header.stamp, msg.header.frame_id = stamp, "map"
+        self._references.publish(msg)
+
+    def _publish_diagnostics(self, now: float) -> None:
+        flight = self._flight
+        values: dict[str, Any] = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
+                                  "missed_deadlines": self._missed, "odometry_age_s": float(min(flight.odometry_age, 1e6))}
+        if self._costs:
+            values |= {"step_us_median": 1e6 * float(np.median(self._costs)),
+                       "step_us_p99": 1e6 * float(np.percentile(self._costs, 99))}
+        if len(self._arrivals) > 2:
+            values["jitter_us_p99"] = 1e6 * float(np.percentile(np.abs(np.diff(self._arrivals) - PERIOD), 99))
+        level = 2 if flight.state.name == "FAILED" else 1 if flight.state.name in ("RECOVERING", "LANDING") else 0
+        self.publish_diagnostics(now, values, level, flight.message)
+
+    # -- services ----------------------------------------------------------------------------------------------------
+
+    def _set_controller(self, request: SetController.Request, response: SetController.Response) -> SetController.Response:
+        if request.type != "geometric":
+            response.success, response.error_code = False, 1
+            response.message = f"type {request.type!r} is not one of geometric"
+            return response
+        response.success, response.message = True, f"{request.type} flies"
+        return response
+
+    def _abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = True, self._flight.abort()
+        return response
+
+
+def create(**kwargs: Any) -> ControllerNode:
+    """The node, for its own process or a composed one."""
+    return ControllerNode(**kwargs)
+
+
+def main() -> None:
+    """Entry point of the executable `controller`."""
+    spin_main(create)

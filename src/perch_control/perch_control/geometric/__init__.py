@@ -1,0 +1,5 @@
+"""Geometric tracking control on SE(3). [M:eq2, M:eq12, M:eq13]"""
+
+from perch_control.geometric.controller import ControlOutput, GeometricController, packed_vehicle
+
+__all__ = ["ControlOutput", "GeometricController", "packed_vehicle"]

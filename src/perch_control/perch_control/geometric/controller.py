@@ -1,0 +1,94 @@
+"""The geometric controller as an object without hidden state: vehicle and gains in, one call per control period."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import radians, tan
+
+import numpy as np
+
+from perch_control.allocation import mixing_columns
+from perch_control.geometric.step import control_step
+from perch_control.rotor_lag import RotorEstimate
+from perch_control.settings import GeometricGains
+from perch_core.vehicle import Vehicle
+
+NO_COMPENSATION = (0.0,) * 6
+_RATE_RESERVE = 1.3  # commanded rates may exceed what a plan may ask for by this factor, so that feedback has room
+
+
+def packed_vehicle(vehicle: Vehicle) -> tuple:
+    """The vehicle's constants as nested tuples of floats, as `control_step` takes them."""
+    forward = tuple(tuple(float(v) for v in row) for row in vehicle.allocation[1:])
+    return (
+        (float(vehicle.mass), *(float(j) for j in vehicle.inertia)),
+        (float(vehicle.thrust_coefficient), float(vehicle.speed_min), float(vehicle.speed_max),
+         float(vehicle.motor_time_constant)),
+        forward,
+        mixing_columns(vehicle),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ControlOutput:
+    """What a controller answers in one period.
+
+    Attributes:
+        rotor_speed: commanded speeds [rad/s], 4 floats.
+        wrench: wanted collective thrust [N] and moments in B [N m], 4 floats.
+        rotor_thrust: thrusts that the rotors will have after the lead time [N], 4 floats.
+        q_C: commanded attitude xyzw, 4 floats.
+        w_C: commanded body rates in B [rad/s], 3 floats.
+        dw_C: commanded angular acceleration in B [rad/s^2], 3 floats.
+    """
+
+    rotor_speed: tuple[float, ...]
+    wrench: tuple[float, ...]
+    rotor_thrust: tuple[float, ...]
+    q_C: tuple[float, ...]
+    w_C: tuple[float, ...]
+    dw_C: tuple[float, ...]
+
+
+class GeometricController:
+    """Geometric tracking on SE(3) with rotor lead and prioritised saturation. [M:eq2]"""
+
+    name = "geometric"
+
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
+        self.vehicle, self.gains = vehicle, gains
+        self._vehicle = packed_vehicle(vehicle)
+        self._gains = (*gains.position, *gains.velocity, *gains.attitude, *gains.rate)
+        self._wide, self._narrow = tan(radians(gains.cone_deg)), tan(radians(gains.cone_contact_deg))
+        self._rate_max = _RATE_RESERVE * vehicle.body_rate_max
+        self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 7, RotorEstimate.at_idle(vehicle))
+
+    @property
+    def lead(self) -> float:
+        """The reference is wanted this far ahead of the state [s]."""
+        return self.gains.lead
+
+    def control(self, state: tuple[float, ...], preview, rotors: RotorEstimate,
+                compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
+        """As `step`, with `preview(dt)` giving the setpoint `dt` seconds from now."""
+        return self.step(state, preview(self.gains.lead).packed, rotors, compensation, time_to_contact)
+
+    def step(self, state: tuple[float, ...], reference: tuple[float, ...], rotors: RotorEstimate,
+             compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
+        """Rotor commands for one period.
+
+        Args:
+            state: p_WB [m], v_WB [m/s] in W, q_WB xyzw, w_WB_B [rad/s], 13 floats.
+            reference: setpoint `lead` seconds from now, 24 floats (see `Setpoint.packed`).
+            rotors: rotor speeds and what they are following.
+            compensation: acceleration in W and angular acceleration in B that make up for disturbances, 6 floats.
+            time_to_contact: [s]; near zero position feedback gives way to attitude.
+        """
+        gains = self.gains
+        share = 1.0 if gains.contact_window <= 0.0 else min(max(time_to_contact / gains.contact_window, 0.0), 1.0)
+        cone = self._narrow + share * (self._wide - self._narrow)
+        limits = (gains.feedback_max, cone, gains.thrust_floor, self._rate_max, gains.acceleration_max,
+                  gains.feedback_rate)
+        out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, limits, gains.lead,
+                           self._vehicle)
+        return ControlOutput(*out[:6])

@@ -1,0 +1,188 @@
+"""One step of geometric tracking control on SE(3), scalar by scalar. [M:eq2, M:eq12, M:eq13]
+
+The commanded attitude follows from the force f that position feedback and feed-forward demand; the commanded body rates
+and angular accelerations follow from f' and f'', which hold the flat outputs' jerk and snap *and* the derivatives of the
+feedback, so that the attitude loop is fed forward with what the position loop is about to demand.
+
+All arguments and results are tuples of floats (see `vector3`); accelerations and forces are per unit of mass.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from perch_control.jit import scalar
+from perch_control.vector3 import axes_of, axpy, cross, dot, limited, norm, quaternion_of, quaternion_product, scale, times
+
+GRAVITY = 9.81
+
+
+@scalar
+def position_feedback(e_p, e_v, k_p, k_v, bound):
+    """Acceleration demanded by the errors, bounded, and whether the bound acts. [M:eq2]"""
+    fb = axpy(-1.0, times(k_p, e_p), scale(-1.0, times(k_v, e_v)))
+    n = norm(fb)
+    if n > bound:
+        return scale(bound / n, fb), True
+    return fb, False
+
+
+@scalar
+def specific_force(a_ref, feedback, b3_body, tilt_tangent, floor):
+    """Specific force f whose direction is the commanded b3, within a cone about the reference's thrust direction. [M:eq10]
+
+    The feedback may turn the thrust away from the reference's direction only so far; so it can neither turn the vehicle
+    over nor choose a direction out of noise where the reference's thrust is low. Where the reference is in free fall
+    its direction is undefined: the cone then stands on the present b3, which asks for no rotation.
+
+    Returns:
+        f (3), whether the cone was left and f' of the feedback no longer counts, whether the direction is defined.
+    """
+    f_ref = (a_ref[0], a_ref[1], a_ref[2] + GRAVITY)
+    n = norm(f_ref)
+    defined = n > floor
+    axis = scale(1.0 / n, f_ref) if defined else b3_body
+    total = axpy(1.0, f_ref, feedback)
+    along = dot(total, axis)
+    across = axpy(-along, axis, total)
+    along = max(along, floor)
+    width = norm(across)
+    limit = tilt_tangent * along
+    if width > limit:
+        return axpy(along, axis, scale(limit / width, across)), True, defined
+    return axpy(along, axis, across), False, defined
+
+
+@scalar
+def direction_derivatives(f, df, ddf):
+    """Unit vector along f with its first and second derivative."""
+    n = norm(f)
+    k = 1.0 / n
+    u = scale(k, f)
+    dn = dot(u, df)
+    du = scale(k, axpy(-dn, u, df))
+    ddn = dot(du, df) + dot(u, ddf)
+    ddu = scale(k, axpy(-2.0 * dn, du, axpy(-ddn, u, ddf)))
+    return u, du, ddu
+
+
+@scalar
+def commanded_frame(f, df, ddf, h, dh, ddh):
+    """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [M:eq12, M:eq13]
+
+    Args:
+        f, df, ddf: specific force and its derivatives, |f| > 0.
+        h, dh, ddh: wanted direction of b2 (b2_des) and its derivatives; not parallel to f.
+
+    Returns:
+        b1, b2, b3 (columns of R_C), w_C and dw_C in the commanded frame [rad/s, rad/s^2].
+    """
+    b3, db3, ddb3 = direction_derivatives(f, df, ddf)
+    n = cross(h, b3)
+    dn = axpy(1.0, cross(dh, b3), cross(h, db3))
+    ddn = axpy(1.0, cross(ddh, b3), axpy(2.0, cross(dh, db3), cross(h, ddb3)))
+    b1, db1, ddb1 = direction_derivatives(n, dn, ddn)
+    b2 = cross(b3, b1)
+    # R' = R hat(w): b3' = R (wy, -wx, 0), b1' = R (0, wz, -wy); R'' = R (hat(w)^2 + hat(w')).
+    wx, wy, wz = -dot(b2, db3), dot(b1, db3), dot(b2, db1)
+    dwx = -dot(b2, ddb3) + wy * wz
+    dwy = dot(b1, ddb3) - wx * wz
+    dwz = dot(b2, ddb1) - wx * wy
+    return b1, b2, b3, (wx, wy, wz), (dwx, dwy, dwz)
+
+
+@scalar
+def attitude_error(q, q_C):
+    """Attitude error e_R in B [rad], and the rotation q_e = q_C^-1 q. [M:eq2]
+
+    `2 sign(w) vec(q_e) = 2 sin(angle / 2) axis` agrees with the paper's `vee(R_C^T R - R^T R_C) / 2 = sin(angle) axis` to
+    second order and, unlike it, keeps growing up to 180 degrees: an inverted vehicle is turned back.
+    """
+    e = quaternion_product((-q_C[0], -q_C[1], -q_C[2], q_C[3]), q)
+    k = 2.0 if e[3] >= 0.0 else -2.0
+    return (k * e[0], k * e[1], k * e[2]), e
+
+
+@scalar
+def moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, dw_extra):
+    """Moment in B. [M:eq2]
+
+    Args:
+        w: body rates [rad/s].
+        e_R: attitude error [rad].
+        w_C_B, dw_C_B: commanded body rates and accelerations turned into B, R^T R_C w_C and R^T R_C dw_C.
+        J: principal moments of inertia [kg m^2].
+        k_R, k_w: gains [1/s^2, 1/s]; k_R and k_Omega of the paper are J k_R and J k_w.
+        dw_extra: angular acceleration that makes up for a known disturbance [rad/s^2].
+    """
+    e_w = axpy(-1.0, w_C_B, w)
+    Jw = times(J, w)
+    turn = cross(w, w_C_B)
+    demand = (
+        -k_R[0] * e_R[0] - k_w[0] * e_w[0] - turn[0] + dw_C_B[0] + dw_extra[0],
+        -k_R[1] * e_R[1] - k_w[1] * e_w[1] - turn[1] + dw_C_B[1] + dw_extra[1],
+        -k_R[2] * e_R[2] - k_w[2] * e_w[2] - turn[2] + dw_C_B[2] + dw_extra[2],
+    )
+    return axpy(1.0, times(J, demand), cross(w, Jw))
+
+
+@scalar
+def geometric_step(state, reference, thrust, extra, gains, limits, J):
+    """Wanted specific thrust and moment. [M:eq2, M:eq12, M:eq13]
+
+    Args:
+        state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
+        reference: p, v, a, j, s in W, then b2_des with its first two derivatives, 24 floats.
+        thrust: specific thrust that acts now [m/s^2], for the derivative of the feedback.
+        extra: acceleration in W and angular acceleration in B that make up for known disturbances, 6 floats.
+        gains: k_p, k_v, k_R, k_w, 12 floats.
+        limits: bound of the position feedback [m/s^2], tangent of its cone, floor of the specific force [m/s^2],
+            bounds of commanded rates [rad/s] and accelerations [rad/s^2], share of the feedback's own rate, 6 floats.
+        J: principal moments of inertia [kg m^2], 3 floats.
+
+    Returns:
+        Specific thrust along b3 [m/s^2], moment (3) [N m], q_C (4), w_C and dw_C turned into B (3, 3), attitude error
+        angle of b3 is left to the caller.
+    """
+    p, v = (state[0], state[1], state[2]), (state[3], state[4], state[5])
+    q, w = (state[6], state[7], state[8], state[9]), (state[10], state[11], state[12])
+    p_r, v_r, a_r = reference[0:3], reference[3:6], reference[6:9]
+    jerk, snap = reference[9:12], reference[12:15]
+    h, dh, ddh = reference[15:18], reference[18:21], reference[21:24]
+    k_p, k_v, k_R, k_w = gains[0:3], gains[3:6], gains[6:9], gains[9:12]
+    B1, B2, B3 = axes_of(q)
+
+    e_p, e_v = axpy(-1.0, p_r, p), axpy(-1.0, v_r, v)
+    feedback, bounded = position_feedback(e_p, e_v, k_p, k_v, limits[0])
+    demand = axpy(1.0, feedback, extra[0:3])
+    f, cut, defined = specific_force(a_r, demand, B3, limits[1], limits[2])
+
+    df, ddf = jerk, snap
+    if not (bounded or cut):
+        # e_p' = e_v; e_v' = a - a_r with the thrust that acts; e_v'' along the same lines.
+        e_a = axpy(thrust, B3, scale(-1.0, (a_r[0] + extra[0], a_r[1] + extra[1], a_r[2] + GRAVITY + extra[2])))
+        db3 = axpy(w[1], B1, scale(-w[0], B2))
+        e_j = axpy(thrust, db3, scale(-1.0, jerk))
+        rate = axpy(-1.0, times(k_p, e_v), scale(-1.0, times(k_v, e_a)))
+        rate2 = axpy(-1.0, times(k_p, e_a), scale(-1.0, times(k_v, e_j)))
+        df, ddf = axpy(limits[5], rate, df), axpy(limits[5], rate2, ddf)
+    if not defined:
+        df, ddf = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+
+    n = cross(h, f)
+    if dot(n, n) < 1e-4 * dot(f, f):  # b2_des within 0.6 degrees of the thrust: keep the present heading instead
+        h, dh, ddh = B2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        n = cross(h, f)
+        if dot(n, n) < 1e-4 * dot(f, f):
+            h = cross(f, B1)
+    b1, b2, b3, w_C, dw_C = commanded_frame(f, df, ddf, h, dh, ddh)
+    w_C, dw_C = limited(w_C, limits[3]), limited(dw_C, limits[4])
+
+    q_C = quaternion_of(b1, b2, b3)
+    e_R, _ = attitude_error(q, q_C)
+    w_C_W = axpy(w_C[0], b1, axpy(w_C[1], b2, scale(w_C[2], b3)))
+    dw_C_W = axpy(dw_C[0], b1, axpy(dw_C[1], b2, scale(dw_C[2], b3)))
+    w_C_B = (dot(B1, w_C_W), dot(B2, w_C_W), dot(B3, w_C_W))
+    dw_C_B = (dot(B1, dw_C_W), dot(B2, dw_C_W), dot(B3, dw_C_W))
+    M = moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, extra[3:6])
+    return dot(f, B3), M, q_C, w_C_B, dw_C_B

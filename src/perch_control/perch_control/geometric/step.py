@@ -1,0 +1,113 @@
+"""From state and reference to rotor commands in one compiled call: prediction, control law, allocation, rotor lead."""
+
+from __future__ import annotations
+
+from math import exp
+
+from perch_control.allocation import allocate
+from perch_control.geometric.law import GRAVITY, geometric_step
+from perch_control.jit import scalar
+from perch_control.rotor_lag import approached, leading_command, reachable, thrusts
+from perch_control.vector3 import axes_of, axpy, cross, scale, times, turned
+
+
+@scalar
+def wrench_of(f, forward):
+    """Collective thrust and moments of rotor thrusts. [P:eq2]
+
+    Args:
+        f: rotor thrusts [N], 4 floats.
+        forward: rows x, y, yaw of the allocation matrix: moments per thrust [m], 3 x 4 floats.
+    """
+    x, y, z = forward
+    return (
+        f[0] + f[1] + f[2] + f[3],
+        x[0] * f[0] + x[1] * f[1] + x[2] * f[2] + x[3] * f[3],
+        y[0] * f[0] + y[1] * f[1] + y[2] * f[2] + y[3] * f[3],
+        z[0] * f[0] + z[1] * f[1] + z[2] * f[2] + z[3] * f[3],
+    )
+
+
+@scalar
+def predicted(state, f, extra, duration, mass, J, forward):
+    """State after a short time under constant rotor thrusts. [M:eq1]
+
+    Args:
+        state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
+        f: rotor thrusts [N], 4 floats.
+        extra: what makes up for the known disturbance (see `geometric_step`); the disturbance itself is its negative.
+        duration: [s].
+        mass, J, forward: constants of the vehicle.
+
+    Returns:
+        State, 13 floats.
+    """
+    p, v = (state[0], state[1], state[2]), (state[3], state[4], state[5])
+    q, w = (state[6], state[7], state[8], state[9]), (state[10], state[11], state[12])
+    T, Mx, My, Mz = wrench_of(f, forward)
+    gyro = cross(w, times(J, w))
+    dw = ((Mx - gyro[0]) / J[0] - extra[3], (My - gyro[1]) / J[1] - extra[4], (Mz - gyro[2]) / J[2] - extra[5])
+    # Constant thrust along the mean b3 of the interval: exact to second order in the duration.
+    _, _, b3 = axes_of(turned(q, scale(0.5 * duration, axpy(0.25 * duration, dw, w))))
+    a = axpy(T / mass, b3, (-extra[0], -extra[1], -extra[2] - GRAVITY))
+    p1 = axpy(duration, axpy(0.5 * duration, a, v), p)
+    v1 = axpy(duration, a, v)
+    q1 = turned(q, scale(duration, axpy(0.5 * duration, dw, w)))
+    w1 = axpy(duration, dw, w)
+    return (p1[0], p1[1], p1[2], v1[0], v1[1], v1[2], q1[0], q1[1], q1[2], q1[3], w1[0], w1[1], w1[2])
+
+
+@scalar
+def rotors_for(wrench, speed, vehicle, lead):
+    """Rotor commands that reach a wrench after the lead time, tilt before thrust before yaw.
+
+    Args:
+        wrench: thrust [N] and moments [N m], 4 floats.
+        speed: present rotor speeds [rad/s], 4 floats.
+        vehicle: constants as `VehicleConstants.packed` gives them.
+        lead: [s].
+
+    Returns:
+        Commanded speeds [rad/s] and the thrusts that they reach [N], 4 floats each.
+    """
+    coefficient, speed_min, speed_max, tau = vehicle[1]
+    share = 1.0 if tau <= 0.0 else 1.0 - exp(-lead / tau)
+    low, high = reachable(speed, share, speed_min, speed_max)
+    lo, hi = thrusts(low, coefficient), thrusts(high, coefficient)
+    now = thrusts(speed, coefficient)
+    kept = (min(max(now[0], lo[0]), hi[0]), min(max(now[1], lo[1]), hi[1]),
+            min(max(now[2], lo[2]), hi[2]), min(max(now[3], lo[3]), hi[3]))
+    _, Mx, My, _ = wrench_of(kept, vehicle[2])
+    f = allocate(wrench, (Mx, My), lo, hi, vehicle[3])
+    return leading_command(speed, f, coefficient, share, speed_min, speed_max), f
+
+
+@scalar
+def control_step(state, reference, speed, command, extra, gains, limits, lead, vehicle):
+    """One control period. [M:eq2]
+
+    The state is predicted to the moment at which the rotors will have answered, and the law is evaluated there.
+
+    Args:
+        state: p_WB, v_WB, q_WB (xyzw), w_WB_B now, 13 floats.
+        reference: at `lead` seconds from now, 24 floats; see `geometric_step`.
+        speed, command: rotor speeds now and what they are following [rad/s], 4 floats each.
+        extra, gains, limits: see `geometric_step`.
+        lead: time in which the rotors shall reach the wanted thrust [s].
+        vehicle: (mass, Jx, Jy, Jz), (thrust coefficient, lowest and highest speed, time constant), moment rows (3 x 4),
+            mixing columns (4 x 4).
+
+    Returns:
+        Commanded rotor speeds (4) [rad/s], wanted wrench (4) [N, N m], rotor thrusts that will be reached (4) [N],
+        q_C (4), w_C and dw_C in B (3, 3), predicted state (13).
+    """
+    mass, J = vehicle[0][0], vehicle[0][1:4]
+    coefficient, _, _, tau = vehicle[1]
+    half = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * lead / tau)
+    f_mid = thrusts(approached(speed, command, half), coefficient)
+    ahead = predicted(state, f_mid, extra, lead, mass, J, vehicle[2])
+    specific = (f_mid[0] + f_mid[1] + f_mid[2] + f_mid[3]) / mass
+    thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, specific, extra, gains, limits, J)
+    wrench = (mass * thrust, M[0], M[1], M[2])
+    out, f = rotors_for(wrench, speed, vehicle, lead)
+    return out, wrench, f, q_C, w_C, dw_C, ahead

@@ -1,0 +1,132 @@
+"""References that the controller makes itself: hold, brake, descend, and the move from one reference to another.
+
+Each has `duration` [s] and `setpoint(t)`; past their duration they hold their end (hover or steady descent).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_control.reference import Setpoint
+from perch_core.trajectory import FlatTrajectory
+
+_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Hover at a point with a heading."""
+
+    target: Setpoint
+    duration: float = 0.0
+
+    @classmethod
+    def at(cls, p, h) -> Hold:
+        """Hover at `p` with b2_des `h`, made horizontal."""
+        return cls(Setpoint(tuple(float(x) for x in p), h=horizontal(h)))
+
+    def setpoint(self, t: float) -> Setpoint:
+        """The same at every time."""
+        return self.target
+
+
+def horizontal(h) -> tuple[float, float, float]:
+    """b2_des turned into the horizontal plane; a vertical one counts as heading zero."""
+    n = float(np.hypot(h[0], h[1]))
+    return (float(h[0]) / n, float(h[1]) / n, 0.0) if n > 1e-3 else (0.0, 1.0, 0.0)
+
+
+class Polynomial:
+    """A polynomial in position with a fixed heading; past its end the end velocity goes on."""
+
+    def __init__(self, coefficients: np.ndarray, duration: float, h: tuple[float, float, float]) -> None:
+        """
+        Args:
+            coefficients: Bernstein coefficients of x, y, z [m], shape (3, degree + 1).
+            duration: [s], > 0.
+            h: wanted direction of b2.
+        """
+        yaw = np.zeros((1, coefficients.shape[1]))
+        self._trajectory = FlatTrajectory(np.array([duration]), np.concatenate([coefficients, yaw])[None])
+        self.duration, self._h = float(duration), h
+
+    def setpoint(self, t: float) -> Setpoint:
+        """Setpoint at a time [s]."""
+        x = self._trajectory.sample(t)
+        p, v = tuple(x.p.tolist()), tuple(x.v.tolist())
+        over = t - self.duration
+        if over > 0.0:
+            return Setpoint((p[0] + over * v[0], p[1] + over * v[1], p[2] + over * v[2]), v, h=self._h)
+        return Setpoint(p, v, tuple(x.a.tolist()), tuple(x.j.tolist()), tuple(x.s.tolist()), h=self._h)
+
+
+def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polynomial:
+    """Smooth change of velocity from a moving state to `v_end`, position left free at the end.
+
+    The velocity is a quintic with zero end acceleration and jerk; the duration keeps the mean of its peak at
+    `deceleration`.
+
+    Args:
+        p, v, a: where the motion is taken over [m, m/s, m/s^2], shape (3,).
+        h: wanted direction of b2; made horizontal.
+        v_end: velocity at the end [m/s].
+        deceleration: [m/s^2].
+    """
+    p, v, a, v_end = (np.array(x, float) for x in (p, v, a, v_end))
+    T = max(0.4, _PEAK * float(np.linalg.norm(v - v_end)) / deceleration, float(np.linalg.norm(a)) / deceleration * 0.4)
+    velocity = np.stack([v, v + a * T / 5, v + 2 * a * T / 5, v_end, v_end, v_end], axis=-1)
+    steps = np.cumsum(velocity, axis=-1) * T / 6
+    return Polynomial(p[:, None] + np.concatenate([np.zeros((3, 1)), steps], axis=-1), T, horizontal(h))
+
+
+def quintic(p0, v0, a0, p1, v1, a1, duration: float) -> np.ndarray:
+    """Bernstein coefficients of the quintic with the given ends, shape (3, 6)."""
+    p0, v0, a0, p1, v1, a1 = (np.array(x, float) for x in (p0, v0, a0, p1, v1, a1))
+    T = duration
+    return np.stack([
+        p0, p0 + v0 * T / 5, p0 + 2 * v0 * T / 5 + a0 * T**2 / 20,
+        p1 - 2 * v1 * T / 5 + a1 * T**2 / 20, p1 - v1 * T / 5, p1,
+    ], axis=-1)
+
+
+@dataclass(frozen=True)
+class Blend:
+    """A new reference reached without a jump: the offset to the old one dies away along a quintic.
+
+    Attributes:
+        source: the new reference.
+        start: its time at which it takes over [s].
+        offset: what is added, over the time since `start`.
+    """
+
+    source: object
+    start: float
+    offset: Polynomial
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.source.duration
+
+    def setpoint(self, t: float) -> Setpoint:
+        """Setpoint at a time [s] of the new reference."""
+        x = self.source.setpoint(t)
+        if t - self.start >= self.offset.duration:
+            return x
+        d = self.offset.setpoint(t - self.start)
+        return Setpoint(*(tuple(m + n for m, n in zip(getattr(x, k), getattr(d, k))) for k in ("p", "v", "a", "j", "s")),
+                        x.h, x.dh, x.ddh)
+
+
+def blended(old: Setpoint, source, start: float, duration: float = 0.5):
+    """`source` from its time `start` on, taken over from the old setpoint without a jump in position, velocity or
+    acceleration; the source itself where it continues the old one exactly."""
+    new = source.setpoint(start)
+    gap = [np.subtract(getattr(old, k), getattr(new, k)) for k in ("p", "v", "a")]
+    if max(float(np.abs(g).max()) for g in gap) < 1e-6:
+        return source
+    zero = np.zeros(3)
+    duration = min(duration, max(0.5 * (source.duration - start), 0.1))
+    return Blend(source, start, Polynomial(quintic(*gap, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))

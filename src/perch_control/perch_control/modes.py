@@ -1,0 +1,64 @@
+"""States, commands and events of the controller; the values are those of the messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from perch_control.reference import Setpoint
+from perch_core.errors import PerchError
+
+
+class State(IntEnum):
+    """State of the controller, as in `perch_msgs/ControllerStatus`."""
+
+    DISARMED = 0
+    ARMED = 1
+    TRACKING = 2
+    HOVERING = 3
+    RECOVERING = 4
+    LANDING = 5
+    FAILED = 6
+
+
+class Command(IntEnum):
+    """Command to the controller, as in `perch_msgs/ControllerCommand`."""
+
+    DISARM = 0
+    ARM = 1
+    HOVER = 2
+    LAND = 3
+    ATTACHED = 4
+    KILL = 5
+
+
+FLYING = (State.TRACKING, State.HOVERING, State.RECOVERING, State.LANDING)
+
+
+class CommandRefused(PerchError):
+    """The command is not carried out; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """Answer to one step.
+
+    Attributes:
+        armed: motors run.
+        rotor_speed: commanded speeds [rad/s], 4 floats.
+        setpoint: reference at this step, None while the motors are off.
+        q_C, w_C, dw_C: commanded attitude (xyzw), body rates [rad/s], angular acceleration [rad/s^2].
+        wrench: wanted thrust [N] and moments [N m], 4 floats.
+        margin: (max - commanded) / max of the most loaded rotor.
+        event: something happened in this step that people should read; empty: nothing.
+    """
+
+    armed: bool
+    rotor_speed: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    setpoint: Setpoint | None = None
+    q_C: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    w_C: tuple[float, ...] = (0.0, 0.0, 0.0)
+    dw_C: tuple[float, ...] = (0.0, 0.0, 0.0)
+    wrench: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    margin: float = 1.0
+    event: str = ""

@@ -1,0 +1,77 @@
+"""Conditions that must hold for a while before the supervisor acts on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import acos, degrees
+
+from perch_control.flight_settings import FlightSettings
+from perch_control.reference import Setpoint
+from perch_control.vector3 import axes_of, axpy, dot, norm
+from perch_core.vehicle import GRAVITY
+
+
+@dataclass
+class Persistent:
+    """A condition with memory: `update` is true from `hold` seconds of it on."""
+
+    hold: float
+    since: float | None = None
+
+    def update(self, condition: bool, now: float) -> bool:
+        """Take the condition at a time [s]."""
+        if not condition:
+            self.since = None
+            return False
+        if self.since is None:
+            self.since = now
+        return now - self.since >= self.hold
+
+
+def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:
+    """Angle between b3 and the thrust direction of the reference [deg]; 0 where the reference is in free fall."""
+    f = (setpoint.a[0], setpoint.a[1], setpoint.a[2] + GRAVITY)
+    n = norm(f)
+    if n < 0.5:
+        return 0.0
+    _, _, b3 = axes_of(state[6:10])
+    return degrees(acos(min(max(dot(b3, f) / n, -1.0), 1.0)))
+
+
+@dataclass
+class TrackingMonitor:
+    """Tilt, body rate and position beyond what was planned, thrust margin, geofence."""
+
+    settings: FlightSettings
+    rate_max: float
+    _tilt: Persistent = field(init=False)
+    _rate: Persistent = field(init=False)
+    _position: Persistent = field(init=False)
+    _margin: Persistent = field(init=False)
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self._tilt, self._rate, self._position = (Persistent(s.fault_time) for _ in range(3))
+        self._margin = Persistent(s.margin_time)
+
+    def deviation(self, state: tuple[float, ...], setpoint: Setpoint, now: float) -> str:
+        """What the vehicle does that was not planned; empty: nothing."""
+        s = self.settings
+        tilt = reference_tilt_deg(state, setpoint)
+        rate = norm(state[10:13])
+        error = norm(axpy(-1.0, setpoint.p, state[0:3]))
+        out = [
+            (self._tilt.update(tilt > s.tilt_margin_deg, now), f"tilt {tilt:.0f} deg away from the plan's"),
+            (self._rate.update(rate > s.rate_factor * self.rate_max, now), f"body rate {rate:.1f} rad/s beyond any plan's"),
+            (self._position.update(error > s.position_error_max, now), f"{error:.2f} m away from the reference"),
+        ]
+        return next((text for acts, text in out if acts), "")
+
+    def exhausted(self, margin: float, now: float) -> bool:
+        """The rotors have been at their limit for too long."""
+        return self._margin.update(margin < self.settings.margin_min, now)
+
+    def outside(self, p: tuple[float, ...]) -> float:
+        """Distance by which a position is outside the geofence [m], 0 inside."""
+        s = self.settings
+        return max(0.0, *(max(lo - x, x - hi) for x, lo, hi in zip(p, s.fence_low, s.fence_high)))

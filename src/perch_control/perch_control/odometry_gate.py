@@ -1,0 +1,85 @@
+"""Which odometry may be flown on: finite, normalised, in time order, and where the last one said the vehicle would be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import acos, degrees, isfinite, sqrt
+
+from perch_core.config import quantity
+
+
+@dataclass(frozen=True)
+class OdometryLimits:
+    """What counts as usable odometry."""
+
+    timeout: float = quantity(0.05, unit="s", above=0.0, high=5.0, doc="without usable odometry for longer: descent without position")
+    position_jump: float = quantity(0.25, unit="m", above=0.0, doc="largest step between two samples beyond the motion")
+    velocity_jump: float = quantity(1.5, unit="m/s", above=0.0, doc="largest step between two samples")
+    attitude_jump_deg: float = quantity(20.0, unit="deg", above=0.0, high=180.0, doc="largest step beyond the rotation")
+    confirm: float = quantity(0.03, unit="s", low=0.0, doc="a jump that stays for so long is the new truth: hover there")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """`usable`: fly on it. `jumped`: the first sample accepted after a jump. `reason`: why not, or what happened."""
+
+    usable: bool
+    jumped: bool = False
+    reason: str = ""
+
+
+class OdometryGate:
+    """Owns the last accepted sample and a candidate that jumped away from it."""
+
+    def __init__(self, limits: OdometryLimits) -> None:
+        self.limits = limits
+        self.stamp: float | None = None     # of the last accepted sample [s]
+        self.state: tuple[float, ...] = ()
+        self._candidate: tuple[float, float, tuple[float, ...]] | None = None  # first stamp, last stamp, state
+
+    def check(self, stamp: float, state: tuple[float, ...]) -> Verdict:
+        """Judge one sample.
+
+        Args:
+            stamp: [s].
+            state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
+        """
+        for value in state:
+            if not isfinite(value):
+                return Verdict(False, reason="odometry holds a value that is not finite")
+        n = sqrt(sum(c * c for c in state[6:10]))
+        if abs(n - 1.0) > 1e-2:
+            return Verdict(False, reason=f"odometry quaternion has norm {n:.3f}, not 1")
+        if self.stamp is None:
+            self.stamp, self.state = stamp, state
+            return Verdict(True)
+        if stamp <= self.stamp:
+            return Verdict(False, reason=f"odometry stamp {stamp:.3f} s is not after {self.stamp:.3f} s")
+        problem = self._step(self.stamp, self.state, stamp, state)
+        if not problem:
+            self.stamp, self.state, self._candidate = stamp, state, None
+            return Verdict(True)
+        if self._candidate is None or self._step(self._candidate[1], self._candidate[2], stamp, state):
+            self._candidate = (stamp, stamp, state)
+        self._candidate = (self._candidate[0], stamp, state)
+        if stamp - self._candidate[0] >= self.limits.confirm:
+            self.stamp, self.state, self._candidate = stamp, state, None
+            return Verdict(True, True, problem)
+        return Verdict(False, reason=problem)
+
+    def _step(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
+        """What is wrong with the step from one sample to the next; empty: nothing."""
+        dt = t1 - t0
+        limits = self.limits
+        dp = sqrt(sum((b[i] - a[i] - 0.5 * dt * (a[3 + i] + b[3 + i])) ** 2 for i in range(3)))
+        if dp > limits.position_jump:
+            return f"odometry position jumped by {dp:.2f} m in {dt * 1e3:.0f} ms"
+        dv = sqrt(sum((b[i] - a[i]) ** 2 for i in range(3, 6)))
+        if dv > limits.velocity_jump + 40.0 * dt:
+            return f"odometry velocity jumped by {dv:.2f} m/s in {dt * 1e3:.0f} ms"
+        c = min(abs(sum(a[i] * b[i] for i in range(6, 10))), 1.0)
+        turn = degrees(2.0 * acos(c))
+        spun = degrees(dt * sqrt(max(sum(a[i] ** 2 for i in range(10, 13)), sum(b[i] ** 2 for i in range(10, 13)))))
+        if turn - spun > limits.attitude_jump_deg:
+            return f"odometry attitude jumped by {turn:.0f} deg in {dt * 1e3:.0f} ms"
+        return ""

@@ -1,0 +1,36 @@
+"""Parameters of the node `controller`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_control.flight_settings import FlightSettings
+from perch_control.settings import GeometricGains
+from perch_core.config import choice, part, quantity, text
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerChoice:
+    """Which control law flies."""
+
+    type: str = choice("geometric", options=("geometric", "nmpc"), doc="control law at the start; service set_controller changes it")
+    adaptive: bool = quantity(False, doc="L1 augmentation on force and moment")
+    reference_period: int = quantity(5, low=1, high=500, doc="controller/reference every so many steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerParameters:
+    """Parameters of the node `controller`: gain sets by vehicle, limits of the supervisor."""
+
+    vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
+    gains: str = choice("vehicle", options=("vehicle", "snapdragon", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
+    blind_after: float = quantity(1.0, unit="s", above=0.0, doc="wall-clock time without odometry while the IMU goes on: descend on the IMU alone")
+    controller: ControllerChoice = part(ControllerChoice)
+    snapdragon: GeometricGains = part(GeometricGains)
+    rpg: GeometricGains = part(GeometricGains)
+    flight: FlightSettings = part(FlightSettings)
+
+    def gain_set(self, vehicle_name: str) -> GeometricGains:
+        """The gains to fly a vehicle with; they are per unit of mass and inertia, so an unknown vehicle takes snapdragon's."""
+        name = self.gains if self.gains != "vehicle" else vehicle_name
+        return self.rpg if name.startswith("rpg") else self.snapdragon

@@ -1,0 +1,89 @@
+"""The way back to a hover from any attitude: away from the surface, upright, then stop.
+
+After a missed perch the vehicle lies tilted beside the wall and falls. While the thrust still points away from the wall it
+pushes off (turning upright moves the upper edge of the body towards the wall by its radius), then it turns upright with all
+the moment there is, catches the fall, and hands over to a hover when it is slow and level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, radians
+
+from perch_control.guidance import horizontal
+from perch_control.reference import Setpoint
+from perch_control.vector3 import axes_of, axpy, dot, limited, norm, scale
+from perch_core.config import quantity
+from perch_core.vehicle import GRAVITY
+
+
+@dataclass(frozen=True)
+class RecoverySettings:
+    """How a recovery flies."""
+
+    push_time: float = quantity(0.12, unit="s", low=0.0, high=1.0, doc="longest push away from the surface")
+    push_clearance: float = quantity(0.12, unit="m", low=0.0, doc="the push ends at this distance from where contact was missed")
+    push_share: float = quantity(0.7, unit="-", above=0.0, high=1.0, doc="share of the greatest thrust while pushing")
+    away_speed: float = quantity(0.5, unit="m/s", low=0.0, doc="speed away from the surface until the clearance is reached")
+    away_distance: float = quantity(0.5, unit="m", low=0.0, doc="distance from the surface at which to hover")
+    velocity_gain: float = quantity(4.0, unit="1/s", above=0.0)
+    climb_gain: float = quantity(1.0, unit="1/s", low=0.0, doc="vertical speed per height lost")
+    climb_speed_max: float = quantity(1.0, unit="m/s", above=0.0)
+    acceleration_max: float = quantity(5.0, unit="m/s^2", above=0.0, doc="horizontal")
+    level_deg: float = quantity(25.0, unit="deg", above=0.0, high=90.0, doc="hand-over to hover below this tilt ...")
+    rate: float = quantity(3.0, unit="rad/s", above=0.0, doc="... this body rate ...")
+    speed: float = quantity(0.8, unit="m/s", above=0.0, doc="... and this speed")
+    timeout: float = quantity(6.0, unit="s", above=0.0, doc="then descend")
+
+
+class Recovery:
+    """Guidance from the present state; `update` first in each period, then `setpoint`."""
+
+    duration = float("inf")
+
+    def __init__(self, settings: RecoverySettings, specific_thrust_max: float, state: tuple[float, ...],
+                 normal: tuple[float, float, float] | None) -> None:
+        """
+        Args:
+            settings: how to fly.
+            specific_thrust_max: greatest collective thrust / mass [m/s^2].
+            state: where the recovery begins, 13 floats (p, v, q, w).
+            normal: outward normal of the surface at `state`, None: in the open.
+        """
+        self._settings, self._thrust_max = settings, specific_thrust_max
+        self._origin, self._normal = state[0:3], normal
+        _, self._h, _ = axes_of(state[6:10])
+        self._pushing = normal is not None and normal[2] < cos(radians(30.0))
+        self._setpoint = Setpoint(state[0:3], state[3:6], h=self._h)
+        self.finished = False
+
+    def update(self, state: tuple[float, ...], elapsed: float) -> None:
+        """Take the present state, `elapsed` seconds after the beginning."""
+        s = self._settings
+        p, v, w = state[0:3], state[3:6], state[10:13]
+        b1, b2, b3 = axes_of(state[6:10])
+        moved = axpy(-1.0, self._origin, p)
+        clearance = dot(moved, self._normal) if self._normal is not None else s.away_distance
+        if self._pushing and (elapsed > s.push_time or clearance > s.push_clearance):
+            self._pushing = False
+        if self._pushing:
+            f = scale(s.push_share * self._thrust_max, self._normal)
+            self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._h)
+            return
+        climb = min(max(-s.climb_gain * moved[2], -s.climb_speed_max), s.climb_speed_max)
+        away = (0.0, 0.0, 0.0)
+        if self._normal is not None and clearance < s.away_distance:
+            nx, ny, _ = self._normal
+            away = scale(s.away_speed, (nx, ny, 0.0))
+        demand = axpy(-s.velocity_gain, v, scale(s.velocity_gain, (away[0], away[1], climb)))
+        side = limited((demand[0], demand[1], 0.0), s.acceleration_max)
+        up = min(max(demand[2], -0.4 * GRAVITY), 0.85 * self._thrust_max - GRAVITY)
+        # A body more than 90 degrees over turns about its own b2 or b1, whichever way is shorter: heading can wait.
+        h = b2 if b3[2] < 0.5 else horizontal(b2)
+        self._setpoint = Setpoint(p, v, (side[0], side[1], up), h=h)
+        self.finished = (b3[2] > cos(radians(s.level_deg)) and norm(w) < s.rate and norm(v) < s.speed
+                         and clearance >= 0.5 * s.away_distance)
+
+    def setpoint(self, t: float) -> Setpoint:
+        """The demand of the last `update`: an acceleration without position or velocity error."""
+        return self._setpoint

@@ -1,0 +1,118 @@
+"""What the vehicle shall do at a time: setpoints, and the sources that give them.
+
+A source is anything with `duration` and `setpoint(t)`, t in seconds since its start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, sin
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.vehicle import GRAVITY
+
+Vector = tuple[float, float, float]
+_ZERO = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """Wanted motion at one time; every vector in W, 3 floats.
+
+    Attributes:
+        p, v, a, j, s: position and its derivatives [m, m/s, m/s^2, m/s^3, m/s^4].
+        h, dh, ddh: wanted direction of b2 (b2_des of [M:eq12]) and its derivatives. A vector, not an angle: a reference
+            attitude gives it without singularity, whatever the tilt.
+    """
+
+    p: Vector
+    v: Vector = _ZERO
+    a: Vector = _ZERO
+    j: Vector = _ZERO
+    s: Vector = _ZERO
+    h: Vector = (0.0, 1.0, 0.0)
+    dh: Vector = _ZERO
+    ddh: Vector = _ZERO
+
+    @property
+    def packed(self) -> tuple[float, ...]:
+        """All fields in their order, 24 floats."""
+        return (*self.p, *self.v, *self.a, *self.j, *self.s, *self.h, *self.dh, *self.ddh)
+
+
+def _floats(v) -> Vector:
+    return (float(v[0]), float(v[1]), float(v[2]))
+
+
+def heading(yaw: float, rate: float = 0.0, acceleration: float = 0.0) -> tuple[Vector, Vector, Vector]:
+    """b2_des of a yaw angle and its first two derivatives. [M:eq12]"""
+    c, s = cos(yaw), sin(yaw)
+    return ((-s, c, 0.0), (-c * rate, -s * rate, 0.0),
+            (s * rate * rate - c * acceleration, -c * rate * rate - s * acceleration, 0.0))
+
+
+@dataclass(frozen=True)
+class FlatReference:
+    """A polynomial in the flat outputs."""
+
+    trajectory: FlatTrajectory
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.trajectory.duration
+
+    def setpoint(self, t: float) -> Setpoint:
+        """Setpoint at a time [s]. Past the end the last acceleration holds: a contact is being awaited there."""
+        x = self.trajectory.sample(t)
+        over = t - self.trajectory.duration
+        p, v, a = x.p.tolist(), x.v.tolist(), x.a.tolist()
+        if over > 0.0:
+            p = [p[i] + over * (v[i] + 0.5 * over * a[i]) for i in range(3)]
+            v = [v[i] + over * a[i] for i in range(3)]
+            return Setpoint(tuple(p), tuple(v), tuple(a), _ZERO, _ZERO, *heading(x.yaw))
+        return Setpoint(tuple(p), tuple(v), tuple(a), tuple(x.j.tolist()), tuple(x.s.tolist()),
+                        *heading(x.yaw, x.yaw_rate, x.yaw_acc))
+
+
+@dataclass(frozen=True)
+class SampledReference:
+    """Full states with rotor thrusts, brought to the same form: jerk and snap follow from the attitude's motion and the
+    collective thrust, b2_des from the reference attitude."""
+
+    trajectory: SampledTrajectory
+    mass: float
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return self.trajectory.duration
+
+    def setpoint(self, t: float) -> Setpoint:
+        """Setpoint at a time [s]; past the end the last acceleration holds."""
+        end = self.trajectory.duration
+        x = self.trajectory.sample(t)
+        R = so3.quat_to_matrix(x.q)
+        w, dw = x.w, x.dw
+        over = max(t - end, 0.0)
+        specific = float(np.sum(x.rotor_thrust)) / self.mass
+        span = 0.5 * float(self.trajectory.times[1] - self.trajectory.times[0])
+        before, after = max(t - span, 0.0), min(t + span, end)
+        rate = 0.0
+        if over > 0.0:
+            w, dw = np.zeros(3), np.zeros(3)
+        elif after > before:
+            change = self.trajectory.sample(after).rotor_thrust - self.trajectory.sample(before).rotor_thrust
+            rate = float(np.sum(change)) / (after - before) / self.mass
+        W = so3.hat(w)
+        turn, turn2 = R @ W, R @ (W @ W + so3.hat(dw))  # R', R''
+        b3, db3, ddb3 = R[:, 2], turn[:, 2], turn2[:, 2]
+        a = specific * b3 - np.array([0.0, 0.0, GRAVITY])
+        j = rate * b3 + specific * db3
+        s = 2.0 * rate * db3 + specific * ddb3
+        p, v = x.p + over * (x.v + 0.5 * over * a), x.v + over * a
+        return Setpoint(_floats(p), _floats(v), _floats(a), _floats(j), _floats(s), _floats(R[:, 1]),
+                        _floats(turn[:, 1]), _floats(turn2[:, 1]))

@@ -1,0 +1,84 @@
+"""Rotor speeds that follow their command with a first-order lag: prediction and the command that makes up for it.
+
+`d Omega / dt = (Omega_cmd - Omega) / tau`, thrust = k Omega^2. A command that aims past the wanted speed reaches it after
+`lead` seconds instead of several `tau`; what the rotor cannot reach in that time is known beforehand, so that the
+allocation can choose among the reachable thrusts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+from perch_control.jit import scalar
+from perch_core.vehicle import Vehicle
+
+
+@scalar
+def approached(speed, target, share):
+    """Speeds after the share `1 - exp(-t / tau)` of the way to their targets [rad/s], 4 floats."""
+    return (
+        speed[0] + share * (target[0] - speed[0]), speed[1] + share * (target[1] - speed[1]),
+        speed[2] + share * (target[2] - speed[2]), speed[3] + share * (target[3] - speed[3]),
+    )
+
+
+@scalar
+def thrusts(speed, coefficient):
+    """Thrusts of rotor speeds [rad/s] -> [N], 4 floats."""
+    return (coefficient * speed[0] * speed[0], coefficient * speed[1] * speed[1],
+            coefficient * speed[2] * speed[2], coefficient * speed[3] * speed[3])
+
+
+@scalar
+def reachable(speed, share, speed_min, speed_max):
+    """Lowest and highest speeds that the rotors can have after the lead time [rad/s], 4 floats each.
+
+    A rotor outside its limits (off, or starting) is taken as being at the limit.
+    """
+    low = approached(speed, (speed_min, speed_min, speed_min, speed_min), share)
+    high = approached(speed, (speed_max, speed_max, speed_max, speed_max), share)
+    return ((max(low[0], speed_min), max(low[1], speed_min), max(low[2], speed_min), max(low[3], speed_min)),
+            (min(max(high[0], speed_min), speed_max), min(max(high[1], speed_min), speed_max),
+             min(max(high[2], speed_min), speed_max), min(max(high[3], speed_min), speed_max)))
+
+
+@scalar
+def leading_command(speed, thrust, coefficient, share, speed_min, speed_max):
+    """Commands with which the rotors have the wanted thrusts after the lead time, within their limits [rad/s], 4 floats."""
+    a, b, c, d = thrust
+    k = 1.0 / coefficient
+    return (
+        min(max(speed[0] + ((k * max(a, 0.0)) ** 0.5 - speed[0]) / share, speed_min), speed_max),
+        min(max(speed[1] + ((k * max(b, 0.0)) ** 0.5 - speed[1]) / share, speed_min), speed_max),
+        min(max(speed[2] + ((k * max(c, 0.0)) ** 0.5 - speed[2]) / share, speed_min), speed_max),
+        min(max(speed[3] + ((k * max(d, 0.0)) ** 0.5 - speed[3]) / share, speed_min), speed_max),
+    )
+
+
+@dataclass(frozen=True)
+class RotorEstimate:
+    """Rotor speeds as the controller believes them to be: the lag model run on its own commands, or the measured ones.
+
+    Attributes:
+        speed: [rad/s], 4 floats.
+        command: what the rotors are following [rad/s], 4 floats.
+    """
+
+    speed: tuple[float, float, float, float]
+    command: tuple[float, float, float, float]
+
+    @classmethod
+    def at_idle(cls, vehicle: Vehicle) -> RotorEstimate:
+        """Rotors at their lowest speed."""
+        idle = (vehicle.speed_min,) * 4
+        return cls(idle, idle)
+
+    def after(self, duration: float, time_constant: float) -> RotorEstimate:
+        """The same rotors `duration` seconds later, still following their command."""
+        share = 1.0 if time_constant <= 0.0 else 1.0 - exp(-duration / time_constant)
+        return RotorEstimate(approached(self.speed, self.command, share), self.command)
+
+    def following(self, command: tuple[float, float, float, float]) -> RotorEstimate:
+        """The same rotors with a new command."""
+        return RotorEstimate(self.speed, command)

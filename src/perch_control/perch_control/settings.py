@@ -1,0 +1,28 @@
+"""Gains and limits of the controller, declared once for files, ROS parameters and documentation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_core.config import quantity
+
+Vector3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class GeometricGains:
+    """Gains of [M:eq2] per unit of mass and inertia, so that they carry over between vehicles: k_x = m position,
+    k_v = m velocity, k_R = J attitude, k_Omega = J rate."""
+
+    position: Vector3 = quantity((7.0, 7.0, 9.0), unit="1/s^2", low=0.0, high=200.0, doc="axes of W")
+    velocity: Vector3 = quantity((4.5, 4.5, 5.5), unit="1/s", low=0.0, high=100.0, doc="axes of W")
+    attitude: Vector3 = quantity((420.0, 420.0, 60.0), unit="1/s^2", low=0.0, high=5000.0, doc="axes of B")
+    rate: Vector3 = quantity((32.0, 32.0, 10.0), unit="1/s", low=0.0, high=500.0, doc="axes of B")
+    lead: float = quantity(0.02, unit="s", low=0.002, high=0.2, doc="time in which the rotors reach the wanted thrust")
+    feedback_max: float = quantity(8.0, unit="m/s^2", above=0.0, high=50.0, doc="bound of the position feedback")
+    cone_deg: float = quantity(40.0, unit="deg", above=0.0, high=80.0, doc="the feedback turns the thrust no further from the reference's")
+    cone_contact_deg: float = quantity(5.0, unit="deg", above=0.0, high=80.0, doc="the same at the end of a trajectory that ends in contact")
+    contact_window: float = quantity(0.3, unit="s", low=0.0, high=2.0, doc="time before the contact over which the cone narrows")
+    thrust_floor: float = quantity(0.8, unit="m/s^2", above=0.0, high=5.0, doc="specific thrust below which a direction is noise")
+    feedback_rate: float = quantity(0.3, unit="-", low=0.0, high=1.0, doc="share of the feedback's own derivative in the commanded rates")
+    acceleration_max: float = quantity(250.0, unit="rad/s^2", above=0.0, high=5000.0, doc="bound of the commanded angular acceleration")
