@@ -7,10 +7,12 @@ the declaration holds unit, range and meaning once, for files, ROS parameters an
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import os
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -101,6 +103,16 @@ def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
     raise ConfigError(source, key, f"{value!r} is not of type {getattr(kind, '__name__', kind)}")
 
 
+def unknown(source: str, key: str, kind: str, names: Iterable[str]) -> ConfigError:
+    """The error for a name that does not exist: it lists the names there are, or the likeliest of many."""
+    names = list(names)
+    close = difflib.get_close_matches(key, names, n=5, cutoff=0.4)
+    if len(names) <= 16:
+        return ConfigError(source, key, f"unknown {kind}; allowed: {', '.join(names)}")
+    hint = f"did you mean {', '.join(close)}?" if close else f"the {len(names)} names begin with {', '.join(dict.fromkeys(n.split('.')[0] for n in names))}"
+    return ConfigError(source, key, f"unknown {kind}; {hint}")
+
+
 def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T:
     """A frozen dataclass from a parsed YAML mapping.
 
@@ -120,7 +132,7 @@ def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T
     dot = f"{prefix}." if prefix else ""
     for key in mapping:
         if key not in known:
-            raise ConfigError(source, f"{dot}{key}", f"unknown key; allowed: {', '.join(known)}")
+            raise unknown(source, f"{dot}{key}", "key", known)
     values = {}
     for name, item in known.items():
         if name not in mapping:

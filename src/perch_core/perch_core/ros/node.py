@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from typing import Any, Callable, Generic, TypeVar
+from typing import Any, Callable, Generic, NoReturn, TypeVar
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # one core per node; must be set before numpy is imported
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.executors import ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
@@ -64,28 +64,45 @@ class PerchNode(Node, Generic[T]):
         self._diagnostics.publish(array)
 
 
+class StopSignal:
+    """Becomes true with SIGINT or SIGTERM.
+
+    rclpy's own handlers end a wait by an exception out of whatever callback runs, which EventsExecutor cannot pass on;
+    a flag lets the callback finish.
+    """
+
+    def __init__(self) -> None:
+        self._set = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, *_: Any) -> None:
+        self._set = True
+
+    def __bool__(self) -> bool:
+        return self._set
+
+
+def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
+    """Run callbacks until the signal. (EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6; spin_once does.)"""
+    while not stop and rclpy.ok():
+        executor.spin_once(timeout_sec=0.1)
+
+
 def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> None:
     """Run one node until SIGINT or SIGTERM; exits the process with 0, or 2 when the caller's parameters are refused."""
+    stop = StopSignal()
     try:
-        rclpy.init(args=args)
-    except Exception as error:  # rclpy raises its own type for a params file that is not YAML
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    signal.signal(signal.SIGTERM, lambda *_: rclpy.try_shutdown())
-    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = create()
     except (ConfigError, rclpy.exceptions.InvalidParameterValueException) as error:
-        print(f"error: {error}", file=sys.stderr)
-        rclpy.try_shutdown()
-        sys.exit(2)
+        _refuse(str(error))
+    except RuntimeError as error:  # rcl refuses command lines and parameter files with this one
+        _refuse(" ".join(str(error).split()))
     executor = EventsExecutor()
     executor.add_node(node)
     try:
-        # EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6; spin_once does.
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=0.5)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        spin_until_stopped(executor, stop)
     finally:
         close = getattr(node, "close", None)
         if close is not None:
@@ -93,3 +110,9 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
         node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(0)
+
+
+def _refuse(problem: str) -> NoReturn:
+    print(f"error: {problem}", file=sys.stderr)
+    rclpy.try_shutdown()
+    sys.exit(2)

@@ -82,7 +82,7 @@ class Parameters(typing.Generic[T]):
         overrides = {name: p.value for name, p in node._parameter_overrides.items()}
         for name in overrides:
             if name not in self._leaves and not name.startswith(_FOREIGN):
-                raise ConfigError(node.get_name(), name, f"unknown parameter; allowed: {', '.join(self._leaves)}")
+                raise config.unknown(node.get_name(), name, "parameter", self._leaves)
         self.value: T = config.from_mapping(
             cls, _nest({n: v for n, v in overrides.items() if n in self._leaves}), node.get_name())
         for name, item in self._leaves.items():
