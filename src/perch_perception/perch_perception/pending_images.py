@@ -39,7 +39,7 @@ class PendingImages:
             odometry_time: stamp of the newest odometry [s]; -inf before the first.
             keep_all: never drop one for being late (lockstep).
         """
-        exposed = msg.header.stamp.sec + 1e-9 * msg.header.stamp.nanosec - self._offset
+        exposed = round(msg.header.stamp.sec + 1e-9 * msg.header.stamp.nanosec - self._offset, 9)
         self._waiting.append((msg, exposed))
         while not keep_all and len(self._waiting) > QUEUE_LENGTH:
             late, late_exposed = self._waiting.popleft()

@@ -136,8 +136,8 @@ class TargetLocalizerNode(PerchNode[TargetLocalizerConfig]):
         measured = to_map(result.average or board, body, self._mount, self.params.calibration)
         fresh, detection.frames_fused = True, 1
         if self.params.mode == "fused":
-            self._target = fuse(self._target, measured) if self._target is not None else start_fusion(measured)
-            detection.frames_fused = self._target.frames
+            self._fuse(measured)
+            detection.frames_fused = self._target.frames if self._target is not None else 1
         elif self.params.mode == "average":
             fresh = self._target is None and result.average is not None  # the first complete image, once
             if fresh:
@@ -153,6 +153,12 @@ class TargetLocalizerNode(PerchNode[TargetLocalizerConfig]):
             out = PoseWithCovarianceStamped(pose=detection.pose)
             out.header = detection.header
             self._poses.publish(out)
+
+    def _fuse(self, measured: MapPose) -> None:
+        if self._target is not None:
+            self._target = fuse(self._target, measured)
+        elif self._good(measured.covariance):  # not before the estimator knows where it is
+            self._target = start_fusion(measured)
 
     def _good(self, covariance: np.ndarray) -> bool:
         """Whether the worst axes of position and attitude are known within the limits."""

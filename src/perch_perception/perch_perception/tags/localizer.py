@@ -119,7 +119,9 @@ class BoardLocalizer:
         centre_S = self.board.corners_S[seen].reshape(-1, 3).mean(axis=0)
         radius = float(np.linalg.norm(self.board.corners_S - centre_S, axis=-1).max())
         closer = self._look(image, distance * direction / np.linalg.norm(direction), radius)
-        return closer if len(closer.ids) >= len(first.ids) else first
+        best = closer if len(closer.ids) >= len(first.ids) else first
+        rejected = tuple(dict.fromkeys(first.rejected + closer.rejected))
+        return Detection(best.ids, best.corners, rejected)
 
     def _look(self, image: np.ndarray, p_CS: np.ndarray, radius: float) -> Detection:
         """Look at a place where the board should be, `radius` [m] around p_CS."""

@@ -121,7 +121,8 @@ def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS) -> BoardPose:
             # Two minima: the covariance of the mixture says how sure the choice is.
             gap = branches[1][0] - cost
             apart = np.concatenate([branches[1][2] - p, turn])
-            covariance = covariance + np.outer(apart, apart) / (1.0 + np.exp(min(0.5 * gap, 500.0)))
+            share = 1.0 / (1.0 + np.exp(min(0.5 * gap, 500.0)))
+            covariance = (1.0 - share) * covariance + share * (np.linalg.inv(branches[1][4]) + np.outer(apart, apart))
     rms = float(np.sqrt(chi2 / np.sum(2.0 / noise**2)))
     by_intrinsics = intrinsics_sensitivity(camera, corners_S, sigma, p, R)
     return BoardPose(p, R, covariance, tuple(ids), rms, by_intrinsics, float(gap))

@@ -1,0 +1,134 @@
+"""The target in the map: where its covariance comes from, and fusion over many images."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_core.camera import CameraMount
+from perch_core.tag_board import load_board
+from perch_core.vehicle import load_vehicle
+from perch_perception.pose_buffer import BodyState
+from perch_perception.tags import CalibrationSigma, fuse, solve_board, start_fusion, to_map
+from perch_perception.tags.fusion import RESTART_AFTER
+from scipy.stats import chi2
+
+BOARD = load_board("pad_four_tags")
+MOUNT: CameraMount = load_vehicle("snapdragon").mounts["front"]
+CALIBRATION = CalibrationSigma()
+P_WS, R_WS = np.array([3.0, 0.2, 1.2]), so3.exp(np.array([0.0, -np.pi / 3, 0.0]))
+SIGMA = 0.06  # px
+
+
+def body_covariance():
+    sigma = np.array([0.01, 0.01, 0.01, 0.004, 0.004, 0.008])
+    return np.diag(sigma**2)
+
+
+class World:
+    """One flight: errors of calibration and odometry drawn once, noise in every image."""
+
+    def __init__(self, rng, focal=CALIBRATION.focal):
+        self.rng = rng
+        camera = MOUNT.camera
+        true = dataclasses.replace(
+            camera, fx=camera.fx * (1 + focal * rng.normal()), fy=camera.fy * (1 + focal * rng.normal()),
+            cx=camera.cx + CALIBRATION.centre * rng.normal(), cy=camera.cy + CALIBRATION.centre * rng.normal())
+        turn = so3.exp(np.radians(CALIBRATION.rotation) * rng.normal(size=3))
+        self.true_mount = dataclasses.replace(MOUNT, camera=true, R_BC=turn @ MOUNT.R_BC)
+        self.late = CALIBRATION.time * rng.normal()
+        self.drift = rng.multivariate_normal(np.zeros(6), body_covariance())
+
+    def image(self, p_WB, v_WB):
+        """The measured target from one image taken at p_WB while flying at v_WB."""
+        true_p = p_WB + self.late * v_WB
+        R_WB = so3.exp(np.array([0.0, 0.05, 0.02]))
+        p_WC, R_WC = self.true_mount.pose(true_p, R_WB)
+        points_C = (BOARD.corners_S @ R_WS.T + P_WS - p_WC) @ R_WC
+        pixels, _ = self.true_mount.camera.project(points_C)
+        rays = MOUNT.camera.unproject(pixels + self.rng.normal(0, SIGMA, pixels.shape))
+        board = solve_board(MOUNT.camera, BOARD.corners_S, rays, np.full((4, 4), SIGMA), BOARD.ids)
+        body = BodyState(0.0, p_WB + self.drift[:3], so3.quat_from_matrix(so3.exp(self.drift[3:]) @ R_WB), v_WB,
+                         np.zeros(3), body_covariance())
+        return to_map(board, body, MOUNT, CALIBRATION)
+
+
+def nees(target):
+    e = np.concatenate([P_WS - target.p_WS, so3.log(R_WS @ target.R_WS.T)])
+    return e @ np.linalg.solve(target.covariance, e), np.linalg.norm(e[:3])
+
+
+def approach(world, images=20):
+    for x in np.linspace(0.0, 1.3, images):
+        yield world.image(np.array([x, 0.0, 1.1]), np.array([1.5, 0.0, 0.0]))
+
+
+def test_covariance_of_one_image_covers_calibration_and_odometry():
+    rng = np.random.default_rng(0)
+    values = [nees(next(approach(World(rng))))[0] for _ in range(200)]
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(values)) / len(values)
+    assert low < np.mean(values) < high
+
+
+def test_fusion_stays_consistent_over_a_whole_approach():
+    """NEES of the fused target over 120 flights: shared errors must not be averaged away."""
+    rng = np.random.default_rng(1)
+    values, fused_errors, single_errors = [], [], []
+    for _ in range(120):
+        target = None
+        world = World(rng)
+        for pose in approach(world):
+            if target is None:
+                single_errors.append(nees(pose)[1])
+            target = start_fusion(pose) if target is None else fuse(target, pose)
+        value, error = nees(target)
+        values.append(value)
+        fused_errors.append(error)
+        assert target.frames == 20
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(values)) / len(values)
+    assert low < np.mean(values) < high
+    assert np.mean(fused_errors) < 0.8 * np.mean(single_errors), "fusion must help"
+
+
+def test_naive_averaging_would_be_overconfident():
+    """The information filter without shared errors, as a contrast: its covariance is far too small."""
+    rng = np.random.default_rng(2)
+    values = []
+    for _ in range(40):
+        information, weighted = np.zeros((6, 6)), np.zeros(6)
+        for pose in approach(World(rng)):
+            e = np.concatenate([P_WS - pose.p_WS, so3.log(R_WS @ pose.R_WS.T)])
+            inverse = np.linalg.inv(pose.covariance)
+            information += inverse
+            weighted += inverse @ e
+        mean = np.linalg.solve(information, weighted)
+        values.append(mean @ information @ mean)
+    assert np.mean(values) > 3 * 6
+
+
+def test_a_contradicting_image_is_not_used_but_a_moved_pad_is_followed():
+    world = World(np.random.default_rng(3))
+    poses = list(approach(world))
+    target = start_fusion(poses[0])
+    for pose in poses[1:6]:
+        target = fuse(target, pose)
+    flipped = dataclasses.replace(poses[6], R_WS=poses[6].R_WS @ so3.exp(np.array([0.5, 0.0, 0.0])))
+    after = fuse(target, flipped)
+    assert (after.frames, after.refused) == (target.frames, 1)
+    np.testing.assert_array_equal(after.p_WS, target.p_WS)
+    assert fuse(after, poses[7]).refused == 0
+    for pose in poses[7:7 + RESTART_AFTER]:
+        after = fuse(after, dataclasses.replace(pose, p_WS=pose.p_WS + np.array([0.0, 1.0, 0.0])))
+    assert after.p_WS[1] == pytest.approx(P_WS[1] + 1.0, abs=0.1)
+
+
+def test_less_certain_odometry_makes_the_next_image_count_less():
+    world = World(np.random.default_rng(4))
+    first, second = list(approach(world, 2))
+    target = start_fusion(first)
+    shared = second.shared.copy()
+    shared[8:, 8:] *= 100.0
+    certain = fuse(target, second)
+    doubtful = fuse(target, dataclasses.replace(second, shared=shared))
+    assert np.trace(doubtful.covariance[:3, :3]) > np.trace(certain.covariance[:3, :3])
+    assert np.linalg.eigvalsh(doubtful.joint)[0] > -1e-12
