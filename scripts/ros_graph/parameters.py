@@ -103,7 +103,7 @@ def _names(graph: Visit, client: AsyncParameterClient, node: str) -> list[str]:
 def _values(graph: Visit, client: AsyncParameterClient, node: str, names: list[str]) -> list[Any]:
     values = list(graph.answer(client.get_parameters(names), node).values)
     if len(values) != len(names):  # how a node says that it does not know one of them
-        raise GraphError(f"{node} does not know {', '.join(names)}; 'param.py list {node}' shows all")
+        raise GraphError(f"{node} does not know {', '.join(names)}; 'param.py list' shows all")
     return values
 
 

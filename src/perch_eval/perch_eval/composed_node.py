@@ -17,9 +17,9 @@ from typing import Any
 import perch_core.ros.node  # noqa: F401  before numpy: it limits numpy's threads
 import rclpy
 from perch_core.errors import PerchError
-from rclpy.executors import ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 
 def create_nodes(plan: list[dict[str, Any]]) -> list[Node]:
@@ -58,22 +58,22 @@ def main() -> None:
     except (OSError, ValueError) as error:
         print(f"error: {sys.argv[1]}: {error}", file=sys.stderr)
         sys.exit(2)
-    rclpy.init(args=[])
-    signal.signal(signal.SIGTERM, lambda *_: rclpy.try_shutdown())
+    # rclpy's own handlers shut the context down in the middle of callbacks, which then fail to publish.
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: stopped.append(received))
     nodes: list[Node] = []
     try:
         nodes = create_nodes(plan)
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        # EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6; spin_once does.
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=0.5)
+        while not stopped:
+            executor.spin_once(timeout_sec=0.2)
     except (PerchError, rclpy.exceptions.InvalidParameterValueException) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     finally:
         close_nodes(nodes)
         rclpy.try_shutdown()

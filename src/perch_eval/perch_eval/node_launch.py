@@ -65,19 +65,25 @@ class NodeLaunch:
 
 def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence[str] = (),
                  extra: Sequence[str] = ()) -> tuple[str, ...]:
-    """The nodes to start, in the scenario's order.
+    """The nodes to start.
+
+    Args:
+        scenario: names the nodes that are started by default.
+        only: start these instead; they need not be among the scenario's.
+        without: leave these out.
+        extra: start these too.
 
     Raises:
-        PerchError: a node that does not exist, or that the scenario does not have.
+        PerchError: a node that does not exist, or that would not have been started anyway.
     """
     for node in (*only, *without, *extra):
         if node not in PACKAGES:
             raise PerchError(f"node {node!r} is not one of {', '.join(PACKAGES)}")
-    everyone = tuple(dict.fromkeys((*scenario.nodes, *extra)))
-    for node in (*only, *without):
+    everyone = tuple(dict.fromkeys((*(only or scenario.nodes), *extra)))
+    for node in without:
         if node not in everyone:
-            raise PerchError(f"scenario {scenario.name} has no node {node!r}; its nodes: {', '.join(everyone)}")
-    chosen = tuple(n for n in everyone if (not only or n in only) and n not in without)
+            raise PerchError(f"node {node!r} is not started anyway; started: {', '.join(everyone)}")
+    chosen = tuple(node for node in everyone if node not in without)
     if not chosen:
         raise PerchError("no node is left to start")
     return chosen
@@ -146,6 +152,18 @@ def parse_override(text: str) -> tuple[str, str, Any]:
         return node, parameter, yaml.safe_load(value)
     except yaml.YAMLError:
         raise PerchError(f"-p {text}: the value is not valid YAML") from None
+
+
+def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Several `node.parameter:=value` as node -> parameter -> value; of two for the same, the later counts.
+
+    Raises:
+        PerchError: a text of another form.
+    """
+    overrides: dict[str, dict[str, Any]] = {}
+    for node, parameter, value in map(parse_override, texts):
+        overrides.setdefault(node, {})[parameter] = value
+    return overrides
 
 
 def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str,

@@ -1,0 +1,53 @@
+#!/usr/bin/env python3
+"""Start one node, as `ros2 run` does, on machines without the `ros2` command.
+
+The node gets its parameter file config/<node>.yaml; what follows the node's name goes to the node and comes
+after the file, so that it counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from perch_setup import ROOT, enter
+
+EXAMPLES = """examples:
+  python3 scripts/run_node.py vehicle
+  python3 scripts/run_node.py controller --ros-args -r __ns:=/quad1 -p type:=nmpc
+  python3 scripts/run_node.py estimator --no-config --ros-args --params-file my.yaml
+"""
+
+
+def main() -> int:
+    """Become the node; 2 for a node that does not exist."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("node", metavar="NODE", help="as in config/scenarios: vehicle, controller, ...")
+    parser.add_argument("--no-config", action="store_true", help="do not pass config/<node>.yaml")
+    arguments, for_node = parser.parse_known_args()
+    enter()
+    from perch_core.errors import PerchError
+    from perch_eval.node_launch import PACKAGES
+    from perch_eval.nodes import executable
+
+    if arguments.node not in PACKAGES:
+        print(f"error: node {arguments.node!r} is not one of {', '.join(PACKAGES)}", file=sys.stderr)
+        return 2
+    try:
+        path = executable(PACKAGES[arguments.node], arguments.node)
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    file = ROOT / "config" / f"{arguments.node}.yaml"
+    with_file = ["--ros-args", "--params-file", str(file), "--"] if file.exists() and not arguments.no_config else []
+    os.execv(path, [path, *with_file, *for_node])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

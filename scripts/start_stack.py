@@ -1,0 +1,138 @@
+#!/usr/bin/env python3
+"""Start every node of a scenario as its own process, and stop them all on Ctrl-C.
+
+The nodes' output appears with the node's name in front; it is also kept, with the parameters, in the log folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from perch_setup import ROOT, enter
+
+EXAMPLES = """examples:
+  python3 scripts/start_stack.py                                       scenario surface_90
+  python3 scripts/start_stack.py --scenario my.yaml --seed 3 --composed
+  python3 scripts/start_stack.py --without mission recorder            start those yourself (run_node.py)
+  python3 scripts/start_stack.py --only vehicle --realtime
+  python3 scripts/start_stack.py -p vehicle.cameras:=none -p estimator.gate_probability:=0.99
+  python3 scripts/start_stack.py --namespace /quad1 --domain 7
+
+Other shells reach the nodes with the same ROS_DOMAIN_ID (42 by default, as in setup.bash).
+"""
+COLOURS = (36, 33, 32, 35, 34, 96, 93, 92, 95, 94, 31)
+
+
+def command_line() -> argparse.ArgumentParser:
+    """Options of the script."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a file (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of every random number (default: 1)")
+    parser.add_argument("--composed", action="store_true", help="all nodes in one process: faster")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NODE", help="start these instead of the scenario's nodes")
+    parser.add_argument("--without", nargs="+", default=[], metavar="NODE", help="do not start these nodes")
+    parser.add_argument("--realtime", action="store_true", help="pace by the wall clock instead of lockstep")
+    parser.add_argument("--domain", type=int, metavar="N", help="ROS domain id, 0 to 101 (default: $ROS_DOMAIN_ID)")
+    parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
+    parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>)")
+    parser.add_argument("--ready-timeout", type=float, default=30.0, metavar="S", help="default: 30 s")
+    parser.add_argument(
+        "-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE", help="over every file; repeatable"
+    )
+    return parser
+
+
+def main() -> int:
+    """0 stopped by the caller, 1 a node ended by itself, 2 the caller's mistake."""
+    parser = command_line()
+    arguments = parser.parse_args()
+    if arguments.domain is not None and not 0 <= arguments.domain <= 101:
+        parser.error(f"--domain {arguments.domain} is outside [0, 101]")
+    if arguments.namespace and not arguments.namespace.startswith("/"):
+        parser.error(f"--namespace {arguments.namespace}: must begin with '/', as in /quad1")
+    if arguments.domain is not None:
+        os.environ["ROS_DOMAIN_ID"] = str(arguments.domain)
+    enter()
+    from perch_core.errors import PerchError
+    from perch_eval.stack import StackError
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # stops like Ctrl-C
+    try:
+        run(arguments)
+    except StackError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if error.callers_mistake else 1
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped", flush=True)
+        return 0
+    return 1
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Start the nodes and watch them until the caller interrupts.
+
+    Raises:
+        PerchError: scenario, nodes or parameters are refused.
+        StackError: a node ended, or did not get ready.
+    """
+    from perch_core import config
+    from perch_core.scenario import load_scenario
+    from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
+    from perch_eval.nodes import node_programs
+    from perch_eval.stack import Stack
+    from ros_graph.connection import visit
+
+    scenario = load_scenario(arguments.scenario)
+    launches = node_launches(
+        scenario,
+        choose_nodes(scenario, arguments.only, arguments.without),
+        seed=arguments.seed,
+        scenario_source=str(config.find("scenarios", arguments.scenario).resolve()),
+        lockstep=not arguments.realtime,
+        overrides=parse_overrides(arguments.parameter),
+    )
+    folder = (arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute()
+    programs = node_programs(launches, folder, namespace=arguments.namespace, composed=arguments.composed)
+    stack = Stack(programs, folder, on_line=printer([program.name for program in programs]))
+    try:
+        stack.start()
+        with visit() as graph:
+            stack.wait_until_ready(
+                lambda: {f"{ns.rstrip('/')}/{name}" for name, ns in graph.node.get_node_names_and_namespaces()},
+                arguments.ready_timeout,
+            )
+        names = ", ".join(launch.name for launch in launches)
+        print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {names}. Logs: {folder}. Ctrl-C stops all.", flush=True)
+        stack.wait()
+        stack.raise_if_ended()
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the stopping
+        stack.stop()
+
+
+def printer(names: list[str]):
+    """Prints lines with the program's name in front, in colour on a terminal."""
+    width = max(map(len, names))
+    colours = dict(zip(names, COLOURS * (1 + len(names) // len(COLOURS))))
+    terminal = sys.stdout.isatty()
+
+    def show(name: str, line: str) -> None:
+        prefix = f"[{name:>{width}}]"
+        print(f"\033[{colours[name]}m{prefix}\033[0m {line}" if terminal else f"{prefix} {line}", flush=True)
+
+    return show
+
+
+if __name__ == "__main__":
+    sys.exit(main())
