@@ -30,7 +30,7 @@ class Estimator:
     def __init__(self, config: UkfConfig = UkfConfig()) -> None:
         self.config = config
         self._transform = UnscentedTransform(config)
-        self._imu = ImuBuffer(config)
+        self._imu = ImuBuffer(config.imu, config.faults, config.history)
         self._gates = {m: float(chi2.ppf(config.gate_probability, m)) for m in (6, 9)}
         self._base: Belief | None = None  # at the stamp of the last applied pose
         self._covariance: np.ndarray | None = None  # VIO's covariance at that pose

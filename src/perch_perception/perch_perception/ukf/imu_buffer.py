@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_perception.ukf.config import UkfConfig
+from perch_perception.ukf.config import ImuFaults, ImuNoise
 
 
 class ImuOutcome(enum.Enum):
@@ -43,11 +43,11 @@ class ImuBuffer:
     Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance).
     """
 
-    def __init__(self, config: UkfConfig) -> None:
-        self._config = config
-        self._midpoint = config.imu.integration == "midpoint"
-        self._variances = (config.imu.gyro_noise**2, config.imu.accel_noise**2)
-        self._keep = max(2, int(config.history * config.imu.rate))
+    def __init__(self, imu: ImuNoise, faults: ImuFaults, history: float) -> None:
+        self._imu, self._faults = imu, faults
+        self._midpoint = imu.integration == "midpoint"
+        self._variances = (imu.gyro_noise**2, imu.accel_noise**2)
+        self._keep = max(2, int(history * imu.rate))
         self._ends: list[int] = []
         self._rows: list[tuple[float, ...]] = []
         self.last: ImuSample | None = None
@@ -61,7 +61,7 @@ class ImuBuffer:
 
     def add(self, sample: ImuSample) -> ImuOutcome:
         """Take a sample; the step that leads to it is then `latest`."""
-        last, imu, faults = self.last, self._config.imu, self._config.faults
+        last, imu, faults = self.last, self._imu, self._faults
         w, f = sample.w_B, sample.f_B
         if last is not None and sample.stamp <= last.stamp:
             return ImuOutcome.NOT_NEWER

@@ -1,0 +1,87 @@
+"""Settings of visual-inertial odometry, with units and ranges (`config/vio.yaml`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_core.config import part, quantity
+
+from perch_perception.ukf.config import ImuFaults, ImuNoise
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """KLT tracks."""
+
+    features: int = quantity(100, low=10, high=400, doc="tracks to keep up")
+    refill: float = quantity(0.85, low=0.1, high=1.0, doc="detect new features below this share of them")
+    spacing: float = quantity(18.0, unit="px", above=2.0, doc="least distance between features")
+    quality: float = quantity(0.01, above=0.0, high=1.0, doc="least corner strength, share of the strongest")
+    window: int = quantity(21, unit="px", low=5, high=61, doc="side of the tracked patch")
+    levels: int = quantity(3, low=0, high=6, doc="pyramid levels above the image")
+    back_check: float = quantity(0.7, unit="px", above=0.0, doc="tracking there and back must return this close")
+    epipolar: float = quantity(2.0, unit="px", above=0.0, doc="largest distance from the epipolar plane")
+    view_angle: float = quantity(1.40, unit="rad", above=0.1, high=1.6, doc="features beyond this from the axis are not used")
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """The MSCKF."""
+
+    clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
+    landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
+    pixel_noise: float = quantity(1.0, unit="px", above=0.0, doc="1 sigma of a track")
+    gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
+    tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
+    least_parallax_deg: float = quantity(2.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
+    landmark_strikes: int = quantity(3, low=1, doc="refused observations after which a landmark is dropped")
+
+
+@dataclass(frozen=True)
+class CalibrationPriors:
+    """1 sigma of what calibration leaves open; zero fixes a quantity."""
+
+    rotation: float = quantity(0.009, unit="rad", low=0.0, high=0.2, doc="camera against IMU, 0.5 deg")
+    translation: float = quantity(0.002, unit="m", low=0.0, high=0.1)
+    time_offset: float = quantity(0.002, unit="s", low=0.0, high=0.05)
+    focal: float = quantity(0.003, unit="-", low=0.0, high=0.05, doc="relative error of the focal length")
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """How the filter starts: the pose in `map` that it is told, and how well it is known."""
+
+    position: tuple[float, float, float] = quantity((0.0, 0.0, 0.0), unit="m", doc="of base_link in map at the start")
+    yaw: float = quantity(0.0, unit="rad", doc="in map at the start")
+    position_sigma: float = quantity(0.001, unit="m", above=0.0)
+    yaw_sigma: float = quantity(0.001, unit="rad", above=0.0)
+    rest_time: float = quantity(0.25, unit="s", above=0.05, high=5.0, doc="IMU at rest needed for a start on the ground")
+    motion_time: float = quantity(0.5, unit="s", above=0.2, high=3.0, doc="frames needed for a start in motion")
+    rest_gyro: float = quantity(0.05, unit="rad/s", above=0.0, doc="largest mean rate over 0.1 s at rest, bias included")
+    rest_accel: float = quantity(0.35, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
+    rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
+    rest_velocity: float = quantity(0.005, unit="m/s", above=0.0, doc="1 sigma of zero velocity on the ground")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """When odometry counts as lost, and when it starts again."""
+
+    least_tracks: int = quantity(8, low=3, doc="tracks below which a frame says nothing")
+    degraded_after: float = quantity(0.15, unit="s", above=0.0, doc="time without a visual update")
+    restart_position: float = quantity(1.0, unit="m", above=0.0, doc="1 sigma of the position since the start that ends a run")
+    restart_velocity: float = quantity(1.0, unit="m/s", above=0.0, doc="1 sigma that ends a run")
+    rejected_frames: int = quantity(12, low=2, doc="frames in a row with most observations refused that end a run")
+
+
+@dataclass(frozen=True)
+class VioConfig:
+    """Visual-inertial odometry."""
+
+    imu: ImuNoise = part(ImuNoise)
+    faults: ImuFaults = part(ImuFaults)
+    tracker: TrackerConfig = part(TrackerConfig)
+    filter: FilterConfig = part(FilterConfig)
+    calibration: CalibrationPriors = part(CalibrationPriors)
+    start: StartConfig = part(StartConfig)
+    loss: LossConfig = part(LossConfig)

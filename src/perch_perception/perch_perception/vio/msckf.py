@@ -1,0 +1,262 @@
+"""The multi-state constraint Kalman filter with landmarks in the state. Mourikis and Roumeliotis 2007; Li and Mourikis 2013.
+
+Per frame: propagate with the IMU, clone the pose, update with landmarks that are still seen, then with tracks that have
+ended (their point eliminated), then take new landmarks into the state from tracks that span the window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from perch_core import so3
+from perch_core.vehicle import GRAVITY
+
+from perch_perception.vio import ekf
+from perch_perception.vio import state as at
+from perch_perception.vio.bearing import Bearings, corrected, residuals
+from perch_perception.vio.config import VioConfig
+from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.state import Landmark, State
+from perch_perception.vio.tracks import Track, Tracks
+from perch_perception.vio.triangulation import triangulate
+
+_G = np.array([0.0, 0.0, -GRAVITY])
+_CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
+
+
+@dataclass
+class FrameReport:
+    """What a frame's update did: observations used and refused; normalised innovations (value, dimension)."""
+
+    landmarks_used: int = 0
+    tracks_used: int = 0
+    refused: int = 0
+    landmarks_new: int = 0
+    nis: float = 0.0
+    nis_dimension: int = 0
+
+    @property
+    def used(self) -> int:
+        """Observed features that changed the state."""
+        return self.landmarks_used + self.tracks_used + self.landmarks_new
+
+
+class Msckf:
+    """Owns the state. The caller feeds IMU steps and bearings; nothing here knows of images or ROS."""
+
+    def __init__(self, config: VioConfig, state: State, focal_length: float) -> None:
+        self.config, self.state = config, state
+        self.tracks = Tracks()
+        self.sigma = config.filter.pixel_noise / focal_length
+        self._gate = ekf.Gate(config.filter.gate_probability)
+        self._used: set[int] = set()  # features whose information is in the state already
+        self.w_WB_B = np.zeros(3)
+
+    def propagate(self, rows: np.ndarray, stamp: int) -> None:
+        """Move the inertial state along IMU steps (m, 9) to a stamp [ns].
+
+        The attitude columns of the transition are formed from first estimates: p' - p - v T - g T^2/2 and
+        v' - v - g T with what these were when the covariance last passed there (Hesch et al. 2014).
+        """
+        s = self.state
+        if len(rows) == 0:
+            s.stamp = stamp
+            return
+        pre = preintegrate(rows, s.gyro_bias, s.accel_bias)
+        T, R = pre.duration, s.R_WB
+        p = s.p_WB + s.v_WB * T + 0.5 * _G * T * T + R @ pre.dp
+        v = s.v_WB + _G * T + R @ pre.dv
+        R_end = R @ pre.dR
+        Phi = np.eye(at.INERTIAL_SIZE)
+        Phi[at.THETA, at.THETA] = R_end.T @ s.R_first
+        Phi[at.POSITION, at.THETA] = -so3.hat(p - s.p_first - s.v_first * T - 0.5 * _G * T * T) @ s.R_first
+        Phi[at.VELOCITY, at.THETA] = -so3.hat(v - s.v_first - _G * T) @ s.R_first
+        Phi[at.POSITION, at.VELOCITY] = T * np.eye(3)
+        Phi[at.THETA, 9:15] = pre.J[0:3]
+        Phi[at.POSITION, 9:15] = R @ pre.J[3:6]
+        Phi[at.VELOCITY, 9:15] = R @ pre.J[6:9]
+        G = np.zeros((9, 9))
+        G[:3, :3], G[3:6, 3:6], G[6:, 6:] = np.eye(3), R, R
+        P, n = s.P, at.INERTIAL_SIZE
+        P[:n, :n] = Phi @ P[:n, :n] @ Phi.T
+        P[:9, :9] += G @ pre.Q @ G.T
+        d = np.arange(3)
+        P[9 + d, 9 + d] += self.config.imu.gyro_bias_walk**2 * T
+        P[12 + d, 12 + d] += self.config.imu.accel_bias_walk**2 * T
+        P[:n, n:] = Phi @ P[:n, n:]
+        P[n:, :n] = P[:n, n:].T
+        s.p_WB, s.v_WB, s.R_WB, s.stamp = p, v, so3.quat_to_matrix(so3.quat_from_matrix(R_end)), stamp
+        s.freeze()
+        self.w_WB_B = pre.w_end
+
+    def add_frame(self, frame: int, ids: np.ndarray, bearings: Bearings) -> FrameReport:
+        """Clone the pose at a frame and update with what is seen in it.
+
+        Args:
+            frame: number, increasing.
+            ids: feature numbers, shape (n,).
+            bearings: their bearings.
+        """
+        report, s = FrameReport(), self.state
+        s.add_clone(frame, self.w_WB_B)
+        ended = self.tracks.take_ended(ids)
+        self.tracks.observe(frame, ids, bearings)
+        self._update_landmarks(report)
+        full = len(s.clones) >= self.config.filter.clones
+        self._update_tracks(ended, report)
+        if full:
+            self._take_in_landmarks(report)
+            s.drop_clones(list(range(len(s.clones) - self.config.filter.clones + 1)))
+        if s.clones:
+            self.tracks.forget_before(s.clones[0].frame)
+        self._used &= self.tracks.by_id.keys()
+        return report
+
+    def apply(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, variance: float | np.ndarray) -> None:
+        """Kalman update of the whole state with a Jacobian over some columns."""
+        dx, self.state.P = ekf.update(self.state.P, columns, H, r, variance)
+        self.state.inject(dx)
+
+    # -- landmarks in the state --------------------------------------------------------------------------------------
+
+    def _update_landmarks(self, report: FrameReport) -> None:
+        """Update with all landmarks seen in the newest frame; drop those that are not seen or refused again and again."""
+        s, limits = self.state, self.config.filter
+        s.drop_landmarks({i for i in s.landmarks if i not in self.tracks.by_id})
+        if not s.landmarks:
+            return
+        m, clone = len(s.landmarks), s.clones[-1]
+        tracks = [self.tracks.by_id[i] for i in s.landmarks]
+        seen = Bearings(np.array([t.b_C[-1] for t in tracks]), np.array([t.by_focal[-1] for t in tracks]))
+        now = self._residuals(clone.R_WB, clone.p_WB, np.array([k.X_W for k in s.landmarks.values()]), seen)
+        first = self._residuals(clone.R_first, clone.p_first, np.array([k.X_first for k in s.landmarks.values()]), seen)
+        k = s.clone_at(len(s.clones) - 1)
+        columns = np.concatenate([_CALIBRATION, np.arange(k, k + 6), np.arange(s.landmark_start, s.size)])
+        H = np.zeros((m, 2, len(columns)))
+        H[:, :, :14] = self._pose_and_calibration(first)
+        for i in range(m):
+            H[i, :, 14 + 3 * i : 17 + 3 * i] = first.by_point[i]
+        P = s.P[np.ix_(columns, columns)]
+        S = np.einsum("kia,kja->kij", H @ P, H) + self.sigma**2 * np.eye(2)
+        distance = np.einsum("ki,ki->k", now.r, np.linalg.solve(S, now.r[:, :, None])[:, :, 0])
+        good = (distance < self._gate.limit(2)) & (now.cosine > 0.5)
+        bad = set()
+        for ok, (i, landmark) in zip(good, s.landmarks.items()):
+            landmark.strikes = 0 if ok else landmark.strikes + 1
+            if landmark.strikes >= limits.landmark_strikes:
+                bad.add(i)
+        report.landmarks_used, report.refused = int(good.sum()), report.refused + int((~good).sum())
+        if good.any():
+            report.nis, report.nis_dimension = float(distance[good].sum()), 2 * int(good.sum())
+            self.apply(columns, H[good].reshape(-1, len(columns)), now.r[good].ravel(), self.sigma**2)
+        self._used |= bad
+        s.drop_landmarks(bad)
+
+    def _take_in_landmarks(self, report: FrameReport) -> None:
+        """Make landmarks of tracks that span the whole window, longest first, as far as there is room."""
+        s, limits = self.state, self.config.filter
+        room = min(limits.landmarks - len(s.landmarks), 5)
+        oldest = s.clones[0].frame
+        for i, track in list(self.tracks.by_id.items()):
+            if room <= 0:
+                return
+            if i in s.landmarks or i in self._used or track.frames[0] > oldest or len(track.frames) < limits.clones - 1:
+                continue
+            prepared = self._prepare([track])
+            if not prepared:
+                continue
+            X, H_x, H_f, r, columns = prepared[0]
+            R_f, H_1, r_1, H_0, r_0 = ekf.eliminate(H_x, H_f, r)
+            if np.abs(np.diag(R_f)).min() < 1e-3:
+                continue
+            P = s.P[np.ix_(columns, columns)]
+            if ekf.squared_distance(H_0, P, r_0, self.sigma**2) > self._gate.limit(len(r_0)):
+                report.refused += 1
+                continue
+            inverse = np.linalg.inv(R_f)
+            cross = -inverse @ H_1 @ s.P[columns]
+            own = inverse @ (H_1 @ P @ H_1.T + self.sigma**2 * np.eye(3)) @ inverse.T
+            s.P = np.block([[s.P, cross.T], [cross, own]])
+            s.landmarks[i] = Landmark(X + inverse @ r_1, X)
+            self.apply(columns, H_0, r_0, self.sigma**2)
+            report.landmarks_new += 1
+            room -= 1
+
+    # -- tracks that have ended --------------------------------------------------------------------------------------
+
+    def _update_tracks(self, ended: dict[int, Track], report: FrameReport) -> None:
+        """Update with tracks that have just ended, longest first; their points are eliminated."""
+        s, limits = self.state, self.config.filter
+        useful = [t for i, t in ended.items() if i not in self._used and i not in s.landmarks and len(t.frames) >= 4]
+        useful = sorted(useful, key=lambda t: -len(t.frames))[: limits.tracks_per_frame]
+        rows, rests = [], []
+        for _, H_x, H_f, r, columns in self._prepare(useful):
+            _, _, _, H_0, r_0 = ekf.eliminate(H_x, H_f, r)
+            distance = ekf.squared_distance(H_0, s.P[np.ix_(columns, columns)], r_0, self.sigma**2)
+            if distance > self._gate.limit(len(r_0)):
+                report.refused += 1
+                continue
+            report.tracks_used += 1
+            report.nis, report.nis_dimension = report.nis + distance, report.nis_dimension + len(r_0)
+            rows.append(H_0)
+            rests.append(r_0)
+        if rows:
+            H, r = ekf.compress(np.concatenate(rows), np.concatenate(rests))
+            self.apply(columns, H, r, self.sigma**2)
+
+    def _prepare(self, tracks: list[Track]) -> list[tuple]:
+        """Triangulate tracks and linearise their observations over calibration and window.
+
+        Returns:
+            For each usable track: X_W (3,), H_x (2m, k), H_f (2m, 3), r (2m,), columns (k,).
+        """
+        s, limits = self.state, self.config.filter
+        place = {c.frame: j for j, c in enumerate(s.clones)}
+        R, p = s.window()
+        R_first, p_first = s.first_window()
+        columns = np.concatenate([_CALIBRATION, np.arange(at.CORE_SIZE, s.landmark_start)])
+        centres, R_WC = p + R @ s.p_BC, R @ s.R_BC
+        found = []
+        for track in tracks:
+            seen = [k for k, f in enumerate(track.frames) if f in place]
+            if len(seen) < 4:
+                continue
+            js = np.array([place[track.frames[k]] for k in seen])
+            bearings = track.bearings(seen)
+            rays = np.einsum("nij,nj->ni", R_WC[js], corrected(bearings, s.focal))
+            X = triangulate(centres[js], rays, np.radians(limits.least_parallax_deg), self.sigma)
+            if X is not None:
+                found.append((X, js, bearings))
+        if not found:
+            return []
+        js = np.concatenate([f[1] for f in found])
+        X = np.repeat([f[0] for f in found], [len(f[1]) for f in found], axis=0)
+        bearings = Bearings(np.concatenate([f[2].b_C for f in found]), np.concatenate([f[2].by_focal for f in found]))
+        now = self._residuals(R[js], p[js], X, bearings)
+        first = self._residuals(R_first[js], p_first[js], X, bearings)
+        J = self._pose_and_calibration(first)
+        out, begin = [], 0
+        for X_W, js, _ in found:
+            m, rows = len(js), slice(begin, begin + len(js))
+            H = np.zeros((m, 2, len(columns)))
+            H[:, :, :8] = J[rows, :, :8]
+            for k, j in enumerate(js):
+                H[k, :, 8 + 6 * j : 14 + 6 * j] = J[begin + k, :, 8:]
+            out.append((X_W, H.reshape(2 * m, -1), first.by_point[rows].reshape(-1, 3), now.r[rows].ravel(), columns))
+            begin += m
+        return out
+
+    def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
+        s, n = self.state, len(X_W)
+        return residuals(np.broadcast_to(R_WB, (n, 3, 3)), np.broadcast_to(p_WB, (n, 3)), X_W, s.R_BC, s.p_BC, bearings, s.focal)
+
+    @staticmethod
+    def _pose_and_calibration(linear) -> np.ndarray:
+        """Derivatives by (camera rotation, camera position, time offset, focal, theta, p), shape (n, 2, 14).
+
+        The time offset acts through the clones' poses (`State.add_clone`), not here.
+        """
+        n = len(linear.r)
+        return np.concatenate([linear.by_camera_rotation, linear.by_camera_position, np.zeros((n, 2, 1)),
+                               linear.by_focal[:, :, None], linear.by_theta, linear.by_position], axis=2)

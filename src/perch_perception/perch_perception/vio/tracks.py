@@ -1,0 +1,54 @@
+"""Feature tracks as the filter needs them: bearings by frame, for as long as the window remembers the frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perch_perception.vio.bearing import Bearings
+
+
+@dataclass
+class Track:
+    """One feature: frames in which it was seen, and its bearings there."""
+
+    frames: list[int] = field(default_factory=list)
+    b_C: list[np.ndarray] = field(default_factory=list)
+    by_focal: list[np.ndarray] = field(default_factory=list)
+
+    def bearings(self, places: list[int]) -> Bearings:
+        """The bearings at given places of the lists."""
+        return Bearings(np.array([self.b_C[k] for k in places]), np.array([self.by_focal[k] for k in places]))
+
+
+@dataclass
+class Tracks:
+    """All features that are seen now, by number."""
+
+    by_id: dict[int, Track] = field(default_factory=dict)
+
+    def observe(self, frame: int, ids: np.ndarray, bearings: Bearings) -> None:
+        """Add the bearings of a frame, ids (n,)."""
+        for i, b, d in zip(ids.tolist(), bearings.b_C, bearings.by_focal):
+            track = self.by_id.setdefault(i, Track())
+            track.frames.append(frame)
+            track.b_C.append(b)
+            track.by_focal.append(d)
+
+    def take_ended(self, ids: np.ndarray) -> dict[int, Track]:
+        """Remove and return the tracks that are not among the present ids."""
+        present = set(ids.tolist())
+        ended = {i: t for i, t in self.by_id.items() if i not in present}
+        for i in ended:
+            del self.by_id[i]
+        return ended
+
+    def forget_before(self, frame: int) -> None:
+        """Drop observations of frames older than the window."""
+        for track in self.by_id.values():
+            k = 0
+            while k < len(track.frames) and track.frames[k] < frame:
+                k += 1
+            if k:
+                del track.frames[:k], track.b_C[:k], track.by_focal[:k]
