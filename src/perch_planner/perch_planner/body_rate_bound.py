@@ -1,0 +1,182 @@
+"""A proved bound on the body rate that flatness commands. [M:eq13]
+
+With f = a + g e3, j the jerk and x = f x j, and d = b2_des of the yaw psi,
+
+    w_x^2 + w_y^2 = |x|^2 / |f|^4                                                   (Lagrange's identity on [M:eq10])
+    w_z = (psi' f_z |f| + (d . f)(d . x) / |f|) / (|f|^2 - (d . f)^2)                             (from [M:eq12])
+
+The tilt part is a quotient of polynomials of degree 48: `|x|^2 <= u |f|^4` is one polynomial inequality, decided by
+its Bernstein coefficients. The spin part holds sines of a polynomial: it is bounded on each subinterval from the
+enclosures of its parts and taken off the squared limit, u = W^2 - w_z^2.
+"""
+
+from __future__ import annotations
+
+from math import cos, sin, sqrt
+
+import numpy as np
+
+from perch_planner.bounds import BELOW, UNDECIDED, VIOLATED, _split, cross, derivative, dot, product
+from perch_planner.compilation import compiled
+
+_DEPTH = 24
+_NODES = 3000
+_TILT = 49          # coefficients of degree 48
+_PARTS = 12         # rows of a node: |f|^4, |x|^2, |f|^2, f (3), x (3), psi, psi', spare
+
+
+@compiled
+def _elevate(coefficients, size):
+    """The same polynomial with `size` coefficients."""
+    out = coefficients
+    while len(out) < size:
+        n = len(out)
+        raised = np.empty(n + 1)
+        raised[0] = out[0]
+        raised[n] = out[n - 1]
+        for i in range(1, n):
+            raised[i] = (i * out[i - 1] + (n - i) * out[i]) / n
+        out = raised
+    return out
+
+
+@compiled
+def rate_parts(force, jerk, yaw, duration):
+    """Bernstein coefficients of what the body rate consists of.
+
+    Args:
+        force: f, shape (3, 13) [m/s^2].
+        jerk: shape (3, 12) [m/s^3].
+        yaw: shape (15,) [rad].
+        duration: of the segment [s].
+
+    Returns:
+        Rows |f|^4 (49), |x|^2 (49), |f|^2 (25), f (3 x 13), x (3 x 24), psi (15), psi' (14), padded with zeros.
+    """
+    parts = np.zeros((_PARTS, _TILT))
+    x = cross(force, jerk)
+    squared = dot(force, force)
+    parts[0] = product(squared, squared)
+    parts[1] = _elevate(dot(x, x), _TILT)
+    parts[2, :25] = squared
+    parts[3:6, :13] = force
+    parts[6:9, :24] = x
+    parts[9, :15] = yaw
+    parts[10, :14] = derivative(yaw, 1) / duration
+    return parts
+
+
+@compiled
+def _squared_rate(parts):
+    """|omega|^2 where the parts begin."""
+    f_z, yaw, yaw_rate = parts[5, 0], parts[9, 0], parts[10, 0]
+    f2 = max(parts[2, 0], 1e-30)
+    specific = sqrt(f2)
+    dx, dy = -sin(yaw), cos(yaw)
+    along = dx * parts[3, 0] + dy * parts[4, 0]
+    turning = dx * parts[6, 0] + dy * parts[7, 0]
+    across = f2 - along * along
+    if across < 1e-12:
+        return np.inf
+    spin = (yaw_rate * f_z * specific + along * turning / specific) / across
+    return parts[1, 0] / max(parts[0, 0], 1e-60) + spin * spin
+
+
+@compiled
+def _spin_bound(parts):
+    """Upper bound of |w_z| over the interval of the parts; infinite where the enclosure is too wide."""
+    low, high = parts[9, :15].min(), parts[9, :15].max()
+    middle, reach = 0.5 * (low + high), 0.5 * (high - low)
+    dx, dy = -sin(middle), cos(middle)
+    least, most = parts[2, :25].min(), parts[2, :25].max()
+    if least <= 0.0:
+        return np.inf
+    along = np.abs(dx * parts[3, :13] + dy * parts[4, :13]).max() + reach * sqrt(most)
+    turning = np.abs(dx * parts[6, :24] + dy * parts[7, :24]).max() + reach * sqrt(max(parts[1].max(), 0.0))
+    across = least - along * along
+    if across <= 0.0:
+        return np.inf
+    return (np.abs(parts[10, :14]).max() * np.abs(parts[5, :13]).max() * sqrt(most) + along * turning / sqrt(least)) / across
+
+
+@compiled
+def _split_parts(parts, left, right):
+    """Halve the interval of all parts."""
+    _split(parts[0].copy(), left[0], right[0])
+    _split(parts[1].copy(), left[1], right[1])
+    _split(parts[2, :25].copy(), left[2, :25], right[2, :25])
+    for k in range(3, 6):
+        _split(parts[k, :13].copy(), left[k, :13], right[k, :13])
+    for k in range(6, 9):
+        _split(parts[k, :24].copy(), left[k, :24], right[k, :24])
+    _split(parts[9, :15].copy(), left[9, :15], right[9, :15])
+    _split(parts[10, :14].copy(), left[10, :14], right[10, :14])
+
+
+@compiled
+def rate_stays_below(parts, limit):
+    """Whether |omega| stays below a limit on a segment.
+
+    Args:
+        parts: of `rate_parts`.
+        limit: [rad/s].
+
+    Returns:
+        (verdict, place) as `bounds.stays_below`.
+    """
+    squared = limit * limit
+    stack = np.zeros((_DEPTH + 2, _PARTS, _TILT))
+    start = np.zeros(_DEPTH + 2)
+    depth = np.zeros(_DEPTH + 2, np.int64)
+    left = np.zeros((_PARTS, _TILT))
+    right = np.zeros((_PARTS, _TILT))
+    stack[0] = parts
+    if _squared_rate(parts) >= squared:
+        return VIOLATED, 0.0
+    top, nodes = 1, 0
+    doubtful = -1.0
+    while top > 0:
+        top -= 1
+        nodes += 1
+        spin = _spin_bound(stack[top])
+        room = squared - spin * spin
+        if room > 0.0 and (room * stack[top, 0] - stack[top, 1]).min() > 0.0:
+            continue
+        if depth[top] >= _DEPTH or nodes >= _NODES:
+            doubtful = start[top]
+            continue
+        level, begin = depth[top] + 1, start[top]
+        _split_parts(stack[top], left, right)
+        middle = begin + 0.5**level
+        if _squared_rate(right) >= squared:
+            return VIOLATED, middle
+        stack[top], start[top], depth[top] = right, middle, level
+        stack[top + 1], start[top + 1], depth[top + 1] = left, begin, level
+        top += 2
+    if doubtful >= 0.0:
+        return UNDECIDED, doubtful
+    return BELOW, 0.0
+
+
+@compiled
+def sampled_rate(parts, count):
+    """Largest |omega| at `count` + 1 even places of a segment, and its place."""
+    best, place = 0.0, 0.0
+    at = np.zeros((_PARTS, 1))
+    basis = np.empty(_TILT)
+    for k in range(count + 1):
+        s = k / count
+        for row, size in ((0, 49), (2, 25), (3, 13), (6, 24), (9, 15), (10, 14)):
+            basis[:size] = 0.0
+            basis[0] = 1.0
+            for n in range(1, size):
+                for i in range(n, 0, -1):
+                    basis[i] = basis[i] * (1.0 - s) + basis[i - 1] * s
+                basis[0] *= 1.0 - s
+            rows = 2 if row == 0 else (3 if row in (3, 6) else 1)
+            for r in range(row, row + rows):
+                at[r, 0] = (basis[:size] * parts[r, :size]).sum()
+        rate = _squared_rate(at)
+        if rate > best:
+            best, place = rate, s
+    return sqrt(best), place

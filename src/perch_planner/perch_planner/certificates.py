@@ -1,0 +1,65 @@
+"""Bounds that a plan carries with it, in the units of their quantities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_planner import plan_checks
+from perch_planner.problem import Limits
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """A proved bound on one quantity of a plan; fields as in `perch_msgs/Certificate`.
+
+    Attributes:
+        quantity: thrust, speed, height, clearance or body_rate.
+        unit: unit of the values.
+        lower_limit, upper_limit: required bounds, infinite where there is none.
+        minimum, maximum: proved bounds of the quantity, infinite where none was asked for.
+        time_of_minimum, time_of_maximum: times of the samples nearest to the proved bounds [s]; nan: none.
+        method: bernstein, sturm or dense.
+        holds: the limits are proved.
+    """
+
+    quantity: str
+    unit: str
+    lower_limit: float
+    upper_limit: float
+    minimum: float
+    maximum: float
+    time_of_minimum: float
+    time_of_maximum: float
+    method: str
+    holds: bool
+
+    def describe(self) -> str:
+        """One line for people."""
+        return (f"{self.quantity} in [{self.minimum:.4g}, {self.maximum:.4g}] {self.unit}, required "
+                f"[{self.lower_limit:.4g}, {self.upper_limit:.4g}]: {'proved' if self.holds else 'not proved'} ({self.method})")
+
+
+def certificates(results: np.ndarray, limits: Limits, mass: float, thrust_method: str = "bernstein") -> tuple[Certificate, ...]:
+    """The certificates of `plan_checks.check`.
+
+    Args:
+        results: shape (5, 5), of `plan_checks.check`.
+        limits: what was required.
+        mass: turns specific thrust into thrust [kg].
+        thrust_method: who decided the thrust bound.
+    """
+    inf = float("inf")
+    table = (("thrust", "N", limits.thrust[0], limits.thrust[1], mass, thrust_method),
+             ("speed", "m/s", -inf, limits.speed, 1.0, "bernstein"),
+             ("height", "m", limits.height[0], limits.height[1], 1.0, "bernstein"),
+             ("clearance", "m", 0.0, inf, 1.0, "bernstein"),
+             ("body_rate", "rad/s", -inf, limits.body_rate, 1.0, "bernstein"))
+    out = []
+    for row, (quantity, unit, low, high, scale, method) in zip(results.tolist(), table):
+        minimum, at_minimum, maximum, at_maximum, holds = row
+        out.append(Certificate(quantity, unit, low, high, scale * minimum, scale * maximum, at_minimum, at_maximum,
+                               method, bool(holds)))
+    assert tuple(c.quantity for c in out) == plan_checks.NAMES
+    return tuple(out)

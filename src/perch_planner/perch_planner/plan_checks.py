@@ -1,0 +1,251 @@
+"""All limits of a plan, checked on its published Bernstein coefficients. [M:eq16, M:alg1]"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from perch_core.vehicle import GRAVITY
+from perch_planner.body_rate_bound import rate_parts, rate_stays_below, sampled_rate
+from perch_planner.bounds import BELOW, cross, derivative, dot, maximum, product, stays_below
+from perch_planner.compilation import compiled
+
+THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE = range(5)
+"""Rows of the results; thrust is the specific thrust |a + g e3|."""
+
+NAMES = ("thrust", "speed", "height", "clearance", "body_rate")
+
+MINIMUM, MINIMUM_AT, MAXIMUM, MAXIMUM_AT, HOLDS = range(5)
+"""Columns of the results: proved bounds, the times of the samples nearest to them, and whether the limits hold."""
+
+_RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
+_FINE = 1e-10      # where a limit falls inside the enclosure
+_CLEARANCE_SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself
+
+
+@compiled
+def specific_force(coefficients, duration):
+    """f = a + g e3 of a segment, Bernstein coefficients of degree 12, shape (3, 15) -> (3, 13) [m/s^2]."""
+    force = np.empty((3, 13))
+    for d in range(3):
+        force[d] = derivative(coefficients[d], 2) / duration**2
+    force[2] += GRAVITY
+    return force
+
+
+@compiled
+def _enclose(coefficients, limit):
+    """Attained maximum, proved maximum and place; finer where the limit lies between the two."""
+    scale = np.abs(coefficients).max()
+    attained, proved, place = maximum(coefficients, _RELATIVE * scale)
+    if attained <= limit < proved:
+        attained, proved, place = maximum(coefficients, _FINE * scale)
+    return attained, proved, place
+
+
+@compiled
+def thrust_extrema(coefficients, durations, low, high):
+    """Least and greatest specific thrust of each segment. [M:eq9, M:eq16]
+
+    Args:
+        coefficients: shape (f, 3, 15) [m].
+        durations: shape (f,) [s].
+        low, high: limits of the specific thrust [m/s^2].
+
+    Returns:
+        Shape (f, 6): attained minimum, proved minimum, place, attained maximum, proved maximum, place [m/s^2].
+    """
+    out = np.empty((len(durations), 6))
+    for i in range(len(durations)):
+        force = specific_force(coefficients[i], durations[i])
+        squared = dot(force, force)
+        attained, proved, place = _enclose(-squared, -low * low)
+        out[i, 0], out[i, 1], out[i, 2] = sqrt(max(-attained, 0.0)), sqrt(max(-proved, 0.0)), place
+        attained, proved, place = _enclose(squared, high * high)
+        out[i, 3], out[i, 4], out[i, 5] = sqrt(attained), sqrt(proved), place
+    return out
+
+
+@compiled
+def surface_distance(coefficients, duration, begin, p_S, v_S, s3):
+    """Distance of the centre of mass from the moving surface, Bernstein coefficients, shape (15,) [m]."""
+    out = np.zeros(coefficients.shape[1])
+    last = len(out) - 1
+    for d in range(3):
+        for k in range(last + 1):
+            out[k] += s3[d] * (coefficients[d, k] - p_S[d] - v_S[d] * (begin + duration * k / last))
+    return out
+
+
+@compiled
+def _rim_polynomial(distance, force, s3, extension, gap):
+    """Positive where the rim of a disc around the centre of mass is farther than `gap` from the surface.
+
+    The rim's lowest point is at distance - extension sin(tilt), sin(tilt) = |f x s3| / |f|, so that the condition is
+    (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
+    """
+    normal = np.empty((3, 1))
+    normal[:, 0] = s3
+    tilt = cross(force, normal)
+    reduced = distance - gap
+    return product(product(reduced, reduced), dot(force, force)), extension**2 * dot(tilt, tilt)
+
+
+@compiled
+def _rim_clears(distance, force, s3, extension, gap):
+    """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful."""
+    verdict, place = stays_below(gap - distance, _CLEARANCE_SLACK)
+    if verdict != BELOW:
+        return False, place
+    far, near = _rim_polynomial(distance, force, s3, extension, gap)
+    raised = product(near, np.ones(len(far) - len(near) + 1))
+    verdict, place = stays_below(raised - far, _CLEARANCE_SLACK)
+    return verdict == BELOW, place
+
+
+@compiled
+def _sampled_clearance(distance, force, s3, extension, count):
+    """Least distance - extension sin(tilt) at even places of a segment, and its place."""
+    best, place = np.inf, 0.0
+    for k in range(count + 1):
+        s = k / count
+        f = np.empty(3)
+        for d in range(3):
+            f[d] = _value(force[d], s)
+        norm = sqrt((f**2).sum())
+        along = (f * s3).sum() / max(norm, 1e-12)
+        gap = _value(distance, s) - extension * sqrt(max(1.0 - along * along, 0.0))
+        if gap < best:
+            best, place = gap, s
+    return best, place
+
+
+@compiled
+def _value(coefficients, s):
+    """Value of a polynomial at s."""
+    total, weight = 0.0, 1.0
+    n = len(coefficients) - 1
+    if s > 0.5:  # Horner in the smaller of s and 1 - s
+        t = (1.0 - s) / s
+        for i in range(n + 1):
+            total += weight * coefficients[n - i]
+            weight *= t * (n - i) / (i + 1)
+        return total * s**n
+    t = s / (1.0 - s)
+    for i in range(n + 1):
+        total += weight * coefficients[i]
+        weight *= t * (n - i) / (i + 1)
+    return total * (1.0 - s) ** n
+
+
+@compiled
+def _widen(out, row, minimum, at_minimum, maximum_, at_maximum):
+    if minimum < out[row, 0]:
+        out[row, 0], out[row, 1] = minimum, at_minimum
+    if maximum_ > out[row, 2]:
+        out[row, 2], out[row, 3] = maximum_, at_maximum
+
+
+@compiled
+def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, speed, low_height, high_height,
+          extension, rate):
+    """Prove every limit of a plan, or find where it fails.
+
+    Args:
+        coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
+        yaw: of the heading, shape (f, 15) [rad].
+        durations: shape (f,) [s].
+        p_S, v_S, s3: point of the surface at time 0 [m], its velocity [m/s], outward normal, each shape (3,).
+        low_thrust, high_thrust: limits of the specific thrust [m/s^2].
+        speed: limit [m/s].
+        low_height, high_height: limits [m].
+        extension: radius of the vehicle's disc [m].
+        rate: limit of |omega| [rad/s].
+
+    Returns:
+        (results, where): results, shape (5, 5), rows and columns as named above; where, shape (5, 2): segment and
+        place of the first doubt of each quantity, segment -1 where there is none.
+    """
+    f = len(durations)
+    out = np.zeros((5, 5))
+    out[:, 0], out[:, 2] = np.inf, -np.inf
+    out[:, 4] = 1.0
+    where = np.full((5, 2), -1.0)
+    gap_wanted, rate_wanted = np.inf, 0.0
+    begin = 0.0
+    thrust = thrust_extrema(coefficients, durations, low_thrust, high_thrust)
+    parts = np.empty((f, 12, 49))
+    for i in range(f):
+        T, c = durations[i], coefficients[i]
+        _widen(out, 0, thrust[i, 1], begin + T * thrust[i, 2], thrust[i, 4], begin + T * thrust[i, 5])
+        velocity = np.empty((3, 14))
+        for d in range(3):
+            velocity[d] = derivative(c[d], 1) / T
+        attained, proved, place = _enclose(dot(velocity, velocity), speed * speed)
+        _widen(out, 1, 0.0, 0.0, sqrt(max(proved, 0.0)), begin + T * place)
+        if proved > speed * speed and where[1, 0] < 0.0:
+            where[1, 0], where[1, 1] = i, place
+        attained, proved, place = _enclose(-c[2], -low_height)
+        if -proved < low_height and where[2, 0] < 0.0:
+            where[2, 0], where[2, 1] = i, place
+        attained2, proved2, place2 = _enclose(c[2], high_height)
+        if proved2 > high_height and where[2, 0] < 0.0:
+            where[2, 0], where[2, 1] = i, place2
+        _widen(out, 2, -proved, begin + T * place, proved2, begin + T * place2)
+        force = specific_force(c, T)
+        distance = surface_distance(c, T, begin, p_S, v_S, s3)
+        gap, place = _sampled_clearance(distance, force, s3, extension, 12)
+        if gap < gap_wanted:
+            gap_wanted, out[3, 1] = gap, begin + T * place
+        jerk = np.empty((3, 12))
+        for d in range(3):
+            jerk[d] = derivative(c[d], 3) / T**3
+        parts[i] = rate_parts(force, jerk, yaw[i], T)
+        sampled, place = sampled_rate(parts[i], 10)
+        if sampled > rate_wanted:
+            rate_wanted, out[4, 3] = sampled, begin + T * place
+        begin += T
+
+    # Clearance and rate are proved against a number: first a tight one near the samples, then the limit itself.
+    out[3, 0], out[3, 2] = -np.inf, np.inf
+    for gap in (0.98 * gap_wanted - 1e-3, 0.9 * gap_wanted - 5e-3, 0.0):
+        if gap < 0.0:
+            continue
+        proved_all, begin = True, 0.0
+        for i in range(f):
+            distance = surface_distance(coefficients[i], durations[i], begin, p_S, v_S, s3)
+            clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
+            if not clears:
+                proved_all = False
+                if gap == 0.0 and where[3, 0] < 0.0:
+                    where[3, 0], where[3, 1] = i, place
+                break
+            begin += durations[i]
+        if proved_all:
+            out[3, 0] = gap
+            break
+    out[4, 0], out[4, 2] = 0.0, np.inf
+    for bound in (1.02 * rate_wanted, 1.08 * rate_wanted, 1.25 * rate_wanted, rate):
+        if bound > rate:
+            continue
+        proved_all = True
+        for i in range(f):
+            verdict, place = rate_stays_below(parts[i], bound)
+            if verdict != BELOW:
+                proved_all = False
+                if bound == rate and where[4, 0] < 0.0:
+                    where[4, 0], where[4, 1] = i, place
+                break
+        if proved_all:
+            out[4, 2] = bound
+            break
+    for i in range(f):
+        if thrust[i, 1] < low_thrust and where[0, 0] < 0.0:
+            where[0, 0], where[0, 1] = i, thrust[i, 2]
+        if thrust[i, 4] > high_thrust and where[0, 0] < 0.0:
+            where[0, 0], where[0, 1] = i, thrust[i, 5]
+    for k in range(5):
+        if where[k, 0] >= 0.0:
+            out[k, 4] = 0.0
+    return out, where

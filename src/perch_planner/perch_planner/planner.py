@@ -1,0 +1,257 @@
+"""The perching planner: quadratic programs until every limit is proved, or a typed refusal. [M:IV-C]
+
+For given durations a QP [M:eq8] is solved and its plan checked; where a limit is violated, linear bounds are added and
+the QP is solved again (`settings.cuts`); where that does not help, the durations grow [M:IV-C.3]. Each of the three
+loops is bounded, so that a plan ends after at most `iterations_max` programs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import Vehicle
+from perch_planner import plan_checks, refusals, sturm
+from perch_planner.certificates import Certificate, certificates
+from perch_planner.contact_constraints import Contact
+from perch_planner.cutting import limit_cuts, thrust_cuts, turning_side
+from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
+from perch_planner.refusals import PerchRefusal
+from perch_planner.segment_program import COST_ORDER, FORMULATIONS
+from perch_planner.time_allocation import allocate, split_last, stretch_factor, with_last_segment
+from perch_planner.yaw_profile import yaw_coefficients
+
+_CUT_ROUNDS = 10
+_CUT_REACH = 1.7      # peaks beyond this multiple of the limit are stretched first
+_PLAIN_STRETCH = 1.15
+_SEGMENT_STRETCH = 1.1  # of the paper's per-segment stretching
+_BISECTIONS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One quadratic program on the way to a plan.
+
+    Attributes:
+        duration: of the whole plan [s].
+        thrust_min, thrust_max: proved extrema of the collective thrust [N]; nan where the program had no solution.
+        cuts: linear bounds in the program.
+    """
+
+    duration: float
+    thrust_min: float
+    thrust_max: float
+    cuts: int
+
+
+@dataclass(frozen=True, slots=True)
+class PerchPlan:
+    """A plan whose limits are proved.
+
+    Attributes:
+        trajectory: flat outputs, degree 14, from time 0 to contact.
+        certificates: one for each limit.
+        iterations: QPs solved.
+        solve_time: wall-clock time [s].
+        attempts: what was tried on the way, in order.
+    """
+
+    trajectory: FlatTrajectory
+    certificates: tuple[Certificate, ...]
+    iterations: int
+    solve_time: float
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def duration(self) -> float:
+        """Time to contact [s]."""
+        return self.trajectory.duration
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What a set of durations gave: a plan (`failure` empty) or why not, and how much longer to try."""
+
+    coefficients: np.ndarray | None
+    yaw: np.ndarray | None
+    results: np.ndarray | None
+    failure: str = ""
+    margin: float = 0.0
+    stretch: float = _PLAIN_STRETCH
+    segments: np.ndarray | None = None
+
+
+_CODES = {"": refusals.INFEASIBLE_WINDOW, "thrust": refusals.THRUST_FLOOR, "speed": refusals.BOX, "height": refusals.BOX,
+          "clearance": refusals.BOX, "body_rate": refusals.BODY_RATE, "solver": refusals.SOLVER}
+_WORDS = {"": "impact window and tube [M:eq14, M:eq15]", "thrust": "thrust range [M:eq16]", "speed": "speed limit",
+          "height": "height limits", "clearance": "clearance from the surface until contact", "body_rate": "body-rate limit",
+          "solver": "numerics of the quadratic program"}
+_ADVICE = {"": "widen the impact speeds, tangential_speed_max or the tube",
+           "thrust": "raise thrust_max, tangential_speed_max or duration_max, or lower impact_acceleration",
+           "speed": "raise speed_max", "height": "move the target or the start, or widen the height limits",
+           "clearance": "start farther in front of the surface", "body_rate": "raise body_rate_max or impact_acceleration",
+           "solver": "choose another solver"}
+
+
+class _Search:
+    """State of one planning call."""
+
+    def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> None:
+        self.problem, self.settings, self.vehicle = problem, settings, vehicle
+        self.limits = Limits.of(settings, vehicle)
+        p_contact = problem.surface.p_WS + vehicle.perch_offset * problem.surface.normal
+        refusals.refuse_hopeless(problem, settings, self.limits, vehicle, p_contact)
+        self.first = split_last(allocate(problem, settings, p_contact))
+        self.contact = Contact(problem, settings, vehicle.perch_offset, len(self.first) - len(problem.waypoints) - 1)
+        self.low, self.high = (x / vehicle.mass for x in self.limits.thrust)
+        self.attempts: list[Attempt] = []
+        self.end_yaw = contact_heading(problem.surface)
+
+    @property
+    def iterations(self) -> int:
+        return len(self.attempts)
+
+    def try_durations(self, durations: np.ndarray) -> _Outcome:
+        """Solve and cut for fixed durations until every limit is proved or nothing helps."""
+        settings, start = self.settings, self.problem.start
+        try:
+            program = FORMULATIONS[settings.formulation](self.contact, durations, settings)
+        except np.linalg.LinAlgError:
+            return _Outcome(None, None, None, "solver")
+        yaw, side, cut_by, cuts_in_use = None, None, "", 0
+        margin, best = 0.0, None
+        for _ in range(_CUT_ROUNDS + 1):
+            if self.iterations >= settings.iterations_max:
+                break
+            coefficients, solution = program.solve()
+            if not solution.solved:
+                self._note(durations, None, cuts_in_use)
+                return replace(best, stretch=_PLAIN_STRETCH) if best else _Outcome(None, None, None, cut_by)
+            extrema = plan_checks.thrust_extrema(coefficients, durations, self.low, self.high)
+            self._note(durations, extrema, cuts_in_use)
+            peak, least = float(extrema[:, 4].max()), float(extrema[:, 1].min())
+            if peak > self.high or least < self.low:
+                cut_by = "thrust"
+                margin = min(self.high - peak, least - self.low) * self.vehicle.mass
+                best = _Outcome(coefficients, None, None, cut_by, margin, stretch_factor(peak, self.high),
+                                (extrema[:, 4] > self.high) | (extrema[:, 1] < self.low))
+                if not settings.cuts or peak > _CUT_REACH * self.high:
+                    return best
+                side = turning_side(self.problem) if side is None else side
+                cuts = thrust_cuts(coefficients, durations, extrema, self.low, self.high, side)
+            else:
+                if yaw is None:
+                    yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
+                                           COST_ORDER[settings.objective])
+                results, where = self._check(coefficients, yaw, durations)
+                failed = [plan_checks.NAMES[k] for k in range(5) if not results[k, plan_checks.HOLDS]]
+                if not failed:
+                    return _Outcome(coefficients, yaw, results)
+                cut_by, margin = failed[-1], self._margin(results, failed[-1])
+                best = _Outcome(coefficients, yaw, results, cut_by, margin)
+                if not settings.cuts:
+                    return best
+                cuts = limit_cuts(where, coefficients, durations, self.problem, self.limits)
+            if not cuts:
+                return best
+            program.add(cuts)
+            cuts_in_use += len(cuts)
+        return best or _Outcome(None, None, None, cut_by, margin)
+
+    def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray):
+        surface, limits = self.problem.surface, self.limits
+        return plan_checks.check(coefficients, yaw, durations, surface.p_WS, self.problem.target_velocity,
+                                 np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed,
+                                 limits.height[0], limits.height[1], limits.extension, limits.body_rate)
+
+    def _margin(self, results: np.ndarray, name: str) -> float:
+        row, limits = results[plan_checks.NAMES.index(name)], self.limits
+        if name == "speed":
+            return limits.speed - row[plan_checks.MAXIMUM]
+        if name == "height":
+            return min(row[plan_checks.MINIMUM] - limits.height[0], limits.height[1] - row[plan_checks.MAXIMUM])
+        return -float("inf")
+
+    def _note(self, durations: np.ndarray, extrema: np.ndarray | None, cuts: int) -> None:
+        mass = self.vehicle.mass
+        low, high = (np.nan, np.nan) if extrema is None else (mass * extrema[:, 1].min(), mass * extrema[:, 4].max())
+        self.attempts.append(Attempt(float(durations.sum()), float(low), float(high), cuts))
+
+    def longer(self, durations: np.ndarray, outcome: _Outcome) -> np.ndarray:
+        """The next durations. [M:IV-C.3]"""
+        if self.settings.stretching == "segments" and outcome.segments is not None:
+            grown = np.where(outcome.segments, _SEGMENT_STRETCH * durations, durations)
+        else:
+            grown = outcome.stretch * durations
+        return with_last_segment(grown, self.settings)
+
+    def shortest(self, durations: np.ndarray, outcome: _Outcome) -> tuple[np.ndarray, _Outcome]:
+        """Bisect the scale of all durations for the shortest plan whose limits are still proved."""
+        shortest = max(self.settings.tube_time, self.settings.last_segment_min)
+        low, high = min(shortest / durations[-1], 1.0), 1.0
+        for _ in range(_BISECTIONS):
+            if high - low < 1e-3 or self.iterations >= self.settings.iterations_max:
+                break
+            middle = 0.5 * (low + high)
+            tried = self.try_durations(middle * durations)
+            if tried.failure or tried.results is None:
+                low = middle
+            else:
+                high, outcome = middle, tried
+        return high * durations, outcome
+
+
+def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> PerchPlan:
+    """Plan a perch. [M:IV-C]
+
+    Args:
+        problem: start, surface, waypoints, target velocity.
+        settings: parameters of the planner.
+        vehicle: mass, thrust range, extension and perch offset.
+
+    Returns:
+        A plan that keeps every limit, each with its proof.
+
+    Raises:
+        PerchRefusal: there is none, or none was found; with the violated constraint and its margin.
+    """
+    begin = perf_counter()
+    search = _Search(problem, settings, vehicle)
+    durations = search.first
+    best: _Outcome | None = None
+    while True:
+        outcome = search.try_durations(durations)
+        if not outcome.failure and outcome.results is not None:
+            break
+        if best is None or best.coefficients is None or (outcome.coefficients is not None and outcome.margin > best.margin):
+            best = outcome
+        grown = search.longer(durations, outcome)
+        if grown.sum() > settings.duration_max or search.iterations >= settings.iterations_max:
+            raise _refusal(search, best, durations)
+        durations = grown
+    if settings.minimum_time:
+        durations, outcome = search.shortest(durations, outcome)
+    method = "bernstein"
+    if settings.decider == "sturm":
+        method = "sturm"
+        if not sturm.thrust_below(outcome.coefficients, durations, search.high):
+            raise PerchRefusal(refusals.SOLVER, "Algorithm 1 [M:alg1]", 0.0,
+                               "Sturm's chain does not confirm the thrust bound that subdivision proves",
+                               certificates(outcome.results, search.limits, vehicle.mass), search.iterations)
+    trajectory = FlatTrajectory(durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
+    proofs = certificates(outcome.results, search.limits, vehicle.mass, method)
+    return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))
+
+
+def _refusal(search: _Search, best: _Outcome, durations: np.ndarray) -> PerchRefusal:
+    """The refusal for the best that was found."""
+    name = best.failure
+    proofs = () if best.results is None else certificates(best.results, search.limits, search.vehicle.mass)
+    margin = best.margin if best.coefficients is not None else float("-inf")
+    amount = f"violated by {-margin:.3g} at best" if np.isfinite(margin) else "not met by any plan that was tried"
+    message = (f"{_WORDS[name]}: {amount}, up to a duration of {durations.sum():.2f} s and {search.iterations} programs; "
+               f"{_ADVICE[name]}")
+    return PerchRefusal(_CODES[name], _WORDS[name], margin, message, proofs, search.iterations)

@@ -1,0 +1,210 @@
+"""What a perching plan is asked for: start, surface, waypoints, and the settings and limits that hold on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.config import choice, quantity
+from perch_core.errors import ConfigError
+from perch_core.surface import PerchSurface
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import GRAVITY, Vehicle
+
+_ZERO = (0.0, 0.0, 0.0)
+
+
+def _vector(source: str, key: str, value) -> np.ndarray:
+    """A finite vector of three.
+
+    Raises:
+        ConfigError: wrong size, or a value that is not finite.
+    """
+    try:
+        out = np.array(value, float)
+    except (TypeError, ValueError):
+        raise ConfigError(source, key, f"{value!r} is not three numbers") from None
+    if out.shape != (3,) or not np.isfinite(out).all():
+        raise ConfigError(source, key, f"{out.tolist()} is not three finite numbers")
+    return out
+
+
+@dataclass(frozen=True)
+class StartState:
+    """Flat outputs at the start.
+
+    Attributes:
+        p: position of the centre of mass in W [m], shape (3,).
+        v, a, j: velocity [m/s], acceleration without gravity [m/s^2], jerk [m/s^3], shape (3,).
+        yaw, yaw_rate, yaw_acc: heading [rad, rad/s, rad/s^2].
+    """
+
+    p: np.ndarray
+    v: np.ndarray = _ZERO
+    a: np.ndarray = _ZERO
+    j: np.ndarray = _ZERO
+    yaw: float = 0.0
+    yaw_rate: float = 0.0
+    yaw_acc: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key in ("p", "v", "a", "j"):
+            object.__setattr__(self, key, _vector("start", key, getattr(self, key)))
+        for key in ("yaw", "yaw_rate", "yaw_acc"):
+            value = float(getattr(self, key))
+            if not abs(value) < 1e3:
+                raise ConfigError("start", key, f"{value} is not a finite angle")
+            object.__setattr__(self, key, value)
+
+    @classmethod
+    def on(cls, trajectory: FlatTrajectory, t: float) -> StartState:
+        """The state of a running trajectory at a time [s since its start], to replace its rest.
+
+        Raises:
+            ConfigError: the time is outside the trajectory.
+        """
+        if not 0.0 <= t <= trajectory.duration:
+            raise ConfigError("start", "time", f"{t:g} s is outside the current trajectory [0, {trajectory.duration:g}] s")
+        at = trajectory.sample(t)
+        return cls(at.p, at.v, at.a, at.j, at.yaw, at.yaw_rate, at.yaw_acc)
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A place to pass, with derivatives where they matter. [M:eq6]
+
+    Attributes:
+        p: position in W [m], shape (3,).
+        v, a, j: velocity, acceleration and jerk in W, shape (3,); None: chosen by the planner.
+    """
+
+    p: np.ndarray
+    v: np.ndarray | None = None
+    a: np.ndarray | None = None
+    j: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("p", "v", "a", "j"):
+            value = getattr(self, key)
+            if value is not None:
+                object.__setattr__(self, key, _vector("waypoint", key, value))
+
+
+@dataclass(frozen=True)
+class PerchProblem:
+    """One perch to plan.
+
+    Attributes:
+        start: flat outputs at time 0.
+        surface: the surface at time 0; the vehicle ends at perch_offset in front of its centre, with b3 = s3.
+        waypoints: places to pass, in order; in W, also with a moving target.
+        target_velocity: constant velocity of the surface in W [m/s], shape (3,).
+        segment_times: first guess of the segment durations [s], one more than waypoints; None: chosen by the planner.
+    """
+
+    start: StartState
+    surface: PerchSurface
+    waypoints: tuple[Waypoint, ...] = ()
+    target_velocity: np.ndarray = _ZERO
+    segment_times: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "target_velocity", _vector("target", "velocity", self.target_velocity))
+        object.__setattr__(self, "waypoints", tuple(self.waypoints))
+        if self.segment_times is not None:
+            times = tuple(float(t) for t in self.segment_times)
+            if len(times) != len(self.waypoints) + 1:
+                raise ConfigError("problem", "segment_times", f"has {len(times)} entries, needs {len(self.waypoints) + 1}")
+            if not all(1e-3 < t < 1e3 for t in times):
+                raise ConfigError("problem", "segment_times", f"{list(times)} are not durations in (0.001, 1000) s")
+            object.__setattr__(self, "segment_times", times)
+
+
+@dataclass(frozen=True)
+class PerchSettings:
+    """Settings of the planner: `config/perching_planner.yaml` and the parameters of the node.
+
+    Where 0 stands for "the vehicle's", the limit comes from the vehicle file.
+    """
+
+    impact_acceleration: float = quantity(3.3, unit="m/s^2", above=0.0, high=100.0, doc="alpha of [M:eq11]")
+    impact_speed_min: float = quantity(0.4, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3")
+    impact_speed_max: float = quantity(0.6, unit="m/s", low=0.0, high=20.0, doc="v_max of [M:eq14], along -s3")
+    tangential_speed_max: float = quantity(0.3, unit="m/s", above=0.0, high=20.0, doc="slip over the surface at contact")
+    tube_time: float = quantity(0.15, unit="s", low=0.0, high=2.0, doc="t_k of [M:eq15]")
+    tube_step: float = quantity(0.01, unit="s", low=0.001, high=0.1, doc="dt of [M:eq15]")
+    tube_tolerance: float = quantity(0.1, low=0.001, high=1.0, doc="q of [M:eq15]")
+    tube_floor: float = quantity(0.33, unit="m/s^2", above=0.0, high=10.0, doc="least half width of the tube per axis")
+    thrust_max: float = quantity(0.0, unit="N", low=0.0, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
+    thrust_min: float = quantity(0.0, unit="N", low=0.0, doc="tau_min of [M:eq16]; 0: the vehicle's")
+    thrust_reserve: float = quantity(0.9, above=0.0, high=1.0, doc="share of the vehicle's thrust that a plan may use")
+    body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
+    speed_max: float = quantity(12.0, unit="m/s", above=0.0, doc="bound on the speed in W")
+    height_min: float = quantity(0.15, unit="m", doc="floor for the centre of mass")
+    height_max: float = quantity(1e3, unit="m", doc="ceiling for the centre of mass")
+    extension: float = quantity(-1.0, unit="m", high=2.0, doc="rim radius that clears the surface; negative: the vehicle's")
+    objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
+    formulation: str = choice("reduced", options=("reduced", "full"), doc="reduced QP, or order 14 as in [M:eq5-8, M:eq17]")
+    solver: str = choice("daqp", options=("daqp", "osqp", "piqp"), doc="quadratic programming solver")
+    decider: str = choice("bernstein", options=("bernstein", "sturm"), doc="thrust bound: subdivision, or [M:alg1]")
+    stretching: str = choice("whole", options=("whole", "segments"), doc="which durations grow when a bound is violated")
+    cuts: bool = quantity(True, doc="add linear bounds where a limit is violated, before the time is stretched")
+    minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
+    duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
+    last_segment_min: float = quantity(0.25, unit="s", low=0.05, high=5.0, doc="shortest last segment")
+    iterations_max: int = quantity(60, low=1, high=1000, doc="QPs per plan")
+
+    def __post_init__(self) -> None:
+        if self.impact_speed_max < self.impact_speed_min:
+            raise ConfigError("", "impact_speed_max",
+                              f"{self.impact_speed_max:g} is below impact_speed_min {self.impact_speed_min:g} m/s")
+        if self.height_max <= self.height_min:
+            raise ConfigError("", "height_max", f"{self.height_max:g} is not above height_min {self.height_min:g} m")
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits that hold over the whole plan.
+
+    Attributes:
+        thrust: collective thrust, least and greatest [N]. [M:eq16]
+        body_rate: greatest |omega| [rad/s].
+        speed: greatest speed in W [m/s].
+        height: least and greatest height of the centre of mass [m].
+        extension: radius of the disc around the centre of mass that stays in front of the surface until contact [m].
+    """
+
+    thrust: tuple[float, float]
+    body_rate: float
+    speed: float
+    height: tuple[float, float]
+    extension: float
+
+    @classmethod
+    def of(cls, settings: PerchSettings, vehicle: Vehicle) -> Limits:
+        """The limits of a vehicle, where the settings do not replace them."""
+        return cls(
+            thrust=(settings.thrust_min or 4.0 * vehicle.thrust_min,
+                    settings.thrust_max or settings.thrust_reserve * 4.0 * vehicle.thrust_max),
+            body_rate=settings.body_rate_max or vehicle.body_rate_max,
+            speed=settings.speed_max,
+            height=(settings.height_min, settings.height_max),
+            extension=settings.extension if settings.extension >= 0.0 else max(vehicle.body_radii[:2]),
+        )
+
+
+def contact_acceleration(surface: PerchSurface, impact_acceleration: float) -> np.ndarray:
+    """Acceleration at contact, alpha s3 - g e3, which puts b3 on s3 [m/s^2], shape (3,). [M:eq11]"""
+    return impact_acceleration * surface.normal - np.array([0.0, 0.0, GRAVITY])
+
+
+def contact_heading(surface: PerchSurface) -> float:
+    """Yaw at contact with b2_des parallel to s2 [rad]. [M:eq12]
+
+    On a pad that is turned so far that s2 points up or down, the heading of the approach, -s3, counts instead.
+    """
+    s2, s3 = surface.R_WS[:, 1], surface.normal
+    if np.hypot(s2[0], s2[1]) > 0.5:
+        return float(np.arctan2(-s2[0], s2[1]))
+    return float(np.arctan2(-s3[1], -s3[0]))

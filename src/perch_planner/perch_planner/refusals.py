@@ -1,0 +1,82 @@
+"""Why there is no plan: typed, with the violated constraint and its margin."""
+
+from __future__ import annotations
+
+from perch_core.errors import PlanningRefusal
+from perch_core.vehicle import GRAVITY, Vehicle
+from perch_planner.certificates import Certificate
+from perch_planner.problem import Limits, PerchProblem, PerchSettings
+
+BAD_INPUT = "bad_input"
+UNREACHABLE_TILT = "unreachable_tilt"
+INFEASIBLE_WINDOW = "infeasible_window"
+THRUST_FLOOR = "thrust_floor"
+BOX = "box"
+BODY_RATE = "body_rate"
+SOLVER = "solver"
+TIME_LIMIT = "time_limit"
+
+
+class PerchRefusal(PlanningRefusal):
+    """A refusal with the certificates of the best plan that was found on the way.
+
+    Attributes:
+        certificates: empty where no plan was found at all.
+        iterations: QPs solved.
+    """
+
+    def __init__(self, code: str, constraint: str, margin: float, message: str,
+                 certificates: tuple[Certificate, ...] = (), iterations: int = 0) -> None:
+        self.certificates, self.iterations = certificates, iterations
+        super().__init__(code, constraint, margin, message)
+
+
+def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle,
+                    p_contact) -> None:
+    """Refuse what no trajectory can do, before a QP is solved.
+
+    Raises:
+        PerchRefusal: the surface's attitude needs a thrust out of range [M:eq9, M:eq11], the vehicle cannot hover, the
+            start or the contact break the box, or the start breaks the thrust range.
+    """
+    low, high = limits.thrust
+    contact = vehicle.mass * settings.impact_acceleration
+    if low > high:
+        raise PerchRefusal(BAD_INPUT, "tau_min <= tau_max [M:eq16]", high - low, f"thrust limits [{low:g}, {high:g}] N are empty")
+    if not low < contact < high:
+        margin = min(contact - low, high - contact)
+        raise PerchRefusal(
+            UNREACHABLE_TILT, "thrust at contact m alpha within [tau_min, tau_max] [M:eq9, M:eq11]", margin,
+            f"holding the surface's attitude takes m alpha = {contact:.3f} N, outside [{low:.3f}, {high:.3f}] N; "
+            f"choose impact_acceleration between {low / vehicle.mass:.2f} and {high / vehicle.mass:.2f} m/s^2")
+    hover = vehicle.mass * GRAVITY
+    if high <= 1.02 * hover:
+        raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
+                           f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N")
+    start = problem.start
+    specific = (start.a[0] ** 2 + start.a[1] ** 2 + (start.a[2] + GRAVITY) ** 2) ** 0.5 * vehicle.mass
+    if not low <= specific <= high:
+        raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
+                           min(specific - low, high - specific),
+                           f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
+    for name, p in (("start", start.p), ("contact", p_contact), *((f"waypoint {k}", w.p) for k, w in enumerate(problem.waypoints))):
+        margin = min(p[2] - limits.height[0], limits.height[1] - p[2])
+        if margin < 0.0 and not (name == "contact" and problem.target_velocity[2]):
+            raise PerchRefusal(BOX, f"height of the {name}", margin,
+                               f"{name} height {p[2]:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m")
+    speed = float(start.v @ start.v) ** 0.5
+    if speed > limits.speed:
+        raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
+                           f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
+    surface = problem.surface
+    lean = abs(float((start.a + (0.0, 0.0, GRAVITY)) @ surface.normal)) * vehicle.mass / max(specific, 1e-9)
+    rim = limits.extension * max(1.0 - min(lean, 1.0) ** 2, 0.0) ** 0.5
+    distance = float((start.p - surface.p_WS) @ surface.normal)
+    if distance <= rim:
+        raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim,
+                           f"the start is {distance:.3f} m in front of the surface's plane; the vehicle's rim needs {rim:.3f} m")
+    for k, waypoint in enumerate(problem.waypoints):
+        distance = float((waypoint.p - surface.p_WS) @ surface.normal)
+        if distance <= 0.0 and not problem.target_velocity.any():
+            raise PerchRefusal(BOX, f"clearance of waypoint {k} from the surface's plane", distance,
+                               f"waypoint {k} is {-distance:.3f} m behind the surface's plane")

@@ -1,0 +1,109 @@
+"""Quadratic programs in the whitened form behind one interface; no answer is believed before its residual is known.
+
+Every solver minimises |w|^2 under `lower <= rows @ w <= upper`. DAQP is the default: an active-set method that is
+exact and the fastest here (0.06-0.13 ms against 2-4 ms for OSQP at the same accuracy); it returned "solved" with
+violated rows when they were not scaled, hence the check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+FEASIBILITY = 1e-6
+"""Largest violation of a row of unit length that counts as solved."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Answer of a solver.
+
+    Attributes:
+        w: minimiser, shape (n,); meaningless unless `solved`.
+        solved: the residual was checked and is within `FEASIBILITY`.
+        residual: largest violation of a row.
+        status: the solver's own word.
+    """
+
+    w: np.ndarray
+    solved: bool
+    residual: float
+    status: str
+
+
+def _residual(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, w: np.ndarray) -> float:
+    value = rows @ w
+    worst = max((lower - value).max(initial=0.0), (value - upper).max(initial=0.0))
+    return float(worst) if worst == worst else np.inf
+
+
+def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
+    import daqp
+
+    n = rows.shape[1]
+    w, _, flag, _ = daqp.solve(_unit(n), np.zeros(n), rows, upper, lower, np.zeros(len(lower), np.int32),
+                               primal_tol=1e-9)
+    return np.asarray(w), "solved" if flag == 1 else f"exit flag {flag}"
+
+
+def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
+    import osqp
+    from scipy import sparse
+
+    n = rows.shape[1]
+    solver = osqp.OSQP()
+    solver.setup(sparse.identity(n, format="csc"), np.zeros(n), sparse.csc_matrix(rows), lower, upper, verbose=False,
+                 eps_abs=1e-8, eps_rel=1e-8, eps_prim_inf=1e-9, max_iter=20000, polishing=True, scaling=0)
+    result = solver.solve(raise_error=False)
+    return np.asarray(result.x, float), str(result.info.status)
+
+
+def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
+    import piqp
+
+    n = rows.shape[1]
+    solver = piqp.DenseSolver()
+    solver.settings.eps_abs = solver.settings.eps_rel = 1e-10
+    solver.setup(np.eye(n), np.zeros(n), None, None, rows, lower, upper, None, None)
+    status = solver.solve()
+    return np.asarray(solver.result.x, float), str(status)
+
+
+_SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp, "piqp": _piqp}
+_MODULES = {"daqp": "daqp", "osqp": "osqp", "piqp": "piqp"}
+NAMES = tuple(_SOLVERS)
+_UNITS: dict[int, np.ndarray] = {}
+
+
+def _unit(n: int) -> np.ndarray:
+    if n not in _UNITS:
+        _UNITS[n] = np.eye(n)
+    return _UNITS[n]
+
+
+def available() -> tuple[str, ...]:
+    """Names of the solvers that are installed, the fastest first."""
+    from importlib.util import find_spec
+
+    return tuple(name for name in NAMES if find_spec(_MODULES[name]) is not None)
+
+
+def least_norm(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: str = "daqp") -> Solution:
+    """The shortest w with `lower <= rows @ w <= upper`. [M:eq8 in whitened coordinates]
+
+    Args:
+        rows: rows of unit length, shape (r, n).
+        lower, upper: bounds, infinite where there is none, shape (r,).
+        solver: `daqp`, `osqp` or `piqp`.
+    """
+    if ((lower <= 0.0) & (upper >= 0.0)).all():
+        return Solution(np.zeros(rows.shape[1]), True, 0.0, "unconstrained optimum")
+    w, status = _SOLVERS[solver](rows, lower, upper)
+    if w.shape != rows.shape[1:] or not np.isfinite(w).all():
+        return Solution(np.zeros(rows.shape[1]), False, np.inf, status)
+    residual = _residual(rows, lower, upper, w)
+    # A solver that says "infeasible" is not overruled by a residual; one that says "solved" is.
+    return Solution(w, status.lower().startswith(("solved", "status.piqp_solved", "piqp_solved")) and residual <= FEASIBILITY,
+                    residual, status)

@@ -1,0 +1,84 @@
+"""First durations of the segments, and how they grow."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from perch_core.vehicle import GRAVITY
+from perch_planner.problem import PerchProblem, PerchSettings
+
+CRUISE_SPEED = 2.5        # [m/s] of the speed profile that spaces the waypoints
+CRUISE_ACCELERATION = 3.0  # [m/s^2]
+MANOEUVRE_TIME = 0.6      # [s] for the rotation before contact, on top of the way
+FINAL_TIME = 0.5          # [s] of the last segment, where the rotation happens
+SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
+
+
+def _profile_time(distance: np.ndarray, length: float) -> np.ndarray:
+    """Times at which a trapezoidal speed profile over `length` has covered `distance`."""
+    ramp = min(CRUISE_SPEED**2 / CRUISE_ACCELERATION, length) / 2.0
+    peak = sqrt(2.0 * CRUISE_ACCELERATION * ramp)
+    total = 2.0 * peak / CRUISE_ACCELERATION + (length - 2.0 * ramp) / peak
+    d = np.minimum(distance, length - distance)
+    near = np.where(d <= ramp, np.sqrt(2.0 * d / CRUISE_ACCELERATION), peak / CRUISE_ACCELERATION + (d - ramp) / peak)
+    return np.where(distance <= length / 2.0, near, total - near)
+
+
+def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) -> np.ndarray:
+    """First durations: those of the problem, or a speed profile along the waypoints.
+
+    Args:
+        problem: start, waypoints, target velocity.
+        settings: bounds on the last segment and the whole.
+        p_end: position at contact if the target stood still [m], shape (3,).
+
+    Returns:
+        Durations [s], shape (len(waypoints) + 1,).
+    """
+    if problem.segment_times is not None:
+        durations = np.array(problem.segment_times)
+    else:
+        points = np.array([problem.start.p, *(w.p for w in problem.waypoints), p_end])
+        reached = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)))])
+        length = max(float(reached[-1]), 1e-3)
+        closing = problem.target_velocity - problem.start.v
+        extra = MANOEUVRE_TIME + sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
+        times = _profile_time(reached, length)
+        durations = np.diff(times * (1.0 + extra / times[-1]))
+        durations = np.maximum(durations, SEGMENT_MIN)
+    return with_last_segment(durations, settings)
+
+
+def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndarray:
+    """The durations with a last segment that is long enough for the tube: a shorter one is often infeasible."""
+    durations = durations.copy()
+    durations[-1] = max(durations[-1], settings.tube_time, settings.last_segment_min)
+    return durations
+
+
+def split_last(durations: np.ndarray) -> np.ndarray:
+    """Divide a long last segment by a knot at which nothing is given.
+
+    One polynomial over a long way is too stiff for the rotation at its end: without the knot no plan keeps a 0.25 kg
+    vehicle under 4.05 N above 105 degrees, with it every inclination is reached.
+    """
+    if durations[-1] < 2.0 * FINAL_TIME:
+        return durations
+    return np.concatenate([durations[:-1], [durations[-1] - FINAL_TIME, FINAL_TIME]])
+
+
+def stretch_factor(peak: float, limit: float) -> float:
+    """Factor on all durations that brings a peak specific thrust near its limit. [M:IV-C.3]
+
+    Accelerations fall with the square of time while gravity stays, hence sqrt((peak - g) / (limit - g)); bounded to
+    [1.05, 1.6], because the terminal conditions do not scale with it.
+
+    Args:
+        peak: largest specific thrust of the plan [m/s^2].
+        limit: its bound [m/s^2].
+    """
+    if limit <= GRAVITY:
+        return 1.1
+    return min(max(sqrt(max(peak - GRAVITY, 0.0) / (limit - GRAVITY)), 1.05), 1.6)
