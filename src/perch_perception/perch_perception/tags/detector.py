@@ -16,8 +16,8 @@ from perch_core.tag_board import TagBoard
 from perch_perception.tags.view import VirtualView
 
 SEARCH_WINDOWS = (13, 9, 17)  # threshold windows, one per search: each finds tags that the others miss [px]
-VIEW_TAG_SIDE = 72.0          # wanted side of a tag in a virtual view [px]
-VIEW_WINDOW = 15              # threshold window there: two modules of the tag [px]
+VIEW_TAG_SIDE = 60.0          # wanted side of a tag in a virtual view [px]
+VIEW_WINDOW = 11              # threshold window there: 1.5 modules of the tag [px]
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class LocalizerConfig:
     max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
                                        doc="a board further away than this is taken for one of another size")
     min_range: float = config.quantity(0.15, unit="m", above=0.0, high=10.0, doc="and so is a nearer one")
-    view_margin: float = config.quantity(1.25, low=1.0, high=3.0, doc="what is looked at around the pad, in pad sizes")
+    view_margin: float = config.quantity(1.2, low=1.0, high=3.0, doc="what is looked at around the pad, in pad sizes")
 
 
 @dataclass(frozen=True)

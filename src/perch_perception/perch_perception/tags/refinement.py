@@ -41,7 +41,7 @@ class RefinedCorners:
     valid: np.ndarray
 
 
-def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, rounds: int = 3) -> RefinedCorners:
+def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, rounds: int = 2) -> RefinedCorners:
     """Measure the corners of tags.
 
     Args:
