@@ -45,6 +45,7 @@ class MissionNode(PerchNode[MissionParameters]):
         self._deferred: Step | None = None                  # a tick that waits for the planner's answer
         self._goal_handle: Any = None
         self._done: Future | None = None
+        self._ended = 0.0                                   # when the last goal ended [s]
         self._held: Step | None = None                      # the first tick, held until there is a goal
 
         self._participant = Participant(self)
@@ -151,6 +152,7 @@ class MissionNode(PerchNode[MissionParameters]):
                 phase=self._machine.phase.value, progress=float(self._machine.progress),
                 time_to_contact=float(self._machine.time_to_contact), message=self._machine.message))
         if outputs.outcome is not None:
+            self._ended = now
             self._finish(outputs.outcome)
 
     # -- planner -----------------------------------------------------------------------------------------------------
@@ -206,6 +208,7 @@ class MissionNode(PerchNode[MissionParameters]):
         self._goal_handle, self._done = None, None
         result = Perch.Result(success=outcome.result is Result.PERCHED, error_code=int(outcome.result),
                               message=outcome.message, contact_time=float(outcome.contact_time))
+        result.end_time = self._ended
         result.final_pose = self._odometry.pose.pose
         if outcome.result is Result.PERCHED:
             handle.succeed()

@@ -125,7 +125,7 @@ class Pilot:
         outcome = OUTCOMES[answer.error_code]
         if cancelled and outcome == "cancelled":
             outcome = "timeout"
-        return FlightResult(outcome, answer.message, self._time, time.monotonic() - began)
+        return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - began)
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
