@@ -82,11 +82,12 @@ class ContactMonitor:
         """Whether the velcro holds."""
         return self.hold.active
 
-    def update(self, time: float, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
+    def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
         """What changed at this instant.
 
         Args:
             time: [s].
+            before: state one integration step ago (13,): an impact is judged before its forces have worked.
             x: state (13,).
             distances: of the plate and of everything else to each surface (m, 2) [m]; negative touches.
         """
@@ -96,30 +97,30 @@ class ContactMonitor:
             if self.attached and s == self.hold.surface:
                 continue
             if plate or rest:
-                event = self._touch(time, s, x, plate, rest)
+                event = self._touch(time, s, before, x, rest)
                 events += [event] if event else []
         events += self._separations(time)
         if self.attached:
             self._draw_flat(time)
         return events
 
-    def _touch(self, time: float, s: int, x: np.ndarray, plate: bool, rest: bool) -> ContactEvent | None:
+    def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool) -> ContactEvent | None:
         known = self._touched.get(s)
         if known is not None and (known[1] is ContactState.COLLISION or not rest):
             self._touched[s] = (time, known[1])
             return None
         surfaces = self._obstacles.surfaces
         p_WS = surfaces.origin[s] + surfaces.velocity[s] * time
-        impact = impact_of(x, self._plate_offset, p_WS, surfaces.axes[s], surfaces.velocity[s])
-        state, reason = self._judge(s, impact, plate, rest)
+        impact = impact_of(before, self._plate_offset, p_WS, surfaces.axes[s], surfaces.velocity[s])
+        state, reason = self._judge(s, impact, rest)
         self._touched[s] = (time, state)
         if state is ContactState.ATTACHED:
-            self._attach(time, s, x, impact, p_WS)
+            self._attach(time, s, x, impact.tilt_error, p_WS)
         offset = float(np.hypot(impact.offset_S[0], impact.offset_S[1])) if s == self._obstacles.pad else 0.0
         return ContactEvent(time, state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
                             impact.tilt_error, offset, reason)
 
-    def _judge(self, s: int, impact: Impact, plate: bool, rest: bool) -> tuple[ContactState, str]:
+    def _judge(self, s: int, impact: Impact, rest: bool) -> tuple[ContactState, str]:
         name = self._obstacles.names[s]
         fast = impact.normal_speed > CRASH_SPEED
         too_fast = f"hit the {name} with {impact.normal_speed:.2f} m/s, above {CRASH_SPEED:g} m/s"
@@ -147,15 +148,15 @@ class ContactMonitor:
             return []
         return [ContactEvent(time, ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
 
-    def _attach(self, time: float, s: int, x: np.ndarray, impact: Impact, p_WS: np.ndarray) -> None:
+    def _attach(self, time: float, s: int, x: np.ndarray, tilt: float, p_WS: np.ndarray) -> None:
         """Hold the plate where it touched; it is then drawn flat on the surface."""
-        R_WS = self._obstacles.surfaces.axes[s]
-        R_WB = so3.quat_to_matrix(x[3:7])
-        plate_W = p_WS + R_WS @ impact.offset_S
-        flat_W = plate_W - impact.offset_S[2] * R_WS[:, 2]
-        axis = np.cross(R_WB[:, 2], R_WS[:, 2])
+        normal = self._obstacles.surfaces.axes[s, :, 2]
+        b3 = so3.quat_to_matrix(x[3:7])[:, 2]
+        plate_W = x[:3] - self._plate_offset * b3
+        flat_W = plate_W - ((plate_W - p_WS) @ normal) * normal
+        axis = np.cross(b3, normal)
         sine = float(np.linalg.norm(axis))
-        turn = so3.quat_exp(axis / sine * impact.tilt_error) if sine > 1e-9 else np.array([0.0, 0.0, 0.0, 1.0])
+        turn = so3.quat_exp(axis / sine * tilt) if sine > 1e-9 else np.array([0.0, 0.0, 0.0, 1.0])
         q_flat = so3.quat_multiply(turn, x[3:7])
         velocity = self._obstacles.surfaces.velocity[s]
         self._final = (flat_W, q_flat)

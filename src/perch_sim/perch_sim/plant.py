@@ -60,6 +60,7 @@ class Plant:
         self._x = resting_state(scenario, self.body)
         self._wind = WindField(scenario.wind, PERIOD * 1e-9, seeding.stream(seed, "wind"))
         self._distances = np.zeros((len(self.obstacles.names), 2))
+        self._warm_up()
 
     @property
     def state(self) -> TrueState:
@@ -88,6 +89,7 @@ class Plant:
         total, sample = np.zeros(6), np.zeros(6)
         states, contacts = [], []
         for k in range(1, SUBSTEPS + 1):
+            before = self._x.copy()
             aim = np.zeros(4) if self.contact.crashed else target
             advance(self._x, self.rotor_speed, aim, wind, self.body, self.obstacles.surfaces, self.contact.hold,
                     (self.time - self._start) * 1e-9 + (k - 1) * STEP, STEP, sample)
@@ -95,12 +97,18 @@ class Plant:
             time = self.time + k * PERIOD // SUBSTEPS
             x = self._x.copy()
             states.append(TrueState(time, x[:3], x[3:7], x[7:10], x[10:13]))
-            contacts += self._touches(time)
+            contacts += self._touches(time, before)
         self.time += PERIOD
         return PlantOutput(tuple(states), total / SUBSTEPS, tuple(contacts))
 
-    def _touches(self, time: int) -> list[ContactEvent]:
+    def _warm_up(self) -> None:
+        """Compile the kernels now, on a copy of the state, rather than in the first step of a flight in real time."""
+        advance(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces,
+                self.contact.hold, 0.0, STEP, np.zeros(6))
+        clearances(self._x, self.body, self.obstacles.surfaces, 0.0, self._distances)
+
+    def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
         clearances(self._x, self.body, self.obstacles.surfaces, elapsed, self._distances)
-        events = self.contact.update(elapsed, self._x, self._distances)
+        events = self.contact.update(elapsed, before, self._x, self._distances)
         return [event._replace(time=time * 1e-9) for event in events]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -27,6 +28,7 @@ from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 from perch_sim.vehicle_topics import VehicleTopics
 
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
+SWITCH_INTERVAL = 2e-4  # the drawing threads give way to a step sooner than Python's 5 ms [s]
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
 
 
@@ -36,6 +38,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("vehicle", VehicleParameters, **kwargs)
         cv2.setNumThreads(1)
+        sys.setswitchinterval(SWITCH_INTERVAL)
         params = self.params
         try:
             scenario = load_scenario(params.scenario)
@@ -158,7 +161,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
     def _keep_pace(self) -> None:
         for _ in range(self._pacing.due(time.monotonic_ns())):
             self._times.end("waiting")
-            if self._output is None and self._index > 0 and self._last_command < self._simulation.time:
+            if 0 < self._last_command < self._simulation.time:
                 self._counts["commands_missed"] += 1
             self._output = self._simulation.advance()
             self._times.end("physics")

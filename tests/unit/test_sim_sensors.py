@@ -1,0 +1,146 @@
+"""Sensors of the simulated vehicle: statistics of noise, camera times, calibration errors, seeds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_core.errors import ConfigError
+from perch_core.scenario import Wind, load_scenario
+from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_sim import seeding
+from perch_sim.calibration import true_mount
+from perch_sim.camera_timing import CameraTiming
+from perch_sim.imu import Imu
+from perch_sim.motors import MotorCommandError, Motors
+from perch_sim.state_history import StateHistory, TrueState
+from perch_sim.wind import WindField
+
+VEHICLE = load_vehicle("snapdragon")
+MOUNT = VEHICLE.mounts["down"]
+REST = np.array([0.0, 0.0, GRAVITY, 0.0, 0.0, 0.0])
+
+
+def samples(config, count, inertial=REST, seed=1):
+    imu = Imu(config, seeding.stream(seed, "imu"))
+    return imu, np.array([np.concatenate(imu.sample(inertial)) for _ in range(count)])
+
+
+def test_imu_at_rest_reads_plus_g_with_the_noise_of_its_file():
+    imu, data = samples(VEHICLE.imu, 20_000)
+    scatter = np.std(np.diff(data, axis=0), axis=0) / np.sqrt(2)  # differences are free of the bias
+    np.testing.assert_allclose(scatter[:3], 0.316, rtol=0.03)
+    np.testing.assert_allclose(scatter[3:], 0.01, rtol=0.03)
+    assert np.all(np.abs(data.mean(axis=0) - REST) < np.repeat([0.2, 0.02], 3))
+    assert abs(data[:, 2].mean() - GRAVITY) < 0.2
+
+
+def test_imu_biases_have_the_spread_of_the_file_and_walk():
+    start = np.array([Imu(VEHICLE.imu, seeding.stream(seed, "imu")).bias for seed in range(400)])
+    np.testing.assert_allclose(start.std(axis=0), np.repeat([0.05, 0.005], 3), rtol=0.15)
+    moved = []
+    for seed in range(200):
+        imu, _ = samples(VEHICLE.imu, 250, seed=seed)
+        moved.append(imu.bias - Imu(VEHICLE.imu, seeding.stream(seed, "imu")).bias)
+    walk = np.sqrt(0.5) * np.repeat([0.002, 0.0002], 3)  # 250 samples are half a second
+    np.testing.assert_allclose(np.std(moved, axis=0), walk, rtol=0.2)
+
+
+def test_imu_saturates_at_its_range():
+    _, data = samples(VEHICLE.imu, 50, inertial=np.array([400.0, -400.0, 0.0, 50.0, -50.0, 0.0]))
+    assert np.all(data[:, [0, 1, 3, 4]] == [156.0, -156.0, 34.0, -34.0])
+
+
+def test_switching_one_stream_off_leaves_the_others():
+    a = seeding.stream(7, "imu").standard_normal(5)
+    seeding.stream(7, "camera_down").standard_normal(1000)
+    np.testing.assert_array_equal(seeding.stream(7, "imu").standard_normal(5), a)
+    assert not np.any(seeding.stream(7, "wind").standard_normal(5) == a)
+    assert not np.any(seeding.stream(8, "imu").standard_normal(5) == a)
+
+
+def test_frames_keep_their_rate_and_arrive_after_read_out_and_transport():
+    timing = CameraTiming(MOUNT, 3.5e-3, 0, seeding.stream(1, "timing"))
+    frames = [timing.next() for _ in range(300)]
+    middle = np.array([f.middle for f in frames]) * 1e-9
+    assert np.diff(middle).mean() == pytest.approx(1 / 30, rel=1e-4)
+    assert np.all(np.abs(np.diff(middle) - 1 / 30) < 4e-4)
+    for f in frames:
+        assert f.end - f.start == 3_500_000
+        assert f.stamp - f.middle == -8_000_000  # stamp_offset of the file
+        assert 9_300_000 + 5_000_000 <= f.arrival - f.end <= 9_300_000 + 10_000_000
+    delays = np.array([f.arrival - f.end for f in frames]) * 1e-6
+    assert delays.std() == pytest.approx(5 / np.sqrt(12), rel=0.1)
+
+
+def test_calibration_errors_are_of_the_promised_size():
+    true = [true_mount(MOUNT, seeding.stream(seed, "calibration_down")) for seed in range(400)]
+    focal = np.array([t.camera.fx / MOUNT.camera.fx - 1 for t in true])
+    turn = np.array([np.linalg.norm(so3.log(MOUNT.R_BC.T @ t.R_BC)) for t in true])
+    time = np.array([t.stamp_offset - MOUNT.stamp_offset for t in true])
+    assert focal.std() == pytest.approx(0.003, rel=0.15) and abs(focal).max() <= 0.0061
+    assert np.degrees(np.sqrt((turn**2).mean())) == pytest.approx(0.5, rel=0.15)
+    assert time.std() == pytest.approx(0.002, rel=0.15)
+
+
+def test_history_interpolates_a_turning_climb():
+    """Against the closed form: constant acceleration and constant body rate."""
+    history, w = StateHistory(100), np.array([0.0, 0.0, 4.0])
+    def truth(t):
+        return np.array([t, 0.5 * t * t, 0.0]), so3.quat_exp(w * t)
+
+    for k in range(20):
+        t = 0.002 * k
+        history.append(TrueState(2_000_000 * k, *truth(t), np.array([1.0, t, 0.0]), w))
+    for ns in (0, 1_234_567, 17_000_001, 38_000_000):
+        p, q = truth(ns * 1e-9)
+        found = history.at(ns)
+        np.testing.assert_allclose(found.p_WB, p, atol=1e-12)
+        assert abs(abs(found.q_WB @ q) - 1) < 1e-12
+    with pytest.raises(LookupError, match="outside"):
+        history.at(38_000_001)
+
+
+def test_gusts_have_the_strength_asked_for_and_drydens_memory():
+    step, sigma = 0.05, 1.5
+    field = WindField(Wind(steady=(0.0, 4.0, 0.0), gust_sigma=sigma), step, seeding.stream(1, "wind"))
+    gusts = np.array([field.next() for _ in range(200_000)]) - [0.0, 4.0, 0.0]
+    np.testing.assert_allclose(gusts.std(axis=0), sigma, rtol=0.05)
+    # along the wind (y): exp(-V t / L); across (x): (1 - V t / 2L) exp(-V t / L), with L = 5 m
+    lag = 10
+    x = 4.0 * lag * step / 5.0
+    def correlation(g):
+        return np.mean(g[lag:] * g[:-lag]) / np.mean(g * g)
+
+    assert correlation(gusts[:, 1]) == pytest.approx(np.exp(-x), abs=0.05)
+    assert correlation(gusts[:, 0]) == pytest.approx((1 - x / 2) * np.exp(-x), abs=0.05)
+
+
+def test_no_gusts_without_strength():
+    field = WindField(Wind(steady=(1.0, 2.0, 3.0)), 0.002, seeding.stream(1, "wind"))
+    np.testing.assert_array_equal(field.next(), [1.0, 2.0, 3.0])
+
+
+def test_motors_limit_refuse_and_time_out():
+    motors = Motors(500.0, 1700.0, timeout=100)
+    assert np.all(motors.target(0) == 0.0)
+    motors.command(0, True, np.array([0.0, 1000.0, 5000.0, 1700.0]))
+    np.testing.assert_array_equal(motors.target(100), [500.0, 1000.0, 1700.0, 1700.0])
+    with pytest.raises(MotorCommandError, match="nan"):
+        motors.command(90, True, np.array([np.nan, 1000.0, 1000.0, 1000.0]))
+    assert np.all(motors.target(101) == 0.0) and motors.timed_out  # the refused command kept nothing alive
+    motors.command(120, True, np.full(4, 900.0))
+    assert not motors.timed_out and np.all(motors.target(130) == 900.0)
+    motors.command(140, False, np.full(4, 900.0))
+    assert np.all(motors.target(141) == 0.0)
+
+
+def test_an_imu_of_another_rate_is_refused(tmp_path, monkeypatch):
+    from perch_sim import simulation
+
+    other = dataclasses.replace(VEHICLE, imu=dataclasses.replace(VEHICLE.imu, rate=200.0))
+    monkeypatch.setattr(simulation, "load_vehicle", lambda name: other)
+    with pytest.raises(ConfigError, match="imu.rate: 200 is not the control rate of 500 Hz"):
+        simulation.Simulation(load_scenario("surface_90"), 1)

@@ -1,0 +1,108 @@
+"""The simulated vehicle as a whole: repeatable flights, cameras that overlap, the VIO stand-in."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_core.scenario import Wind, load_scenario
+from perch_sim import seeding
+from perch_sim.simulation import SECOND, Simulation
+from perch_sim.vio_model import VioModel, VioModelParameters
+
+SCENARIO = dataclasses.replace(load_scenario("surface_90"), wind=Wind(steady=(0.3, 0.2, 0.0), gust_sigma=0.2))
+
+
+def climb(flight: Simulation) -> np.ndarray:
+    """A crude controller: hold level and 0.8 m by rates and height, from the IMU's own samples."""
+    vehicle = flight.vehicle
+    state, R = flight.state, so3.quat_to_matrix(flight.state.q_WB)
+    thrust = vehicle.mass * (9.81 + 4.0 * (0.8 - state.p_WB[2]) - 3.0 * state.v_WB[2])
+    moment = np.array(vehicle.inertia) * (-60.0 * np.cross([0, 0, 1.0], R[2]) * -1 - 15.0 * state.w_WB_B)
+    rotor = np.linalg.solve(vehicle.allocation, [thrust, *moment])
+    return np.sqrt(np.maximum(rotor, 0.0) / vehicle.thrust_coefficient)
+
+
+def fly(seconds: float, seed: int, render: tuple[str, ...] = (), threads: int = 1) -> tuple[str, str, Simulation]:
+    """Digests of all states and samples, and of all images with their times."""
+    flown, seen = hashlib.sha256(), hashlib.sha256()
+    with ThreadPoolExecutor(threads) as pool:
+        flight = Simulation(SCENARIO, seed, render, pool)
+        while flight.time < (1 + seconds) * SECOND:
+            flight.motors.command(flight.time, True, climb(flight))
+            output = flight.advance()
+            for part in (*output.imu, *output.state[1:]):
+                flown.update(part.tobytes())
+            for name, camera in flight.cameras.items():
+                if camera.due(flight.time) is not None:
+                    delivery = camera.take()
+                    seen.update(repr((name, delivery.frame)).encode())
+                    if delivery.image is not None:
+                        seen.update(delivery.image.result().tobytes())
+    return flown.hexdigest(), seen.hexdigest(), flight
+
+
+def test_the_same_seed_gives_the_same_flight_and_another_another():
+    first, _, flight = fly(1.0, seed=3)
+    assert fly(1.0, seed=3)[0] == first
+    assert fly(1.0, seed=4)[0] != first
+    assert flight.state.p_WB[2] > 0.3 and not flight.plant.contact.crashed  # it flew
+
+
+def test_images_do_not_depend_on_threads_nor_the_flight_on_images():
+    flown, seen, _ = fly(0.3, seed=3, render=("front",), threads=1)
+    assert fly(0.3, seed=3, render=("front",), threads=3)[:2] == (flown, seen)
+    assert fly(0.3, seed=3)[0] == flown
+
+
+def test_images_arrive_at_thirty_hertz_after_their_exposure():
+    flight, frames = Simulation(SCENARIO, 1), []
+    while flight.time < 3 * SECOND:
+        flight.advance()
+        delivery = flight.cameras["front"].due(flight.time)
+        if delivery is not None:
+            assert 0 <= flight.time - delivery.frame.arrival < 2_000_000
+            frames.append(flight.cameras["front"].take().frame)
+    assert 58 <= len(frames) <= 61
+    assert [f.index for f in frames] == list(range(len(frames)))
+
+
+def test_calibration_errors_belong_to_realism():
+    ideal = dataclasses.replace(SCENARIO, realism="ideal")
+    def offsets(scenario):
+        flight, out = Simulation(scenario, 5), []
+        while len(out) < 3:
+            flight.advance()
+            if flight.cameras["down"].due(flight.time):
+                frame = flight.cameras["down"].take().frame
+                out.append(frame.stamp - frame.middle)
+        return out
+
+    assert offsets(ideal) == [-8_000_000] * 3
+    real = offsets(SCENARIO)
+    assert real[0] != -8_000_000 and abs(real[0] + 8_000_000) <= 4_000_000
+
+
+def test_vio_stand_in_has_its_documented_drift_and_noise():
+    params = VioModelParameters()
+    truth = np.array([1.0, -2.0, 1.5]), so3.quat_exp(np.array([0.3, -1.2, 0.5])), np.array([0.5, 0.0, -0.2])
+    first, last, tilt = [], [], []
+    for seed in range(300):
+        model = VioModel(params, seeding.stream(seed, "vio_model"))
+        for k in range(31):
+            estimate = model.degrade(k / 30, *truth)
+            if k == 0:
+                first.append(estimate.p_WB - truth[0])
+        last.append(estimate.p_WB - truth[0])
+        error = so3.quat_log(so3.quat_multiply(estimate.q_WB, so3.quat_conjugate(truth[1])))
+        tilt.append(error)
+        assert np.linalg.norm(estimate.q_WB) == pytest.approx(1.0)
+    assert np.std(first) == pytest.approx(params.position_noise, rel=0.1)
+    expected = np.hypot(params.position_noise, params.position_drift)  # after one second
+    assert np.std(np.array(last)[:, 2]) == pytest.approx(expected, rel=0.15)
+    np.testing.assert_allclose(estimate.pose_variance[2], expected**2, rtol=1e-6)
+    np.testing.assert_allclose(np.std(tilt, axis=0)[:2], params.attitude_noise, rtol=0.15)
