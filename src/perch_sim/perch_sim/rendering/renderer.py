@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_sim.rendering.atlas import build_atlas
+from perch_sim.rendering.cables import CablePainter
 from perch_sim.rendering.grid import build_grid
 from perch_sim.rendering.raster import Rasterizer
 from perch_sim.rendering.scene import Scene
 from perch_sim.rendering.sensor import Sensor, control_exposure
-from perch_sim.rendering.visibility import FaceArrays
+from perch_sim.rendering.visibility import FaceArrays, face_matrices
 
 BLUR_STEP = 2.0  # motion across the image that one sub-frame may stand for [px]
 MAX_SUBFRAMES = 6
+
+# Textures are grey; in colour dark ones are a little warm and bright ones a little cold, none of them red.
+TINT = np.stack([np.arange(256) * share for share in
+                 (np.linspace(1.02, 0.95, 256), np.ones(256), np.linspace(0.93, 0.98, 256))], axis=-1)
 
 Pose = tuple[np.ndarray, np.ndarray]  # p_WB (3,) [m], R_WB (3, 3)
 
@@ -46,6 +52,8 @@ class Renderer:
         self._faces = FaceArrays.of(scene.faces())
         self._grid = build_grid(mount.camera)
         self._raster = Rasterizer(self._faces, build_atlas(scene), mount.camera, self._grid)
+        self._cables = CablePainter(scene.cables, mount.camera) if scene.cables else None
+        self._tint = np.rint(TINT).astype(np.uint8)[None]
         self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed)
 
     def render(self, poses: Sequence[Pose], rng: np.random.Generator,
@@ -72,7 +80,14 @@ class Renderer:
         return self._sensor.expose(((mean + len(frames) // 2) // len(frames)).astype(np.uint8), rng)
 
     def _light(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray) -> np.ndarray:
-        return self._raster.draw(p_WC, R_WC, shift_W)
+        """What falls on the lens at one instant, under the light that the exposure is made for, uint8."""
+        image = self._raster.draw(p_WC, R_WC, shift_W)
+        if self.mount.colour:
+            image = cv2.LUT(cv2.merge([image] * 3), self._tint)
+        if self._cables is not None:
+            M, _, front = face_matrices(self._faces, p_WC, R_WC, shift_W)
+            self._cables.paint(image, p_WC, R_WC, M[front], self._faces.half[front])
+        return image
 
     def _subframes(self, poses: list[Pose]) -> int:
         """As many as the motion across the image during the exposure asks for."""

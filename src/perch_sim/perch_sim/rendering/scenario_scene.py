@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_core.scenario import Scenario
+from perch_core.catenary import Catenary
+from perch_core.scenario import Cable, Scenario
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
-from perch_sim.rendering.scene import Scene
+from perch_sim.rendering.scene import CableCurve, Scene
+
+CABLE_COLOURS = {"red": (190.0, 35.0, 35.0), "grey": (88.0, 88.0, 92.0)}  # rgb under full light
+CABLE_SPACING = 0.25  # between the points of a cable's polyline [m]
 
 
 def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
@@ -29,4 +33,11 @@ def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
         target = PerchSurface(surface.p_WS, surface.R_WS, scenario.target.panel_size)
         board = load_board(scenario.target.board)
     return Scene(room_low=centre - half, room_high=centre + half, target=target, board=board,
+                 cables=tuple(_curve(cable) for cable in world.cables),
                  contrast=world.contrast, light=world.light, seed=seed)
+
+
+def _curve(cable: Cable) -> CableCurve:
+    hanging = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag)
+    count = max(2, int(np.ceil(hanging.length / CABLE_SPACING)) + 1)
+    return CableCurve(hanging.sample(count), cable.radius, CABLE_COLOURS[cable.colour])

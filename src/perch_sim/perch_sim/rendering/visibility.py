@@ -54,7 +54,7 @@ class FaceArrays:
             np.array([f.half if f.bounded else (np.inf, np.inf) for f in faces]),
             np.array([f.texel for f in faces]), np.array([f.moving for f in faces]),
             np.array([f.kind == "pad" for f in faces]), np.array(bounded, dtype=int),
-            np.array(edges).reshape(len(bounded), -1, 3),
+            np.array(edges).reshape(len(bounded), 4 * EDGE_SAMPLES, 3),
         )
 
 
