@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import importlib
 import json
-import signal
 import sys
 from pathlib import Path
 from typing import Any
 
-import perch_core.ros.node  # noqa: F401  before numpy: it limits numpy's threads
 import rclpy
 from perch_core.errors import PerchError
+from perch_core.ros.node import StopSignal, spin_until_stopped
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -58,19 +57,15 @@ def main() -> None:
     except (OSError, ValueError) as error:
         print(f"error: {sys.argv[1]}: {error}", file=sys.stderr)
         sys.exit(2)
-    # rclpy's own handlers shut the context down in the middle of callbacks, which then fail to publish.
+    stop = StopSignal()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    stopped: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stopped.append(received))
     nodes: list[Node] = []
     try:
         nodes = create_nodes(plan)
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        while not stopped:
-            executor.spin_once(timeout_sec=0.2)
+        spin_until_stopped(executor, stop)
     except (PerchError, rclpy.exceptions.InvalidParameterValueException) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
