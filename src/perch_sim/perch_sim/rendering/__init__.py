@@ -3,5 +3,6 @@
 from perch_sim.rendering.renderer import Renderer
 from perch_sim.rendering.scenario_scene import build_scene
 from perch_sim.rendering.scene import Box, CableCurve, Scene
+from perch_sim.rendering.sensor import Exposure, control_exposure
 
-__all__ = ["Box", "CableCurve", "Renderer", "Scene", "build_scene"]
+__all__ = ["Box", "CableCurve", "Exposure", "Renderer", "Scene", "build_scene", "control_exposure"]

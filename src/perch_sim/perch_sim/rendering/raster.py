@@ -75,21 +75,22 @@ class Rasterizer:
         affordable = int(np.sqrt(FINE_SAMPLES / (len(cells) * CELL**2)))
         return int(np.clip(wanted, 1, max(1, affordable)))
 
-    def _texture_matrices(self, view: View, cells: np.ndarray, face: np.ndarray, supersampling: int) -> np.ndarray:
-        """Ray in C -> (column, row, 1) of the atlas, up to scale: shape (cells, 3, 3)."""
+    def _affine(self, view: View, cells: np.ndarray, face: np.ndarray, supersampling: int) -> np.ndarray:
+        """(sx, ox, sy, oy) of the atlas level that fits each cell, shape (4, cells, 1): see `Atlas.affine`."""
         footprint = self._texels_per_pixel(view, cells, face) / supersampling
         level = np.rint(LEVELS_PER_OCTAVE * np.log2(footprint))
         level = np.clip(level, 0, self.atlas.levels[face] - 1).astype(int)
-        sx, ox, sy, oy = self.atlas.affine[face, level].T[..., None]
-        M = view.M[face]
-        return np.stack([sx * M[:, 0] + ox * M[:, 2], sy * M[:, 1] + oy * M[:, 2], M[:, 2]], axis=1)
+        return self.atlas.affine[face, level].T[..., None]
 
     def _draw_uniform(self, image: np.ndarray, view: View, cells: np.ndarray, first: np.ndarray,
                       supersampling: int) -> None:
         if not len(cells):
             return
-        T = self._texture_matrices(view, cells, first[cells], supersampling)
-        corners = np.matmul(T, self.grid.corners[cells]).transpose(1, 0, 2)  # (3, cells, 4)
+        face = first[cells]
+        sx, ox, sy, oy = self._affine(view, cells, face, supersampling)
+        M = view.M[face]
+        to_atlas = np.stack([sx * M[:, 0] + ox * M[:, 2], sy * M[:, 1] + oy * M[:, 2], M[:, 2]], axis=1)
+        corners = np.matmul(to_atlas, self.grid.corners[cells]).transpose(1, 0, 2)  # (3, cells, 4)
         x, y, w = np.ascontiguousarray(corners) @ sample_weights(supersampling)
         x /= w
         y /= w
@@ -103,19 +104,19 @@ class Rasterizer:
         x = np.full_like(nearest, self.atlas.void[0])
         y = np.full_like(nearest, self.atlas.void[1])
         for face, rows in self._candidates(view, cells):
-            rays = self.grid.corners[cells[rows]]
-            u, v, inverse = np.ascontiguousarray(np.matmul(view.M[face], rays).transpose(1, 0, 2)) @ weights
-            wins = inverse > nearest[rows]
+            corners = np.matmul(view.M[face], self.grid.corners[cells[rows]]).transpose(1, 0, 2)
+            u, v, inverse = np.ascontiguousarray(corners) @ weights
+            before = nearest[rows]
+            wins = inverse > before
             half_u, half_v = self.faces.half[face]
             if np.isfinite(half_u):
                 wins &= (np.abs(u) <= np.float32(half_u) * inverse) & (np.abs(v) <= np.float32(half_v) * inverse)
-            T = self._texture_matrices(view, cells[rows], np.full(len(rows), face), supersampling)
-            column, row, w = np.ascontiguousarray(np.matmul(T, rays).transpose(1, 0, 2)) @ weights
-            w = np.where(wins, w, 1.0)
-            for store, value in ((nearest, inverse), (x, column / w), (y, row / w)):
-                kept = store[rows]
-                np.copyto(kept, value, where=wins)
-                store[rows] = kept
+            sx, ox, sy, oy = self._affine(view, cells[rows], np.full(len(rows), face), supersampling)
+            np.copyto(before, inverse, where=wins)
+            range_ = 1.0 / before  # of this face where it wins; elsewhere the value is not used
+            x[rows] = np.where(wins, sx * (u * range_) + ox, x[rows])
+            y[rows] = np.where(wins, sy * (v * range_) + oy, y[rows])
+            nearest[rows] = before
         self._look_up(image, cells, x, y, supersampling)
 
     def _candidates(self, view: View, cells: np.ndarray) -> list[tuple[int, np.ndarray]]:
