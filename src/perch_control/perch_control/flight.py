@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Protocol
+from typing import Any, Protocol
 
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.descent import BlindDescent
@@ -32,6 +32,9 @@ class Law(Protocol):
 
     name: str
 
+    def prepare(self, source, contact: bool):
+        """The reference to follow for a trajectory, which ends in a contact or not."""
+
     def control(self, state: tuple[float, ...], preview, rotors: RotorEstimate, compensation: tuple[float, ...],
                 time_to_contact: float) -> ControlOutput:
         """Rotor commands; `preview(dt)` is the setpoint `dt` seconds from now."""
@@ -54,6 +57,7 @@ class FlightController:
         self.compensator = None
         self._constants = packed_vehicle(vehicle)
         self._pending: Order | None = None
+        self._prepared: Any = None            # what is followed for `_pending`
         self._source = Hold(Setpoint((0.0, 0.0, 0.0)))
         self._start = 0.0                     # time at which `_source` began [s]
         self._events: list[str] = []
@@ -122,6 +126,7 @@ class FlightController:
             raise TrajectoryRefused(f"the vehicle is {self.state.name.lower()}, not armed and ready")
         check_joints(order.source.trajectory, self.settings.joint_gap)
         check_start(order, self.now, self._expected(max(order.start, self.now)), self.settings)
+        self._prepared = self.law.prepare(order.source, order.at_end is AtEnd.CONTACT)
         self._pending = order
 
     def estimator(self, state: int, vio_age: float, message: str) -> None:
@@ -311,7 +316,7 @@ class FlightController:
         late = self.now - order.start
         # On the ground there is nothing to continue; in the air the new reference is reached without a jump.
         present = self._expected(self.now)
-        source = blended(present, order.source, late) if self.state is not State.ARMED else order.source
+        source = self._prepared if self.state is State.ARMED else blended(present, self._prepared, late)
         self._enter(State.TRACKING, f"tracking trajectory {order.id}")
         self.order, self._source, self._start, self.trajectory_id = order, source, order.start, order.id
 

@@ -61,6 +61,15 @@ class Polynomial:
             return Setpoint((p[0] + over * v[0], p[1] + over * v[1], p[2] + over * v[2]), v, h=self._h)
         return Setpoint(p, v, tuple(x.a.tolist()), tuple(x.j.tolist()), tuple(x.s.tolist()), h=self._h)
 
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """p, v, a, j, s at many times [s], shape (n, 15); the end velocity goes on past the end."""
+        x = self._trajectory.sample_many(times)
+        out = np.concatenate([x.p, x.v, x.a, x.j, x.s], axis=-1)
+        over = np.maximum(times - self.duration, 0.0)
+        out[:, 0:3] += over[:, None] * x.v
+        out[over > 0.0, 6:] = 0.0
+        return out
+
 
 def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polynomial:
     """Smooth change of velocity from a moving state to `v_end`, position left free at the end.
@@ -93,17 +102,19 @@ def quintic(p0, v0, a0, p1, v1, a1, duration: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Blend:
-    """A new reference reached without a jump: the offset to the old one dies away along a quintic.
+    """A reference with an offset: one that dies away (a new reference is reached without a jump), or one that grows.
 
     Attributes:
-        source: the new reference.
-        start: its time at which it takes over [s].
+        source: the reference.
+        start: its time at which the offset begins [s].
         offset: what is added, over the time since `start`.
+        lasting: the offset goes on past its end instead of being over.
     """
 
     source: object
     start: float
     offset: Polynomial
+    lasting: bool = False
 
     @property
     def duration(self) -> float:
@@ -111,9 +122,9 @@ class Blend:
         return self.source.duration
 
     def setpoint(self, t: float) -> Setpoint:
-        """Setpoint at a time [s] of the new reference."""
+        """Setpoint at a time [s] of the reference."""
         x = self.source.setpoint(t)
-        if t - self.start >= self.offset.duration:
+        if t <= self.start or (t - self.start >= self.offset.duration and not self.lasting):
             return x
         d = self.offset.setpoint(t - self.start)
         return Setpoint(*(tuple(m + n for m, n in zip(getattr(x, k), getattr(d, k))) for k in ("p", "v", "a", "j", "s")),

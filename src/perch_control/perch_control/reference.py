@@ -116,3 +116,20 @@ class SampledReference:
         p, v = x.p + over * (x.v + 0.5 * over * a), x.v + over * a
         return Setpoint(_floats(p), _floats(v), _floats(a), _floats(j), _floats(s), _floats(R[:, 1]),
                         _floats(turn[:, 1]), _floats(turn2[:, 1]))
+
+
+def packed_many(source, times: np.ndarray) -> np.ndarray:
+    """Setpoints of a source at many times [s], packed, shape (n, 24); a flat trajectory is evaluated in one go."""
+    if not isinstance(source, FlatReference):
+        return np.array([source.setpoint(float(t)).packed for t in times])
+    end = source.trajectory.duration
+    inside = times <= end
+    x = source.trajectory.sample_many(times[inside])
+    c, s, r, q = np.cos(x.yaw), np.sin(x.yaw), x.yaw_rate, x.yaw_acc
+    zero = np.zeros_like(c)
+    h = np.stack([-s, c, zero, -c * r, -s * r, zero, s * r * r - c * q, -c * r * r - s * q, zero], axis=-1)
+    out = np.empty((len(times), 24))
+    out[inside] = np.concatenate([x.p, x.v, x.a, x.j, x.s, h], axis=-1)
+    for k in np.flatnonzero(~inside):
+        out[k] = source.setpoint(float(times[k])).packed
+    return out

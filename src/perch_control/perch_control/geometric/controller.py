@@ -8,6 +8,7 @@ from math import radians, tan
 import numpy as np
 
 from perch_control.allocation import mixing_columns
+from perch_control.geometric.rehearsal import flown, rehearsed
 from perch_control.geometric.step import control_step
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
@@ -26,6 +27,7 @@ def packed_vehicle(vehicle: Vehicle) -> tuple:
          float(vehicle.motor_time_constant)),
         forward,
         mixing_columns(vehicle),
+        tuple(float(d) / vehicle.mass for d in vehicle.drag),
     )
 
 
@@ -87,8 +89,35 @@ class GeometricController:
         gains = self.gains
         share = 1.0 if gains.contact_window <= 0.0 else min(max(time_to_contact / gains.contact_window, 0.0), 1.0)
         cone = self._narrow + share * (self._wide - self._narrow)
-        limits = (gains.feedback_max, cone, gains.thrust_floor, self._rate_max, gains.acceleration_max,
-                  gains.feedback_rate)
-        out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, limits, gains.lead,
-                           self._vehicle)
+        out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, self._limits(cone),
+                           gains.lead, self._vehicle)
         return ControlOutput(*out[:6])
+
+    def _limits(self, cone: float) -> tuple[float, ...]:
+        gains = self.gains
+        return (gains.feedback_max, cone, gains.thrust_floor, self._rate_max, gains.acceleration_max, gains.feedback_rate)
+
+    def prepare(self, source, contact: bool):
+        """The reference to follow for a trajectory: one that ends in contact is rehearsed and offset first."""
+        gains = self.gains
+        if not (contact and gains.rehearse):
+            return source
+        return rehearsed(source, self.vehicle, self, gains.contact_speed, gains.contact_overshoot)
+
+    def rehearse(self, start: np.ndarray, rotors: RotorEstimate, table: np.ndarray, period: float,
+                 duration: float) -> np.ndarray:
+        """State in which this controller ends a contact trajectory on the nominal vehicle.
+
+        Args:
+            start: state at the beginning, shape (13,).
+            rotors: rotors at the beginning.
+            table: setpoints `lead` ahead of each period, shape (n, 24).
+            period: control period [s].
+            duration: time from the beginning to the contact [s].
+
+        Returns:
+            State at `duration`, shape (13,).
+        """
+        gains = self.gains
+        return flown(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
+                     gains.contact_window, gains.lead, period, duration, self._vehicle)

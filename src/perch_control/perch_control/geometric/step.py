@@ -8,7 +8,7 @@ from perch_control.allocation import allocate
 from perch_control.geometric.law import GRAVITY, geometric_step
 from perch_control.jit import scalar
 from perch_control.rotor_lag import approached, leading_command, reachable, thrusts
-from perch_control.vector3 import axes_of, axpy, cross, scale, times, turned
+from perch_control.vector3 import axes_of, axpy, cross, dot, scale, times, turned
 
 
 @scalar
@@ -58,6 +58,14 @@ def predicted(state, f, extra, duration, mass, J, forward):
 
 
 @scalar
+def drag_compensation(q, v, drag, extra):
+    """`extra` with what makes up for the rotor drag `drag` (per mass, axes of B) [1/s] at a velocity in W added."""
+    b1, b2, b3 = axes_of(q)
+    d = axpy(drag[0] * dot(b1, v), b1, axpy(drag[1] * dot(b2, v), b2, scale(drag[2] * dot(b3, v), b3)))
+    return (extra[0] + d[0], extra[1] + d[1], extra[2] + d[2], extra[3], extra[4], extra[5])
+
+
+@scalar
 def rotors_for(wrench, speed, vehicle, lead):
     """Rotor commands that reach a wrench after the lead time, tilt before thrust before yaw.
 
@@ -95,7 +103,7 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
         extra, gains, limits: see `geometric_step`.
         lead: time in which the rotors shall reach the wanted thrust [s].
         vehicle: (mass, Jx, Jy, Jz), (thrust coefficient, lowest and highest speed, time constant), moment rows (3 x 4),
-            mixing columns (4 x 4).
+            mixing columns (4 x 4), rotor drag / mass (3).
 
     Returns:
         Commanded rotor speeds (4) [rad/s], wanted wrench (4) [N, N m], rotor thrusts that will be reached (4) [N],
@@ -105,8 +113,11 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
     coefficient, _, _, tau = vehicle[1]
     half = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * lead / tau)
     f_mid = thrusts(approached(speed, command, half), coefficient)
-    ahead = predicted(state, f_mid, extra, lead, mass, J, vehicle[2])
+    felt = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
+    ahead = predicted(state, f_mid, felt, lead, mass, J, vehicle[2])
     specific = (f_mid[0] + f_mid[1] + f_mid[2] + f_mid[3]) / mass
+    # The wanted velocity, not the measured one: its noise would come back as thrust.
+    extra = drag_compensation(ahead[6:10], reference[3:6], vehicle[4], extra)
     thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, specific, extra, gains, limits, J)
     wrench = (mass * thrust, M[0], M[1], M[2])
     out, f = rotors_for(wrench, speed, vehicle, lead)

@@ -1,0 +1,115 @@
+"""The controller flown on the model before it flies: where will it end?
+
+A perch asks for more moment at low thrust than the rotors have without extra thrust: stopping the rotation at the wall
+pushes the vehicle away from it by 0.2-0.3 m/s, every time, in the same way. No feedback can undo that in the last tenth of
+a second, but it can be known beforehand: the flight is rehearsed with rotor lag and limits, and the reference is offset
+so that the *rehearsed* vehicle arrives as planned.
+"""
+
+from __future__ import annotations
+
+from math import exp
+
+import numpy as np
+
+from perch_control.geometric.law import commanded_frame
+from perch_control.geometric.step import control_step, drag_compensation, predicted
+from perch_control.guidance import Blend, Polynomial
+from perch_control.jit import scalar
+from perch_control.reference import packed_many
+from perch_control.rotor_lag import RotorEstimate, approached, thrusts
+from perch_control.vector3 import quaternion_of
+from perch_core.vehicle import GRAVITY, Vehicle
+
+_ROUNDS = 5
+_SPAN = 1.5     # the last part of the trajectory is rehearsed [s]
+_QUIET = 0.3    # the offset no longer accelerates: the rotation at the end [s]
+_PERIOD = 0.002
+_POSITION_SCALE, _SPEED_SCALE = 0.05, 0.2  # misses that weigh the same [m], [m/s]
+_CLOSE = 0.1    # the sum of both, with which the rounds end
+_LARGEST = 0.5  # an offset beyond this belongs to the planner [m, m/s]
+
+
+@scalar
+def flown(start, speed, table, gains, limits, narrow, window, lead, period, duration, vehicle):
+    """State at the end of a flight of the geometric controller on the nominal vehicle; see `rehearse`."""
+    state, command = start, speed
+    mass, J = vehicle[0][0], vehicle[0][1:4]
+    coefficient, _, _, tau = vehicle[1]
+    share = 1.0 if tau <= 0.0 else 1.0 - exp(-period / tau)
+    middle = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * period / tau)
+    none = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for k in range(table.shape[0]):
+        r = table[k]
+        reference = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12], r[13], r[14], r[15],
+                     r[16], r[17], r[18], r[19], r[20], r[21], r[22], r[23])
+        part = 1.0 if window <= 0.0 else min(max((duration - k * period - lead) / window, 0.0), 1.0)
+        cone = narrow + part * (limits[1] - narrow)
+        command = control_step(state, reference, speed, command, none, gains,
+                               (limits[0], cone, limits[2], limits[3], limits[4], limits[5]), lead, vehicle)[0]
+        f = thrusts(approached(speed, command, middle), coefficient)
+        felt = drag_compensation(state[6:10], state[3:6], vehicle[4], none)
+        state = predicted(state, f, felt, period, mass, J, vehicle[2])
+        speed = approached(speed, command, share)
+    return np.array(state)
+
+
+def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, overshoot: float):
+    """A contact trajectory, offset so that the controller arrives where and as fast as planned.
+
+    The offset grows while the thrust is still high and goes on as a straight line through the rotation at the end, which
+    therefore stays as it was rehearsed: what is added to the end's position and velocity arrives there nearly unchanged,
+    and a few rounds converge.
+
+    Args:
+        source: reference with `duration` and `setpoint(t)`.
+        vehicle: the nominal vehicle.
+        controller: a `GeometricController`.
+        contact_speed: least speed into the surface at the contact [m/s]; a slower plan arrives with this.
+        overshoot: the end lies so far behind the surface [m]: a vehicle that estimation errors hold back touches it, too.
+
+    Returns:
+        The reference to follow; `source` itself where it is too short, or where the rehearsal comes no closer.
+    """
+    T = source.duration
+    n = int(min(_SPAN, T) / _PERIOD)
+    growth = n * _PERIOD - _QUIET
+    if growth < _QUIET:
+        return source
+    begin, lead = T - n * _PERIOD, controller.lead
+    times = np.arange(n) * _PERIOD + lead
+    table = packed_many(source, begin + times)
+    start, rotors = _on_reference(source.setpoint(begin), vehicle)
+    end = source.setpoint(T)
+    s3 = np.add(end.a, (0.0, 0.0, GRAVITY)) / np.linalg.norm(np.add(end.a, (0.0, 0.0, GRAVITY)))
+    faster = max(contact_speed + float(np.dot(end.v, s3)), 0.0)
+    wanted = np.array([np.subtract(end.p, overshoot * s3), np.subtract(end.v, faster * s3)])
+    delta, best, least = np.zeros((2, 3)), None, np.inf
+    for _ in range(_ROUNDS):
+        shifted = table.copy()
+        shifted[:, :15] += _offset(delta, growth).many(times)
+        final = controller.rehearse(start, rotors, shifted, _PERIOD, n * _PERIOD)
+        miss = np.array([final[0:3], final[3:6]]) - wanted
+        error = float(np.linalg.norm(miss[0]) / _POSITION_SCALE + np.linalg.norm(miss[1]) / _SPEED_SCALE)
+        if error < least:
+            best, least = delta.copy(), error
+        if error < _CLOSE:
+            break
+        delta = np.clip(delta - miss, -_LARGEST, _LARGEST)
+    return Blend(source, begin, _offset(best, growth), lasting=True) if best.any() else source
+
+
+def _offset(delta: np.ndarray, duration: float) -> Polynomial:
+    """From rest, without jerk at either end, onto the line that has offset `delta` (position, velocity) `_QUIET` later."""
+    p, v = delta[0] - _QUIET * delta[1], delta[1] * duration / 7.0
+    zero = np.zeros(3)
+    points = np.stack([zero, zero, zero, zero, p - 3.0 * v, p - 2.0 * v, p - v, p], axis=-1)
+    return Polynomial(points, duration, (0.0, 0.0, 0.0))
+
+
+def _on_reference(x, vehicle: Vehicle) -> tuple[np.ndarray, RotorEstimate]:
+    """State and rotors of a vehicle that is exactly on a setpoint."""
+    f = (x.a[0], x.a[1], x.a[2] + GRAVITY)
+    b1, b2, b3, w, _ = commanded_frame(f, x.j, x.s, x.h, x.dh, x.ddh)
+    speed = float(np.sqrt(vehicle.mass * np.linalg.norm(f) / 4.0 / vehicle.thrust_coefficient))
+    return np.array([*x.p, *x.v, *quaternion_of(b1, b2, b3), *w]), RotorEstimate((speed,) * 4, (speed,) * 4)
