@@ -1,0 +1,144 @@
+"""First and second derivatives of the whole problem, put together from those of the stages.
+
+CasADi would differentiate the sum over N compiled calls by its chain rule: 22 directions through every call and six
+thousand nodes, 2.3 ms per iteration. Here every stage function is called once, mapped over the stages, and one gather
+puts the nonzeros where they belong: 0.5 ms. The results are the same; a test compares them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from perch_core.rotor_model import INPUTS, STATES
+from perch_planner.powerline.stage_functions import STAGE_STATES, StageFunctions
+
+STRIDE = STAGE_STATES + INPUTS
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The problem's parameters as symbols: see `nlp.Numbers`."""
+
+    lines: Sequence[ca.MX]
+    reference: ca.MX
+    run: ca.MX
+    end: ca.MX
+    see: ca.MX
+
+
+class Gather:
+    """A sparse matrix whose nonzeros are picked from one long vector of stage derivatives."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self._shape = (rows, columns)
+        self._rows: list[np.ndarray] = []
+        self._columns: list[np.ndarray] = []
+        self._source: list[np.ndarray] = []
+        self._parts: list[ca.MX] = []
+        self._length = 0
+
+    def add(self, values: ca.MX, rows: np.ndarray, columns: np.ndarray, mirror: bool = False) -> None:
+        """Put `values[i]` at (rows[i], columns[i]); with `mirror` also at the transposed place off the diagonal."""
+        source = self._length + np.arange(len(rows))
+        self._parts.append(values)
+        self._length += len(rows)
+        self._rows.append(rows), self._columns.append(columns), self._source.append(source)
+        if mirror:
+            off = rows != columns
+            self._rows.append(columns[off]), self._columns.append(rows[off]), self._source.append(source[off])
+
+    def matrix(self) -> ca.MX:
+        """The matrix; values at the same place are added up."""
+        rows, columns, source = map(np.concatenate, (self._rows, self._columns, self._source))
+        sparsity, mapping = ca.Sparsity.triplet(*self._shape, rows.tolist(), columns.tolist(), False)
+        everything = ca.vertcat(*self._parts)
+        if sparsity.nnz() == len(rows):
+            return ca.MX(sparsity, everything[source[np.array(mapping)].tolist()])
+        # Several values at one place: a constant matrix of ones adds them, cheaper than a chain of sparse sums.
+        place = {cell: k for k, cell in enumerate(zip(*[np.array(v) for v in sparsity.get_triplet()]))}
+        target = [place[cell] for cell in zip(rows, columns)]
+        adder = ca.DM.triplet(target, source.tolist(), ca.DM.ones(len(rows)), sparsity.nnz(), self._length)
+        return ca.MX(sparsity, ca.mtimes(adder, everything))
+
+
+def _pattern(sparsity: ca.Sparsity) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = sparsity.get_triplet()
+    return np.array(rows, int), np.array(columns, int)
+
+
+def _tiled(pattern: tuple[np.ndarray, np.ndarray], row_step: int, column_step: int, count: int, row: int = 0, column: int = 0
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """A pattern repeated along the stages."""
+    k = np.arange(count)[:, None]
+    return (row + k * row_step + pattern[0]).ravel(), (column + k * column_step + pattern[1]).ravel()
+
+
+def split(x: ca.MX, N: int) -> tuple[ca.MX, ca.MX]:
+    """States (18 x N + 1) and inputs (4 x N) of the stacked variables."""
+    stages = ca.reshape(x[: N * STRIDE], STRIDE, N)
+    return ca.horzcat(stages[:STAGE_STATES, :], x[N * STRIDE:]), stages[STAGE_STATES:, :]
+
+
+def constraint_rows(N: int, lines: int) -> tuple[np.ndarray, int, np.ndarray]:
+    """First rows of the dynamics of every interval, of the start condition, and of the clearances of nodes 1..N."""
+    dynamics = np.array([0] + [STAGE_STATES + STATES + k * (STAGE_STATES + lines) for k in range(N - 1)])
+    clearance = dynamics[1:] + STAGE_STATES
+    return dynamics, STAGE_STATES, np.append(clearance, STAGE_STATES + STATES + (N - 1) * (STAGE_STATES + lines))
+
+
+def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int) -> ca.MX:
+    """Jacobian of all constraints."""
+    f, count = stages.functions, len(p.lines)
+    X, U = split(x, N)
+    dynamics, start, clearance = constraint_rows(N, count)
+    out = Gather(int(clearance[-1]) + count, N * STRIDE + STAGE_STATES)
+
+    rows, columns = _pattern(stages.jacobian["step"])
+    k = np.arange(N)[:, None]
+    values = f["step_jac"].map(N)(X[:, :N], U, 1.0 / N)
+    out.add(-ca.vec(values), (dynamics[:, None] + rows).ravel(), (k * STRIDE + columns).ravel())
+    diagonal = np.arange(STAGE_STATES)
+    out.add(ca.MX(ca.DM.ones(N * STAGE_STATES)), (dynamics[:, None] + diagonal).ravel(), ((k + 1) * STRIDE + diagonal).ravel())
+    out.add(ca.MX(ca.DM.ones(STATES)), start + np.arange(STATES), np.arange(STATES))
+    rows, columns = _pattern(stages.jacobian["clear"])
+    for i, line in enumerate(p.lines):
+        values = f["clear_jac"].map(N)(X[:, 1:], line)
+        out.add(ca.vec(values), (clearance[:, None] + i + rows).ravel(), ((k + 1) * STRIDE + columns).ravel())
+    return out.matrix()
+
+
+def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.MX, lam_g: ca.MX, perception: bool
+            ) -> tuple[ca.MX, ca.MX]:
+    """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g."""
+    f, count = stages.functions, len(p.lines)
+    X, U = split(x, N)
+    dynamics, start, clearance = constraint_rows(N, count)
+    size = N * STRIDE + STAGE_STATES
+    out = Gather(size, size)
+    pieces: list[tuple[ca.MX, int]] = []  # gradients of one function over the stages, and the first stage
+
+    def take(name: str, values: ca.MX, variables: int, first: int, number: int) -> None:
+        pieces.append((values[:variables, :], first))
+        places = _tiled(_pattern(stages.hessian[name]), STRIDE, STRIDE, number, first * STRIDE, first * STRIDE)
+        out.add(ca.vec(values[variables:, :]), *places, mirror=True)
+
+    lam_step = ca.reshape(lam_g[(dynamics[:, None] + np.arange(STAGE_STATES)).ravel().tolist()], STAGE_STATES, N)
+    take("step", f["step_hess"].map(N)(X[:, :N], U, 1.0 / N, -lam_step), STRIDE, 0, N)
+    take("run", f["run_hess"].map(N)(X[:, :N], U, p.run, lam_f), STRIDE, 0, N)
+    if perception:
+        take("see", f["see_hess"].map(N)(X[:, :N], p.lines[0], p.see, lam_f), STAGE_STATES, 0, N)
+    for i, line in enumerate(p.lines):
+        take("clear", f["clear_hess"].map(N)(X[:, 1:], line, lam_g[(clearance + i).tolist()].T), STAGE_STATES, 1, N)
+    take("end", f["end_hess"](X[:, N], p.reference, p.end, lam_f), STAGE_STATES, N, 1)
+
+    gradient = ca.MX.zeros(STRIDE, N + 1)
+    for values, first in pieces:
+        rows, number = values.shape
+        gradient[:rows, first : first + number] += values
+    gradient[:STAGE_STATES, 1:] += lam_step
+    gradient[:STATES, 0] += lam_g[start : start + STATES]
+    return ca.vec(gradient)[:size], out.matrix()

@@ -1,0 +1,198 @@
+"""The multiple-shooting problem and its solver: free duration, soft perception, hard avoidance and limits. [P:eq14]"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from perch_core.rotor_model import INPUTS, STATES
+from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, hessian, jacobian, split
+from perch_planner.powerline.stage_functions import (
+    END_WEIGHTS, LINE_SIZE, REFERENCE, RUN_WEIGHTS, SEE_WEIGHTS, STAGE_STATES, StageFunctions,
+)
+
+_FREE = np.inf
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What fixes the sparsity of a problem, and so needs a solver of its own.
+
+    Attributes:
+        intervals: N.
+        lines: number of segments to avoid; the first is the target.
+        perception: whether the costs of [P:eq9, P:eq12, P:eq13] are part of it.
+        solver: "fatrop" or "ipopt".
+    """
+
+    intervals: int
+    lines: int
+    perception: bool
+    solver: str = "fatrop"
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """One problem of a structure: everything that changes from solve to solve.
+
+    Attributes:
+        start: x_init [P:eq14b], shape (17,).
+        reference: wanted end: p (3), s3 (3), v (3), w (3), shape (12,).
+        lines: rows of centre, direction, radius, half length, shape (lines, 8).
+        run_weights: thrust, body rate, ramp, shape (3,); see `stage_functions`.
+        end_weights: horizontal position, height, tilt, velocity, body rate, thrust, shape (6,).
+        see_weights: reprojection, cheirality, segment visibility of every node, shape (N, 3).
+        duration: bounds of T [s]. [P:eq14c]
+        height_min: z_min with its margin [m]. [P:eq14e]
+        thrust: bounds of a rotor's thrust [N]. [P:eq14f]
+        body_rate: bound of each component of w_WB_B [rad/s].
+        clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line, see `stage_functions`. [P:eq14j]
+        states, inputs: initial guess, shapes (N + 1, 18) and (N, 4), inputs in [-1, 1].
+        defects: what is added to the integrator's result at the end of every interval, shape (N, 18); see `defects_of`.
+    """
+
+    start: np.ndarray
+    reference: np.ndarray
+    lines: np.ndarray
+    run_weights: np.ndarray
+    end_weights: np.ndarray
+    see_weights: np.ndarray
+    duration: tuple[float, float]
+    height_min: float
+    thrust: tuple[float, float]
+    body_rate: float
+    clearance: float
+    states: np.ndarray
+    inputs: np.ndarray
+    defects: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the solver found.
+
+    Attributes:
+        states, inputs: shapes (N + 1, 18) and (N, 4).
+        converged: the solver reports a local optimum.
+        status: the solver's own word.
+        cost: value of [P:eq14a].
+        iterations: of the interior-point method.
+        time: wall-clock time of the solve [s].
+    """
+
+    states: np.ndarray
+    inputs: np.ndarray
+    converged: bool
+    status: str
+    cost: float
+    iterations: int
+    time: float
+
+    @property
+    def duration(self) -> float:
+        """T [s]."""
+        return float(self.states[0, STATES])
+
+
+@dataclass
+class Problem:
+    """A solver of one structure, built from stage functions once and solved many times."""
+
+    structure: Structure
+    stages: StageFunctions
+    tolerance: float = 1e-6
+    barrier: float | None = None  # first barrier parameter; a small one keeps to a good guess
+    push: float = 1e-2  # how far a guess is pushed off its active bounds
+    max_iterations: int = 300
+    _solver: ca.Function = field(init=False, repr=False)
+    _equality: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        N, count, f = self.structure.intervals, self.structure.lines, self.stages.functions
+        x = ca.MX.sym("x", N * STRIDE + STAGE_STATES)
+        sizes = [LINE_SIZE] * count + [STATES, REFERENCE, RUN_WEIGHTS, END_WEIGHTS, SEE_WEIGHTS * N, STAGE_STATES * N]
+        p = ca.MX.sym("p", sum(sizes))
+        *lines, start, reference, run, end, see, defects = ca.vertsplit(p, np.cumsum([0, *sizes]).tolist())
+        parameters = Parameters(lines, reference, run, end, ca.reshape(see, SEE_WEIGHTS, N))
+        X, U = split(x, N)
+
+        cost = ca.sum2(f["run"].map(N)(X[:, :N], U, run)) + f["end"](X[:, N], reference, end)
+        if self.structure.perception:
+            cost += ca.sum2(f["see"].map(N)(X[:, :N], lines[0], parameters.see))
+        gaps = X[:, 1:] - f["step"].map(N)(X[:, :N], U, 1.0 / N) - ca.reshape(defects, STAGE_STATES, N)
+        clear = ca.vertcat(*[f["clear"].map(N)(X[:, 1:], line) for line in lines], ca.MX(0, N))
+        # The order that fatrop asks for: dynamics of an interval, then what else constrains its first node.
+        later = ca.vec(ca.vertcat(gaps[:, 1:], clear[:, :-1]))
+        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, later, clear[:, -1])
+        dynamics, first, clearance = constraint_rows(N, count)
+        self._equality = np.ones(g.shape[0], bool)
+        self._equality[(clearance[:, None] + np.arange(count)).ravel()] = False
+
+        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.shape[0])
+        gradient, H = hessian(self.stages, x, parameters, N, lam_f, lam_g, self.structure.perception)
+        jac_g = ca.Function("nlp_jac_g", [x, p], [g, jacobian(self.stages, x, parameters, N)], ["x", "p"], ["g", "jac_g_x"])
+        if self.structure.solver == "fatrop":
+            hess_l = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [gradient, H], ["x", "p", "lam_f", "lam_g"],
+                                 ["grad_gamma_x", "hess_gamma_x_x"])
+            options = {"structure_detection": "auto", "equality": self._equality.tolist(), "fatrop.print_level": 0}
+        else:
+            hess_l = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [ca.triu(H)], ["x", "p", "lam_f", "lam_g"],
+                                 ["triu_hess_gamma_x_x"])
+            options = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
+        name = self.structure.solver
+        options |= {"print_time": False, "expand": False, "error_on_fail": False, "calc_lam_p": False,
+                    "cache": {"nlp_jac_g": jac_g, "nlp_hess_l": hess_l},
+                    f"{name}.tol": self.tolerance, f"{name}.max_iter": self.max_iterations, **self._start_options(name)}
+        self._solver = ca.nlpsol("powerline", name, {"x": x, "f": cost, "g": g, "p": p}, options)
+
+    def _start_options(self, name: str) -> dict[str, float]:
+        """How to begin from a good guess: with a small barrier, and without pushing it far off its active bounds."""
+        if self.barrier is None:
+            return {}
+        return {f"{name}.mu_init": self.barrier, f"{name}.bound_push": self.push, f"{name}.bound_frac": self.push}
+
+    def _bounds(self, numbers: Numbers) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the variables; T is bounded at the first node only, for it is the same at all."""
+        N = self.structure.intervals
+        low, high = np.full((N + 1, STRIDE), -_FREE), np.full((N + 1, STRIDE), _FREE)
+        low[1:, 2] = numbers.height_min
+        low[1:, 10:13], high[1:, 10:13] = -numbers.body_rate, numbers.body_rate
+        low[1:, 13:17], high[1:, 13:17] = numbers.thrust
+        low[0, STATES], high[0, STATES] = numbers.duration
+        low[:, STAGE_STATES:], high[:, STAGE_STATES:] = -1.0, 1.0
+        return low.ravel()[:-INPUTS], high.ravel()[:-INPUTS]
+
+    def defects_of(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Error of the problem's integrator along a trajectory: a four times finer step minus its own, shape (N, 18).
+
+        Two RK4 steps per interval drift by millimetres until the end. The error hardly changes between neighbouring
+        trajectories: added as a constant in the next solve, it is gone from that solve's result.
+        """
+        step, N = self.stages.functions["step"], self.structure.intervals
+        coarse = step(states[:-1].T, inputs.T, 1.0 / N)
+        fine = states[:-1].T
+        for _ in range(4):
+            fine = step(fine, inputs.T, 0.25 / N)
+        return np.array(fine - coarse).T
+
+    def solve(self, numbers: Numbers) -> Solution:
+        """Solve one problem from its initial guess."""
+        N = self.structure.intervals
+        guess = np.concatenate([numbers.states, np.vstack([numbers.inputs, np.zeros(INPUTS)])], axis=1).ravel()[:-INPUTS]
+        parameters = np.concatenate([numbers.lines.ravel(), numbers.start, numbers.reference, numbers.run_weights,
+                                     numbers.end_weights, numbers.see_weights.ravel(),
+                                     numbers.defects.ravel()])
+        low, high = self._bounds(numbers)
+        begin = time.perf_counter()
+        answer = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
+                              lbg=np.where(self._equality, 0.0, numbers.clearance),
+                              ubg=np.where(self._equality, 0.0, _FREE))
+        elapsed = time.perf_counter() - begin
+        statistics = self._solver.stats()
+        found = np.concatenate([np.array(answer["x"]).ravel(), np.zeros(INPUTS)]).reshape(N + 1, STRIDE)
+        return Solution(found[:, :STAGE_STATES], found[:-1, STAGE_STATES:], bool(statistics["success"]),
+                        str(statistics.get("return_status", statistics.get("unified_return_status", ""))),
+                        float(answer["f"]), int(statistics["iter_count"]), elapsed)

@@ -1,0 +1,114 @@
+"""What a powerline plan is asked for, and the pose at which the vehicle grips. [P:V-A]"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.errors import PlanningRefusal
+from perch_core.lines import Segment
+
+E3 = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class PerchPose:
+    """Where the vehicle shall come to rest; its yaw about b3 is free.
+
+    Attributes:
+        p_WB: position of the centre of mass [m], shape (3,).
+        s3_W: wanted direction of b3, unit, shape (3,).
+        v_W: wanted velocity [m/s], shape (3,).
+    """
+
+    p_WB: np.ndarray
+    s3_W: np.ndarray
+    v_W: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @classmethod
+    def at(cls, p_WB: np.ndarray, q_WB: np.ndarray, v_W: np.ndarray | None = None) -> PerchPose:
+        """From a full pose (quaternion xyzw); of its attitude only b3 counts, as the gripper may turn about it."""
+        p_WB, q_WB = np.array(p_WB, float), np.array(q_WB, float)
+        norm = np.linalg.norm(q_WB)
+        if not abs(norm - 1) < 1e-2:
+            raise PlanningRefusal("bad_input", "perch pose", -abs(norm - 1), f"perch quaternion has norm {norm:.4f}, not 1")
+        return cls(p_WB, so3.quat_to_matrix(q_WB / norm)[:, 2], np.zeros(3) if v_W is None else np.array(v_W, float))
+
+    @classmethod
+    def on_line(cls, line: Segment, point: np.ndarray, pitch: float, offset: float, side_W: np.ndarray,
+                v_W: np.ndarray | None = None) -> PerchPose:
+        """From a point of a line and a pitch about it.
+
+        b3 starts from the direction that is nearest to the vertical and square to the line, and leans by `pitch` towards
+        the side of `side_W`: 0 hangs the line under a level vehicle, pi under one that is upside down.
+
+        Args:
+            line: the line to grip.
+            point: point near it in W [m], shape (3,); its nearest point of the line counts.
+            pitch: tilt about the line, in [0, pi] [rad].
+            offset: from the wire's axis to the centre of mass along b3 [m].
+            side_W: a point in W on the side that the vehicle comes from [m], shape (3,).
+            v_W: wanted velocity at the end [m/s].
+
+        Raises:
+            PlanningRefusal: pitch out of range, not finite, or a vertical line.
+        """
+        if not 0.0 <= pitch <= np.pi + 1e-9:
+            raise PlanningRefusal("bad_input", "perch pitch", -1.0, f"perch pitch {pitch:g} rad is outside [0, pi]")
+        grip = line.closest_point(np.array(point, float))
+        up = E3 - (E3 @ line.direction) * line.direction
+        if np.linalg.norm(up) < 0.1:
+            raise PlanningRefusal("bad_input", "perch pitch", -1.0,
+                                  f"line {line.id} is vertical: a pitch about it means nothing; give a pose")
+        up = up / np.linalg.norm(up)
+        side = np.cross(line.direction, up)
+        if (np.asarray(side_W, float) - grip) @ side < 0:
+            side = -side
+        s3_W = np.cos(pitch) * up + np.sin(pitch) * side
+        return cls(grip + offset * s3_W, s3_W, np.zeros(3) if v_W is None else np.array(v_W, float))
+
+    def tilt(self) -> float:
+        """Angle of b3 from the vertical [rad]."""
+        return float(so3.angle_between(self.s3_W, E3))
+
+
+@dataclass(frozen=True)
+class PowerlineRequest:
+    """One manoeuvre to plan.
+
+    Attributes:
+        start: state, shape (17,), see `rotor_model`.
+        lines: all segments to avoid, the target among them.
+        target_line: id of the segment to perch on.
+        perch: where to come to rest; None only with `recovery_only`.
+        perception: keep the target line in view. [P:eq8-13]
+        with_recovery: append the recovery. [P:V-B]
+        recovery_only: plan a recovery from `start` alone.
+        hover: where a recovery shall tend to [m], shape (3,); the start of the perch when None.
+        solver: overrides the settings' first choice; empty: it stands.
+    """
+
+    start: np.ndarray
+    lines: tuple[Segment, ...]
+    target_line: int
+    perch: PerchPose | None = None
+    perception: bool = False
+    with_recovery: bool = True
+    recovery_only: bool = False
+    hover: np.ndarray | None = None
+    solver: str = ""
+
+    def target(self) -> Segment:
+        """The line to perch on.
+
+        Raises:
+            PlanningRefusal: the map is empty or does not know the line.
+        """
+        for line in self.lines:
+            if line.id == self.target_line:
+                return line
+        known = ", ".join(str(line.id) for line in self.lines) or "none"
+        raise PlanningRefusal("empty_map", "target line", -1.0,
+                              f"target line {self.target_line} is not in the map (lines: {known}); map the lines first")

@@ -1,0 +1,106 @@
+"""The two-phase solve: a loose first answer with the paper's end weights, then the end pinned down from there.
+
+The paper's end weights leave up to 29 mm at the perch. Weights 300 times as large leave microns, but from a cold start the
+solver needs twice the iterations; from the loose answer of the first phase it needs a dozen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from perch_core.rotor_model import RotorModel
+from perch_core.vehicle import GRAVITY, Vehicle
+from perch_planner.powerline import compiled
+from perch_planner.powerline.nlp import Numbers, Problem, Solution, Structure
+from perch_planner.powerline.settings import PerceptionWeights, PerchWeights
+from perch_planner.powerline.stage_functions import StageFunctions, StageModel, stage_functions
+
+# Phase: tolerance, first barrier parameter, push off active bounds. The nearer the guess, the smaller the latter two.
+PHASES = {
+    "first": {"tolerance": 1e-2},
+    "second": {"tolerance": 1e-5, "barrier": 1e-3, "push": 1e-4},
+    "polish": {"tolerance": 1e-5, "barrier": 1e-5, "push": 1e-7},
+}
+
+
+@dataclass
+class Solver:
+    """Solvers of one vehicle, built when first needed and kept.
+
+    Attributes:
+        vehicle: body, limits, cameras.
+        gravity: [m/s^2].
+        camera: name of the camera that the perception costs are about.
+    """
+
+    vehicle: Vehicle
+    gravity: float = GRAVITY
+    camera: str = "front"
+    model: RotorModel = field(init=False)
+    compiled: bool = field(init=False)
+    _stages: StageFunctions = field(init=False, repr=False)
+    _problems: dict = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.model = RotorModel.of(self.vehicle, self.gravity)
+        stage = StageModel.of(self.model, self.vehicle.thrust_rate_max, self.vehicle.body_radii, self.vehicle.mounts[self.camera])
+        self._stages, self.compiled = compiled.load(stage_functions(stage))
+
+    def problem(self, structure: Structure, phase: str) -> Problem:
+        """The solver of a structure and phase; building one takes about 50 ms."""
+        key = (structure, phase)
+        if key not in self._problems:
+            self._problems[key] = Problem(structure, self._stages, **PHASES[phase])
+        return self._problems[key]
+
+    def solve(self, structure: Structure, numbers: Numbers, pinned_end: np.ndarray, start_phase: str = "first") -> Solution:
+        """All phases that a guess of this quality needs.
+
+        Args:
+            structure: which solver.
+            numbers: the problem with the end weights of the first phase and no defects.
+            pinned_end: end weights of the later phases, shape (6,).
+            start_phase: "first" for a cold guess, "second" for the solution of a similar problem, "polish" for one that
+                is right but for the integrator's error.
+
+        Returns:
+            The last phase's solution, with iterations and time of all; where the first phase diverges, its own.
+        """
+        iterations, time = 0, 0.0
+        if start_phase == "first":
+            first = self.problem(structure, "first").solve(numbers)
+            iterations, time = first.iterations, first.time
+            if not np.all(np.isfinite(first.states)):
+                return first
+            numbers = replace(numbers, states=first.states, inputs=first.inputs)
+        last = self.problem(structure, "polish" if start_phase == "polish" else "second")
+        defects = last.defects_of(numbers.states, numbers.inputs)
+        found = last.solve(replace(numbers, end_weights=pinned_end, defects=defects))
+        return replace(found, iterations=iterations + found.iterations, time=time + found.time)
+
+
+def run_weights(weights: PerchWeights, ramp: float, thrust_rate_max: float, intervals: int) -> np.ndarray:
+    """Running weights for the stage functions, shape (3,).
+
+    Sums over nodes grow with N; the weights are the authors' for N = 30 and are scaled to mean the same for every N.
+    """
+    share = 30.0 / intervals
+    return np.array([weights.thrust * share, weights.rate * share, ramp or thrust_rate_max / (2 * intervals)])
+
+
+def end_weights(weights: PerchWeights) -> np.ndarray:
+    """End weights for the stage functions, shape (6,)."""
+    return np.array([weights.xy_end, weights.z_end, weights.tilt_end, weights.v_end, weights.w_end, weights.thrust_end])
+
+
+def see_weights(weights: PerceptionWeights, intervals: int) -> np.ndarray:
+    """Perception weights of every node with their exponential decay, shape (N, 3). [P:V-A]
+
+    The camera cannot see the line at the end of the perch, so that neither the cost nor the constraints may rule there.
+    """
+    k = np.arange(intervals) * 30.0 / intervals
+    soft = np.exp(-weights.soft_decay * np.maximum(0.0, k - 30 * weights.soft_until))
+    cost = np.exp(-weights.reprojection_decay * k)
+    return np.stack([weights.reprojection * cost, weights.cheirality * soft, weights.visibility * soft], axis=1) * 30.0 / intervals

@@ -1,0 +1,194 @@
+"""The NLP's stage functions as CasADi expressions: dynamics, running, perception and end costs, clearance. [P:eq14-15]
+
+Each is one small function of one stage. The solver's per-stage structure lets them be compiled once and called N times,
+which makes the compile short (the whole NLP unrolled takes seven times as long) and the solve fast. Their derivatives are
+written out here as well: put together by `derivatives`, they cost a fifth of what CasADi's own chain rule through N
+compiled calls does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from perch_core import lines, rotor_model
+from perch_core.camera import CameraMount
+from perch_core.components import Scalar, Vector, components, dot, matrix_of
+from perch_core.rotor_model import INPUTS, P, Q, STATES, THRUST, V, W, RotorModel
+from perch_core.so3 import quat_from_matrix
+
+STAGE_STATES = STATES + 1  # the duration T rides along as a constant state
+SUB_STEPS = 2  # one RK4 step per T/30 drifts up to 22 mm when re-integrated; two stay below 0.7 mm
+LINE_SIZE = 8  # centre (3), direction (3), radius, half length
+RUN_WEIGHTS, SEE_WEIGHTS, END_WEIGHTS, REFERENCE = 3, 3, 6, 12
+
+
+@dataclass(frozen=True)
+class StageModel:
+    """What the stage functions depend on besides their arguments.
+
+    Attributes:
+        rotor: the 17-state model.
+        thrust_rate_max: scale of the inputs: u = thrust_rate_max * mu with mu in [-1, 1] [N/s].
+        body_radii: ellipsoid that contains the vehicle [m].
+        p_BC, q_BC: place of the camera on the body [m, xyzw].
+    """
+
+    rotor: RotorModel
+    thrust_rate_max: float
+    body_radii: tuple[float, float, float]
+    p_BC: tuple[float, float, float]
+    q_BC: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, rotor: RotorModel, thrust_rate_max: float, body_radii: Vector, camera: CameraMount) -> StageModel:
+        """The stage model of a vehicle's parts."""
+        q_BC = quat_from_matrix(camera.R_BC)
+        return cls(rotor, float(thrust_rate_max), tuple(map(float, body_radii)),
+                   tuple(float(v) for v in camera.p_BC), tuple(float(v) for v in q_BC))
+
+
+def _step(model: StageModel, x: Vector, u: Vector, unit_step: Scalar) -> Vector:
+    """Next node: [P:eq14d], the dynamics scaled by the duration T and stepped by 1/N of a unit horizon."""
+    interval = x[STATES] * unit_step
+    rates = tuple(model.thrust_rate_max * value for value in u)
+    state = x[:STATES]
+    for _ in range(SUB_STEPS):
+        state = rotor_model.rk4(model.rotor, state, rates, interval / SUB_STEPS)
+    return (*state, x[STATES])
+
+
+def _run(model: StageModel, x: Vector, u: Vector, weights: Vector) -> Scalar:
+    """Running cost of thrust and body rate. [P:eq15]
+
+    weights: thrust, body rate, ramp. The impulse is N times the paper's gamma T / N + u T^2 / (2 N^2), that is
+    gamma T + ramp mu T^2 with ramp = thrust_rate_max / (2 N); the authors' code has ramp = 1/2 in its place.
+    """
+    T = x[STATES]
+    impulse = tuple(gamma * T + weights[2] * mu * T * T for gamma, mu in zip(x[THRUST], u))
+    return weights[0] * dot(impulse, impulse) + weights[1] * dot(x[W], x[W])
+
+
+def _hinge_squared(h: Scalar) -> Scalar:
+    """Penalty of a soft constraint h > 0: exactly what a slack with a quadratic cost gives, without the slack."""
+    violated = ca.fmax(0, -h)
+    return violated * violated
+
+
+def _see(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
+    """Perception cost and soft constraints of the target line. [P:eq9, P:eq12, P:eq13, P:eq14h, P:eq14i]
+
+    [P:eq13] is a quotient with a pole where the camera looks along the line, and its arctan (the authors' remedy) has
+    no slope there, so that a solver started so never turns. With s the place of the centred point along the line, in
+    half lengths, the constraint says s^2 < 1; the angle of (d3D_z, d3D_z s) says the same, falls linearly as the
+    camera turns, and needs no quotient.
+    """
+    o_C, l_C = lines.line_in_camera(x[P], x[Q], line[0:3], line[3:6], model.p_BC, model.q_BC)
+    n_I, l_I = lines.image_line(o_C, l_C)
+    p2D, d3D = lines.centre_points(n_I, l_I)
+    in_front = lines.cheirality(n_I, l_I)
+    along = (dot(p2D, l_I) - in_front * dot(o_C, l_I)) / line[7]  # = d3D_z s, for |l_C| = 1
+    beside = ca.fabs(ca.atan2(along, in_front)) - np.pi / 4
+    error = lines.reprojection_error(n_I)
+    return (weights[0] * error * error + weights[1] * _hinge_squared(in_front)
+            + weights[2] * _hinge_squared(-beside))
+
+
+def _end(model: StageModel, x: Vector, reference: Vector, weights: Vector) -> Scalar:
+    """Terminal cost: position, tilt, velocity, body rate, rotor thrust. [P:eq15]
+
+    The orientation error with free yaw is the direction of thrust, R e3 - s3: unlike the paper's Euler angles it has no
+    singular attitude. The thrust term (zero in the paper) lets a recovery end in hover.
+
+    Args:
+        model: constants.
+        x: last node.
+        reference: p (3), s3 (3), v (3), w (3).
+        weights: horizontal position, height, tilt, velocity, body rate, rotor thrust.
+    """
+    def off(values: Vector, first: int) -> Scalar:
+        error = tuple(value - reference[first + i] for i, value in enumerate(values))
+        return dot(error, error)
+
+    b3_W = tuple(row[2] for row in matrix_of(x[Q]))
+    idle = tuple(gamma - model.rotor.hover for gamma in x[THRUST])
+    height = x[2] - reference[2]
+    return (weights[0] * off(x[0:2], 0) + weights[1] * height * height + weights[2] * off(b3_W, 3)
+            + weights[3] * off(x[V], 6) + weights[4] * off(x[W], 9) + weights[5] * dot(idle, idle))
+
+
+def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
+    """[P:eq7] divided by |o x l|^2 + |l|^2 + k: (d^2 - 1) / (d^2 + 1) of the scaled distance d.
+
+    The sign is the paper's, but the value is dimensionless, between -1 and 1, and its slope at contact is 1, so that
+    a solver's tolerance and a margin mean the same everywhere.
+    """
+    radii = tuple(r + line[6] for r in model.body_radii)
+    h = lines.segment_clearance(x[P], x[Q], line[0:3], line[3:6], line[7], line[6], model.body_radii)
+    _, l = lines.scaled_line(x[P], x[Q], line[0:3], line[3:6], radii)
+    return h / (h + 2 * dot(l, l))
+
+
+@dataclass(frozen=True)
+class StageFunctions:
+    """The functions of one stage with their derivatives as flat vectors of nonzeros, and where these belong.
+
+    Attributes:
+        functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, weights)`, `see(x, line, weights)`,
+            `end(x, reference, weights)` -> cost; `clear(x, line)` -> constraint, with x of 18 values (17 states, T) and u
+            of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f
+            and then the nonzeros of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
+        jacobian, hessian: sparsity of these nonzeros by base name; the Hessian's is an upper triangle.
+    """
+
+    functions: dict[str, ca.Function]
+    jacobian: dict[str, ca.Sparsity]
+    hessian: dict[str, ca.Sparsity]
+
+    def with_functions(self, functions: dict[str, ca.Function]) -> StageFunctions:
+        """The same with other bodies under the same names (compiled ones)."""
+        return StageFunctions(functions, self.jacobian, self.hessian)
+
+
+def stage_functions(model: StageModel) -> StageFunctions:
+    """Build the stage functions and their derivatives as expressions."""
+    x, u = ca.SX.sym("x", STAGE_STATES), ca.SX.sym("u", INPUTS)
+    line, reference = ca.SX.sym("line", LINE_SIZE), ca.SX.sym("reference", REFERENCE)
+    unit_step = ca.SX.sym("unit_step")
+    run, see, end = (ca.SX.sym(name, size) for name, size in
+                     (("run", RUN_WEIGHTS), ("see", SEE_WEIGHTS), ("end", END_WEIGHTS)))
+    xs, us, ls, rs = map(components, (x, u, line, reference))
+    rw, sw, ew = map(components, (run, see, end))
+    expressions = {
+        "step": ([x, u], [unit_step], ca.vertcat(*_step(model, xs, us, unit_step))),
+        "run": ([x, u], [run], _run(model, xs, us, rw)),
+        "see": ([x], [line, see], _see(model, xs, ls, sw)),
+        "end": ([x], [reference, end], _end(model, xs, rs, ew)),
+        "clear": ([x], [line], _clear(model, xs, ls)),
+    }
+    functions, jacobian, hessian = {}, {}, {}
+    for name, (variables, parameters, value) in expressions.items():
+        z, inputs = ca.vertcat(*variables), variables + parameters
+        lam = ca.SX.sym("lam", value.shape[0])
+        J = ca.jacobian(value, z)
+        weighted = ca.dot(lam, value)
+        gradient = ca.gradient(weighted, z)
+        H = ca.triu(ca.hessian(weighted, z)[0])
+        differentiable = [i < len(variables) for i in range(len(inputs))]
+        functions[name] = ca.Function(name, inputs, [value], {"is_diff_in": differentiable})
+        functions[f"{name}_jac"] = ca.Function(f"{name}_jac", inputs, [_nonzeros(J)])
+        functions[f"{name}_hess"] = ca.Function(f"{name}_hess", [*inputs, lam],
+                                                ca.cse([ca.vertcat(ca.densify(gradient), _nonzeros(H))]))
+        jacobian[name], hessian[name] = J.sparsity(), H.sparsity()
+    return StageFunctions(functions, jacobian, hessian)
+
+
+def _nonzeros(matrix: ca.SX) -> ca.SX:
+    return ca.vertcat(*matrix.nonzeros())
+
+
+def line_parameters(segment: lines.Segment, radius_reduction: float = 0.0) -> np.ndarray:
+    """A segment as the stage functions take it, shape (8,)."""
+    return np.array([*segment.centre, *segment.direction, segment.radius - radius_reduction, segment.half_length])

@@ -1,0 +1,134 @@
+"""Requests that cannot be planned, refused before any solver runs, with the cause and what to change."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.errors import PlanningRefusal
+from perch_core.lines import Segment, scaled_clearance, segment_distance
+from perch_core.rotor_model import P, Q, THRUST, V, W
+from perch_core.vehicle import Vehicle
+from perch_planner.powerline.request import PowerlineRequest
+from perch_planner.powerline.settings import PowerlineSettings
+
+END_TRIM = 0.1  # neighbours of one cable touch at their ends: that much of each end does not count as crossing [m]
+SPEED_MAX = 10.0  # no start of a perch is faster [m/s]
+
+
+def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+    """Refuse a request that no plan can answer.
+
+    Raises:
+        PlanningRefusal: code bad_input, empty_map, start_invalid or perch_in_collision; the message names the value.
+    """
+    _finite(request)
+    if request.recovery_only:
+        _start(request, vehicle, settings, touching_allowed=True)
+        return
+    target = request.target()
+    _crossing(request.lines)
+    _start(request, vehicle, settings)
+    _perch(request, target, vehicle, settings)
+    _ahead(request, target, vehicle, settings)
+
+
+def _refuse(code: str, constraint: str, margin: float, message: str) -> None:
+    raise PlanningRefusal(code, constraint, margin, message)
+
+
+def _finite(request: PowerlineRequest) -> None:
+    start = np.asarray(request.start, float)
+    if start.shape != (17,):
+        _refuse("bad_input", "start state", -1.0, f"start state has shape {start.shape}, needs (17,)")
+    values = {"start state": start}
+    if request.perch is not None:
+        values |= {"perch position": request.perch.p_WB, "perch direction": request.perch.s3_W, "end velocity": request.perch.v_W}
+    elif not request.recovery_only:
+        _refuse("bad_input", "perch pose", -1.0, "no perch pose is given")
+    for name, value in values.items():
+        if not np.all(np.isfinite(value)):
+            _refuse("bad_input", name, -1.0, f"{name} {np.asarray(value).tolist()} is not finite")
+    norm = float(np.linalg.norm(start[Q]))
+    if abs(norm - 1) > 1e-2:
+        _refuse("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
+
+
+def _crossing(lines: tuple[Segment, ...]) -> None:
+    trimmed = {line.id: Segment(line.centre, line.direction, max(line.half_length - END_TRIM, 1e-3), line.radius, line.id)
+               for line in lines}
+    if len(trimmed) < len(lines):
+        _refuse("bad_input", "line ids", -1.0, "two lines have the same id")
+    for a, b in combinations(trimmed.values(), 2):
+        gap = segment_distance(a, b) - a.radius - b.radius
+        if gap < 0:
+            _refuse("bad_input", "lines cross", gap,
+                    f"lines {a.id} and {b.id} cross: their axes come within {segment_distance(a, b):.3f} m; the map is wrong")
+
+
+def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings, touching_allowed: bool = False) -> None:
+    start = request.start
+    if start[2] < settings.height_min:
+        _refuse("start_invalid", "height [P:eq14e]", start[2] - settings.height_min,
+                f"start height {start[2]:.3f} m is below height_min {settings.height_min:g} m; climb first")
+    rate, speed = float(np.linalg.norm(start[W])), float(np.linalg.norm(start[V]))
+    if rate > vehicle.body_rate_max:
+        _refuse("start_invalid", "body rate", vehicle.body_rate_max - rate,
+                f"start body rate {rate:.2f} rad/s is above {vehicle.body_rate_max:g} rad/s")
+    if speed > SPEED_MAX:
+        _refuse("start_invalid", "speed", SPEED_MAX - speed, f"start speed {speed:.2f} m/s is above {SPEED_MAX:g} m/s")
+    low, high = start[THRUST].min(), start[THRUST].max()
+    if low < -1e-6 or high > 1.05 * vehicle.thrust_max:
+        _refuse("start_invalid", "rotor thrust [P:eq14f]", min(low, vehicle.thrust_max - high),
+                f"start rotor thrusts {low:.2f} .. {high:.2f} N are outside [0, {vehicle.thrust_max:.2f}] N")
+    if touching_allowed:  # a recovery starts at a line
+        return
+    for line in request.lines:
+        clearance = float(scaled_clearance(start[None, P], start[None, Q], line, vehicle.body_radii)[0])
+        if clearance < 0:
+            _refuse("start_invalid", "clearance [P:eq14j]", clearance,
+                    f"line {line.id} is nearer than the body at the start: scaled distance {1 + clearance:.2f} < 1; move away first")
+
+
+def _perch(request: PowerlineRequest, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+    perch = request.perch
+    if abs(np.linalg.norm(perch.s3_W) - 1) > 1e-3:
+        _refuse("bad_input", "perch direction", -1.0, "the wanted direction of b3 is not a unit vector")
+    if perch.p_WB[2] < settings.height_min:
+        _refuse("infeasible", "height [P:eq14e]", perch.p_WB[2] - settings.height_min,
+                f"perch height {perch.p_WB[2]:.3f} m is below height_min {settings.height_min:g} m")
+    grip = perch.p_WB - vehicle.perch_offset * perch.s3_W
+    miss = float(target.distance(grip))
+    q_WB = _attitude(perch.s3_W)
+    for line in request.lines:
+        clearance = float(scaled_clearance(perch.p_WB[None], q_WB[None], line, vehicle.body_radii)[0])
+        if clearance < 0:
+            _refuse("perch_in_collision", "clearance [P:eq14j]", clearance,
+                    f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
+    if miss > settings.gripper_error_max:
+        _refuse("bad_input", "gripper", settings.gripper_error_max - miss,
+                f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {settings.gripper_error_max:g} m)")
+
+
+def _attitude(s3_W: np.ndarray) -> np.ndarray:
+    """Any attitude with that b3: the body's ellipsoid is round about it for every vehicle whose x and y radii are equal."""
+    half = np.array([0.0, 0.0, 1.0]) + s3_W
+    if np.linalg.norm(half) < 1e-6:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    half /= np.linalg.norm(half)
+    return np.array([*np.cross([0.0, 0.0, 1.0], half), half[2]])
+
+
+def _ahead(request: PowerlineRequest, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+    mount = vehicle.mounts.get(settings.camera)
+    if mount is None:
+        _refuse("bad_input", "camera", -1.0, f"vehicle {vehicle.name} has no camera {settings.camera!r}")
+    axis_W = so3.quat_to_matrix(request.start[Q]) @ mount.R_BC[:, 2]
+    way = target.closest_point(request.perch.p_WB) - request.start[P]
+    bearing = float(np.degrees(so3.angle_between(axis_W, way)))
+    if bearing > settings.bearing_max_deg:
+        _refuse("bad_input", "line ahead", settings.bearing_max_deg - bearing,
+                f"line {target.id} is behind the vehicle: {bearing:.0f} deg from the camera's axis "
+                f"(allowed {settings.bearing_max_deg:g} deg); turn to face it first")
