@@ -96,6 +96,11 @@ class LockstepMaster:
         """Whether the present step waits for its motor command."""
         return self._awaited is not None
 
+    @property
+    def led(self) -> bool:
+        """Whether steps wait for motor commands at all."""
+        return self._controller
+
     def has_reported(self, node: str) -> bool:
         """Whether a participant has finished any work in this run."""
         return self._slow[node].reported

@@ -72,6 +72,11 @@ class LockstepWatch:
         self._progress = time.monotonic()
         return self._master.begin(stamp)
 
+    @property
+    def led(self) -> bool:
+        """Whether the flight waits for motor commands; without them nothing slows it."""
+        return self._master.led
+
     # -- may it go on? -----------------------------------------------------------------------------------------------
 
     def may_advance(self) -> bool:

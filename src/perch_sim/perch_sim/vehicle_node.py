@@ -65,7 +65,10 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self.create_timer(1.0, self._diagnose, clock=steady)
         self._watch: LockstepWatch | None = None
         self._pacing: Pacing | None = None
+        self._allowance = 0                    # steps that the wall clock allows a flight without controller
         if params.lockstep:
+            self._idle_clock = self.create_timer(PERIOD * 1e-9, self._advance, clock=steady)
+            self._idle_clock.cancel()
             self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps],
                                         params.lockstep_timeout, params.start_timeout)
             self.create_subscription(StepReport, "step_report", self._receive_report, qos.GATED)
@@ -113,7 +116,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         """One transition; false when something has to be waited for."""
         watch = self._watch
         if self._output is None:
-            if not watch.may_advance():
+            if not watch.may_advance() or not self._in_time():
                 return False
             self._times.end("waiting")
             self._output = self._simulation.advance()
@@ -132,6 +135,23 @@ class VehicleNode(PerchNode[VehicleParameters]):
                 watch.trigger(trigger.node, stamp, stamp + round(trigger.latency * 1e9))
         released = watch.begin(stamp)
         self._publish(frames, [Release(topic=topic, count=count) for topic, count in released.items()])
+        return True
+
+    def _in_time(self) -> bool:
+        """A flight that no controller leads keeps to the wall clock instead of running away."""
+        if self._watch.led:
+            if self._pacing is not None:
+                self._pacing = None
+                self._idle_clock.cancel()
+            return True
+        if self._pacing is None:
+            self._pacing = Pacing(PERIOD, time.monotonic_ns())
+            self._idle_clock.reset()
+        if self._allowance == 0:
+            self._allowance = self._pacing.due(time.monotonic_ns())
+        if self._allowance == 0:
+            return False
+        self._allowance -= 1
         return True
 
     def _arrived(self, stamp: int) -> list[tuple[str, Delivery]] | None:
@@ -214,7 +234,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
                                   "motors_timed_out": self._simulation.motors.timed_out,
                                   "crashed": self._simulation.plant.contact.crashed}
         level, message = 0, "ok"
-        if self._pacing is not None:
+        if self._watch is None:
             values |= {"deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
         elif self._watch.waiting:
             message = f"waiting for {self._watch.waiting}"
