@@ -170,6 +170,15 @@ def test_standing_still_is_not_blurred():
                                   renderer.render([pose], np.random.default_rng(0)))
 
 
+def test_a_hall_of_60_m_needs_no_more_memory_than_a_room():
+    def texels(scene: Scene) -> float:
+        return sum(4 * face.half[0] * face.half[1] / face.texel**2 for face in scene.faces() if face.kind == "room")
+
+    hall = make_scene(room_low=[-30, -20, 0], room_high=[30, 20, 15])
+    assert texels(hall) <= 25.1e6
+    assert texels(WALL) <= texels(hall)
+
+
 def test_scenes_that_cannot_be_are_refused():
     with pytest.raises(ConfigError, match="room_high"):
         Scene([0, 0, 0], [1, 1, 0])

@@ -15,6 +15,7 @@ from perch_core.tag_board import TagBoard
 
 PAD_THICKNESS = 2e-3  # the pad lies in the perching plane, the panel that carries it just behind [m]
 FLOOR_TEXEL, WALL_TEXEL, PANEL_TEXEL = 2.5e-3, 4e-3, 2.5e-3  # the floor is seen from the closest [m]
+ROOM_TEXELS = 25e6  # a large room gets coarser textures, so that memory and start stay small
 PAD_TEXELS_PER_MODULE = 32  # of a tag's 8 x 8 modules: every printed edge falls on a texel's border
 
 
@@ -142,13 +143,16 @@ def _panel_faces(panel: PerchSurface, depth: float, moving: bool) -> list[Face]:
 def _room_faces(low: np.ndarray, high: np.ndarray) -> list[Face]:
     """Floor, ceiling and four walls, normals inward."""
     centre, half = (low + high) / 2, (high - low) / 2
+    length, width, height = high - low
+    walls = length * width + 2 * (length + width) * height
+    coarser = np.sqrt(max(1.0, (length * width / FLOOR_TEXEL**2 + walls / WALL_TEXEL**2) / ROOM_TEXELS))
     x, y, z = np.eye(3)
     layout = ((x, y, 2, -1), (x, -y, 2, +1), (-y, z, 0, +1), (y, z, 0, -1), (x, z, 1, +1), (-x, z, 1, -1))
     faces = []
     for right, up, axis, side in layout:
         where = centre.copy()
         where[axis] += side * half[axis]
-        texel = FLOOR_TEXEL if axis == 2 and side < 0 else WALL_TEXEL
+        texel = coarser * (FLOOR_TEXEL if axis == 2 and side < 0 else WALL_TEXEL)
         faces.append(Face(where, right, up, (abs(right) @ half, abs(up) @ half), "room", texel, bounded=False))
     return faces
 

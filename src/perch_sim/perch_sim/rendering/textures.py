@@ -8,7 +8,7 @@ import numpy as np
 from perch_core.tag_board import TagBoard
 
 MEANS = (105, 150)  # range of a texture's mean grey level under full light: walls differ
-SCALES = (0.010, 0.035, 0.12, 0.4)  # sizes of the blobs [m]: some are trackable from any distance in the room
+SCALES = (0.007, 0.025, 0.09, 0.35)  # sizes of the blobs [m]: some are trackable from any distance in the room
 WEIGHTS = (0.8, 1.0, 1.0, 0.8)
 EDGE = np.clip(np.rint(128 + 100 * np.tanh((np.arange(256) - 128) / 22.0)), 0, 255).astype(np.uint8)  # blobs get edges
 WHITE, BLACK, VELCRO = 235, 20, 45  # paper, ink, hook-and-loop tape
