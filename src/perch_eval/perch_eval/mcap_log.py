@@ -82,7 +82,12 @@ class McapLog:
 
 
 def read(path: Path, topics: set[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-    """Messages of a file in the order written: topic, type, time [ns], data. A cut-off file is read as far as it goes."""
+    """Messages of a file in the order written: topic, type, time [ns], data.
+
+    A cut-off file is read as far as it goes; a flight that broke off before its first message has no file at all.
+    """
+    if not path.exists():
+        return
     with open(path, "rb") as file:
         try:
             for schema, channel, message in NonSeekingReader(file).iter_messages(topics=list(topics) if topics else None,
