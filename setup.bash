@@ -2,6 +2,8 @@
 # It puts the virtual environment, the built workspace and every node's executable on the path.
 # Made for bash; it needs a finished set-up (python3 scripts/setup.py, or any other script here).
 
+case $- in *u*) _perch_nounset=1; set +u ;; esac  # activate and colcon read variables that are not set
+
 _perch_root="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
 
 _perch_prepend() {  # NAME FOLDER: put FOLDER first in the path variable NAME, once
@@ -12,7 +14,8 @@ _perch_prepend() {  # NAME FOLDER: put FOLDER first in the path variable NAME, o
   export "$1=$2${rest:+:$rest}"
 }
 
-if { [ ! -f "$_perch_root/install/setup.bash" ] && [ -z "${PERCH_WITHOUT_WORKSPACE:-}" ]; } || [ ! -f "$_perch_root/.venv/bin/activate" ]; then
+if [ ! -f "$_perch_root/.venv/bin/activate" ] ||
+  { [ ! -f "$_perch_root/install/setup.bash" ] && [ -z "${PERCH_WITHOUT_WORKSPACE:-}" ]; }; then
   echo "perch is not set up yet: run   python3 $_perch_root/scripts/setup.py   and source this file again" >&2
   unset -f _perch_prepend
   unset _perch_root
@@ -52,3 +55,7 @@ export OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 unset -f _perch_prepend
 unset _perch_root _perch_folder
+if [ -n "${_perch_nounset:-}" ]; then
+  unset _perch_nounset
+  set -u
+fi

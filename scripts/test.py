@@ -23,7 +23,10 @@ EXAMPLES = """examples:
 def main() -> int:
     """Run pytest; 0 all passed, 1 some failed, 2 the caller's mistake."""
     parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
     arguments, for_pytest = parser.parse_known_args()

@@ -79,7 +79,7 @@ class Step:
                 _let_finish(process)
                 raise
         if process.returncode:
-            raise SetupError(_failure(command, process.returncode, lines, file), FAILED)
+            raise SetupError(_failure(log, process.returncode, lines, file), FAILED)
 
     def _write(self, detail: str, final: bool = False) -> None:
         self._shown = time.monotonic()
@@ -99,7 +99,6 @@ def _let_finish(process: subprocess.Popen) -> None:
         process.kill()
 
 
-def _failure(command: Sequence[object], code: int, lines: Sequence[str], log: Path) -> str:
+def _failure(tool: str, code: int, lines: Sequence[str], log: Path) -> str:
     shown = "\n".join(f"    {line}" for line in lines)
-    tool = " ".join(str(word) for word in command[:4])
-    return f"'{tool} ...' failed (exit code {code}). Its last lines:\n{shown}\nAll of them: {log}"
+    return f"set-up failed in step {tool} (exit code {code}). Its last lines:\n{shown}\nAll of them: {log}"

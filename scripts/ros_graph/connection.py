@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,7 +10,6 @@ from typing import Any, TypeVar
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
@@ -24,26 +24,33 @@ _SETTLED_S = 0.7
 class Visit:
     """A hidden node, and what is needed to wait for answers with it."""
 
-    def __init__(self, node: Node, executor: EventsExecutor, context: Context) -> None:
+    def __init__(self, node: Node, executor: EventsExecutor) -> None:
         self.node = node
         self._executor = executor
-        self._context = context
+        self._interrupted = False
+
+    def interrupt(self) -> None:
+        """End the present wait. (An exception out of a signal handler would end in the executor's callbacks.)"""
+        self._interrupted = True
 
     def spin_until(self, done: Callable[[], bool], timeout: float | None = None) -> bool:
         """Handle what arrives until `done`.
 
         Returns:
             Whether `done` came before the timeout.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C.
         """
         last = None if timeout is None else time.monotonic() + timeout
-        while self._context.ok() and not done():
+        while not done():
+            if self._interrupted:
+                self._interrupted = False
+                raise KeyboardInterrupt
             if last is not None and time.monotonic() > last:
                 return False
-            try:
-                self._executor.spin_once(timeout_sec=0.05)
-            except ExternalShutdownException:
-                break
-        return done()
+            self._executor.spin_once(timeout_sec=0.05)
+        return True
 
     def answer(self, future: Future, what: str, timeout: float = 10.0) -> Any:
         """The result of a future.
@@ -100,9 +107,13 @@ def visit() -> Iterator[Visit]:
     )
     executor = EventsExecutor(context=context)
     executor.add_node(node)
+    guest = Visit(node, executor)
+    before = {number: signal.signal(number, lambda *_: guest.interrupt()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield Visit(node, executor, context)
+        yield guest
     finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
         node.destroy_node()
         context.try_shutdown()
 

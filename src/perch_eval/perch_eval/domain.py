@@ -17,13 +17,13 @@ USABLE = range(43, 102)
 
 
 @contextlib.contextmanager
-def reserved_domain(candidates: Iterable[int] = USABLE, folder: Path | None = None) -> Iterator[int]:
+def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None = None) -> Iterator[int]:
     """A domain id that no other reservation on this machine holds.
 
     The kernel gives it back when the process ends, however it ends.
 
     Args:
-        candidates: ids to choose from, best first.
+        candidates: ids to choose from, best first; by default all usable ones.
         folder: where the lock files lie; by default the machine's folder for temporary files.
 
     Raises:
@@ -31,7 +31,7 @@ def reserved_domain(candidates: Iterable[int] = USABLE, folder: Path | None = No
     """
     folder = folder or Path(tempfile.gettempdir()) / f"perch-domains-{os.getuid()}"
     folder.mkdir(exist_ok=True)
-    for candidate in candidates:
+    for candidate in _spread() if candidates is None else candidates:
         with (folder / str(candidate)).open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -47,3 +47,9 @@ def free_domain() -> int:
     stack = contextlib.ExitStack()
     atexit.register(stack.close)
     return stack.enter_context(reserved_domain())
+
+
+def _spread() -> list[int]:
+    """The usable ids, from another one on in each process: people who choose by hand begin with the small ones."""
+    start = os.getpid() % len(USABLE)
+    return [*USABLE[start:], *USABLE[:start]]

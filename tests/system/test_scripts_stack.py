@@ -1,0 +1,115 @@
+"""start_stack.py and run_node.py: what a user sees, also when things go wrong."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+
+import psutil
+import pytest
+from perch_eval.domain import reserved_domain
+from system.scripts import PATIENCE, run_script, start_script
+
+NODES = ("estimator", "controller")  # they wait for a vehicle that does not come: no flight is needed here
+
+
+@pytest.fixture
+def domain():
+    """A ROS domain that nobody else uses."""
+    with reserved_domain() as number:
+        yield str(number)
+
+
+@pytest.fixture
+def start(domain, tmp_path):
+    """Starts start_stack.py with some nodes and waits until it says that they are ready."""
+    processes: list[subprocess.Popen] = []
+
+    def start(*arguments: str) -> subprocess.Popen:
+        process = start_script("start_stack.py", "--only", *NODES, "--domain", domain, "--log-dir", str(tmp_path),
+                               "--ready-timeout", str(PATIENCE), *arguments)
+        processes.append(process)
+        for line in process.stdout:
+            if line.startswith("ready"):
+                return process
+        raise AssertionError(process.stderr.read())
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def children(process: subprocess.Popen) -> dict[str, psutil.Process]:
+    """The nodes that a start_stack.py has started, by name of the executable."""
+    found = {}
+    for child in psutil.Process(process.pid).children():
+        for word in child.cmdline():
+            if "/install/" in word:
+                found[os.path.basename(word)] = child
+    return found
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("mode", [[], ["--composed"]], ids=["processes", "composed"])
+def test_ready_then_stopped_without_leftovers(start, tmp_path, mode, number):
+    process = start(*mode)
+    started = children(process)
+    assert set(started) == ({"composed"} if mode else set(NODES))
+    process.send_signal(number)
+    out, error = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, error) == (0, "") and out.endswith("stopped\n")
+    assert not any(child.is_running() for child in started.values())
+    assert {file.name for file in tmp_path.glob("*.yaml")} == {f"{node}.yaml" for node in NODES}
+    logs = "".join(file.read_text() for file in tmp_path.glob("*.log"))
+    assert "Traceback" not in logs
+
+
+def test_a_killed_node_is_named_and_the_others_are_stopped(start):
+    process = start()
+    started = children(process)
+    started["estimator"].kill()
+    _, error = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert "estimator ended: killed by SIGKILL" in error
+    assert not started["controller"].is_running()
+
+
+def test_nodes_in_a_namespace_become_ready(start):
+    process = start("--namespace", "/quad1")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["--scenario", "surface_900"], "surface_900: unknown; there are: "),
+    (["--scenario", "/no/file.yaml"], "/no/file.yaml: no such file"),
+    (["--only", "pilot"], "'pilot' is not one of vehicle"),
+    (["--without", "vio_modell"], "'vio_modell' is not one of vehicle"),
+    (["--only", "estimator", "-p", "controller.type:=nmpc"], "'controller', which is not started"),
+    (["-p", "gain=2"], "expected NODE.PARAMETER:=VALUE"),
+    (["--domain", "200"], "200 is outside [0, 101]"),
+    (["--namespace", "quad1"], "must begin with '/'"),
+    (["--only", "estimator", "-p", "estimator.no_such_gain:=1"], "no_such_gain"),
+    (["--only", "estimator", "-p", "estimator.gate_probability:=7.0"], "gate_probability: 7 is outside"),
+])
+def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, domain, tmp_path):
+    more = [] if "--domain" in arguments else ["--domain", domain]
+    result = run_script("start_stack.py", *arguments, *more, "--log-dir", str(tmp_path))
+    assert result.returncode == 2
+    assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
+
+
+def test_a_single_node(domain):
+    process = start_script("run_node.py", "estimator", "--ros-args", "-p", "gate_probability:=0.5", ROS_DOMAIN_ID=domain)
+    try:
+        answer = run_script("param.py", "get", "/estimator", "gate_probability", "--spin-time", str(PATIENCE), ROS_DOMAIN_ID=domain)
+        assert (answer.returncode, answer.stdout) == (0, "0.5\n")
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0 and "Traceback" not in error
+    finally:
+        process.kill()
+    assert "'ghost' is not one of vehicle" in run_script("run_node.py", "ghost").stderr

@@ -1,0 +1,24 @@
+"""ROS domains: no two flights or tests on one machine share one."""
+
+from __future__ import annotations
+
+import pytest
+from perch_core.errors import PerchError
+from perch_eval.domain import USABLE, reserved_domain
+
+
+def test_reservations_differ_and_end(tmp_path):
+    with reserved_domain([5, 6], tmp_path) as first:
+        with reserved_domain([5, 6], tmp_path) as second:
+            assert (first, second) == (5, 6)
+            with pytest.raises(PerchError, match="every ROS domain is reserved"), reserved_domain([5, 6], tmp_path):
+                pass
+        with reserved_domain([5, 6], tmp_path) as again:
+            assert again == 6
+    with reserved_domain([5, 6], tmp_path) as free:
+        assert free == 5
+
+
+def test_domains_keep_below_the_ephemeral_ports():
+    # DDS: port = 7400 + 250 * domain + 2 * participant + offset; Linux hands out ports from 32768 on
+    assert 7400 + 250 * max(USABLE) + 250 <= 32_900 and min(USABLE) > 0

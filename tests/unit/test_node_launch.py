@@ -1,0 +1,99 @@
+"""Launch: which nodes start, with which parameters, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+from perch_core import config
+from perch_core.errors import ConfigError, PerchError
+from perch_core.scenario import Scenario, load_scenario
+from perch_eval import nodes as nodes_module
+from perch_eval.node_launch import (
+    PACKAGES, NodeLaunch, choose_nodes, node_launches, parse_override, parse_overrides, read_parameters)
+from perch_eval.nodes import node_programs
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A configuration folder of the test's own."""
+    monkeypatch.setattr(config, "config_dir", lambda: tmp_path)
+    return tmp_path
+
+
+def scenario(**changes) -> Scenario:
+    return Scenario(name="test", nodes=("vehicle", "controller", "mission"), **changes)
+
+
+def test_later_sources_of_a_parameter_count(folder):
+    (folder / "controller.yaml").write_text("/**: {ros__parameters: {gains: {a: 1.0, b: 1.0, c: 1.0}, vehicle: file}}")
+    flown = scenario(vehicle="rpg", parameters={"controller": {"gains.b": 2.0, "gains.c": 2.0}})
+    launches = node_launches(flown, ["controller"], overrides={"controller": {"gains": {"c": 3.0}}})
+    assert launches[0].parameters == {"gains.a": 1.0, "gains.b": 2.0, "gains.c": 3.0, "vehicle": "rpg"}
+
+
+def test_the_vehicle_waits_for_the_nodes_that_are_started(folder):
+    def participants(*nodes: str) -> list[str]:
+        vehicle = node_launches(scenario(), ["vehicle", *nodes])[0]
+        return vehicle.parameters["participants"]
+
+    assert participants("controller", "mission", "perching_planner") == ["controller", "mission"]
+    assert participants() == [""]
+
+
+def test_seed_scenario_and_mode_reach_the_vehicle(folder):
+    vehicle = node_launches(scenario(), ["vehicle"], seed=7, scenario_source="/x/my.yaml", lockstep=False)[0].parameters
+    assert (vehicle["seed"], vehicle["scenario"], vehicle["lockstep"]) == (7, "/x/my.yaml", False)
+
+
+@pytest.mark.parametrize("content", ["vehicle: {ros__parameters: {a: 1}}", "/**: {a: 1}", "- 1", "/**: 1"])
+def test_a_parameter_file_of_another_form_is_refused(folder, content):
+    (folder / "vehicle.yaml").write_text(content)
+    with pytest.raises(ConfigError, match="vehicle.yaml"):
+        read_parameters("vehicle")
+
+
+def test_every_parameter_file_of_the_repository_can_be_read():
+    for node in PACKAGES:
+        read_parameters(node)
+
+
+def test_chosen_nodes():
+    assert choose_nodes(scenario()) == ("vehicle", "controller", "mission")
+    assert choose_nodes(scenario(), without=["mission"], extra=["recorder"]) == ("vehicle", "controller", "recorder")
+    assert choose_nodes(scenario(), only=["vio_model"]) == ("vio_model",)
+
+
+@pytest.mark.parametrize("arguments, words", [
+    ({"only": ["pilot"]}, "'pilot' is not one of vehicle"),
+    ({"without": ["vio"]}, "'vio' is not started anyway; started: vehicle, controller, mission"),
+    ({"without": ["vehicle", "controller", "mission"]}, "no node is left"),
+])
+def test_impossible_choices_are_refused(arguments, words):
+    with pytest.raises(PerchError, match=words):
+        choose_nodes(scenario(), **arguments)
+
+
+def test_overrides_are_yaml_and_name_their_node():
+    assert parse_override("controller.gains.a:=2") == ("controller", "gains.a", 2)
+    assert parse_overrides(["a.x:=1", "b.y:=[1.0, 2.0]", "a.x:=no"]) == {"a": {"x": False}, "b": {"y": [1.0, 2.0]}}
+    for text in ("controller.a=1", "a:=1", ".a:=1", "controller.a:=[1"):
+        with pytest.raises(PerchError, match="-p "):
+            parse_override(text)
+    with pytest.raises(PerchError, match="'vio', which is not started"):
+        node_launches(scenario(), ["vehicle"], overrides={"vio": {"a": 1}})
+
+
+def test_parameter_files_hold_for_every_namespace(tmp_path):
+    file = NodeLaunch("vehicle", "perch_sim", {"a.b": 1e-5, "c": [1.0], "d": "90"}).write(tmp_path)
+    assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"a.b": 1e-5, "c": [1.0], "d": "90"}}}
+
+
+def test_one_program_per_node_or_one_for_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(nodes_module, "executable", lambda package, name: f"/{package}/{name}")
+    launches = node_launches(load_scenario("surface_90"), ["vehicle", "controller"])
+    single = node_programs(launches, tmp_path, namespace="/quad1")
+    assert [(p.command[0], p.nodes) for p in single] == [
+        ("/perch_sim/vehicle", ("/quad1/vehicle",)), ("/perch_control/controller", ("/quad1/controller",))]
+    assert "__ns:=/quad1" in single[0].command
+    together = node_programs(launches, tmp_path, composed=True)
+    assert [(p.command[0], p.nodes) for p in together] == [("/perch_eval/composed", ("/vehicle", "/controller"))]

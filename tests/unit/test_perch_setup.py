@@ -1,0 +1,182 @@
+"""Set-up: what it refuses, what it remembers, and that nothing is installed at a floating version."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from perch_setup import alone, machine, progress, stamps, virtualenv, wheel_paths
+from perch_setup.errors import SetupError
+from perch_setup.layout import REQUIREMENTS, ROOT
+from perch_setup.machine import INSTALLED, WHEELS, check_python, check_tools, detect_platform
+
+
+def pins(name: str) -> dict[str, str]:
+    """Package -> version of a lock file; every line must pin one version."""
+    found = {}
+    for line in (REQUIREMENTS / name).read_text().splitlines():
+        if line and not line.startswith("#"):
+            match = re.fullmatch(r"([a-z0-9][a-z0-9.-]*)==([^\s;]+)(; .*)?", line)
+            assert match, f"{name}: {line!r} is not an exact version"
+            found[match[1]] = match[2]
+    return found
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch) -> Path:
+    """An empty repository in place of ours."""
+    monkeypatch.setattr(stamps, "ROOT", tmp_path)
+    monkeypatch.setattr(stamps, "STATE", tmp_path / ".perch")
+    monkeypatch.setattr(stamps, "_FILE", tmp_path / ".perch" / "stamps.json")
+    return tmp_path
+
+
+# -- the machine -----------------------------------------------------------------------------------------------------
+
+
+def test_wheels_without_ros_and_the_installation_where_jazzy_is_sourced(monkeypatch, tmp_path):
+    monkeypatch.setattr(machine, "ROS_PREFIX", tmp_path / "ros_prefix")
+    assert detect_platform({}) is WHEELS
+    assert detect_platform({"ROS_DISTRO": "jazzy"}) is INSTALLED
+    assert WHEELS.locks != INSTALLED.locks
+
+
+def test_a_workspace_stays_with_its_installation_in_shells_where_nothing_is_sourced(monkeypatch, tmp_path):
+    monkeypatch.setattr(machine, "ROS_PREFIX", tmp_path / "ros_prefix")
+    prefix = tmp_path / "opt"
+    (prefix / "share" / "rclpy").mkdir(parents=True)
+    (prefix / "setup.bash").touch()
+    machine.remember(INSTALLED, {"AMENT_PREFIX_PATH": f"/overlay:{prefix}"})
+    assert detect_platform({}) is INSTALLED
+    (prefix / "setup.bash").unlink()
+    assert detect_platform({}) is WHEELS
+
+
+def test_another_distribution_is_refused_with_a_way_out():
+    with pytest.raises(SetupError, match="ROS 2 humble is sourced.*perch needs jazzy.*source /opt/ros/jazzy") as error:
+        detect_platform({"ROS_DISTRO": "humble"})
+    assert error.value.exit_code == 2 and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("version", [(3, 8), (3, 10), (3, 13), (4, 0)])
+def test_an_unsupported_python_is_named_with_the_supported_ones(version):
+    with pytest.raises(SetupError, match=r"needs Python 3\.11 or 3\.12") as error:
+        check_python(WHEELS, version)
+    assert "{}.{}".format(*version) in str(error.value) and error.value.exit_code == 2
+
+
+def test_a_processor_without_wheels_is_refused_unless_ros_is_installed(monkeypatch):
+    monkeypatch.setattr(machine.platform, "machine", lambda: "aarch64")
+    with pytest.raises(SetupError, match="aarch64.*install ROS 2 Jazzy"):
+        check_python(WHEELS, (3, 12))
+    check_python(INSTALLED, (3, 12))
+
+
+def test_each_missing_tool_is_named_with_its_apt_line(monkeypatch):
+    monkeypatch.setattr(machine.shutil, "which", lambda tool: None if tool in ("cmake", "g++") else f"/usr/bin/{tool}")
+    monkeypatch.setattr(machine.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(machine.sysconfig, "get_paths", lambda: {"include": "/nowhere"})
+    with pytest.raises(SetupError) as error:
+        check_tools()
+    text = str(error.value)
+    assert "sudo apt-get install cmake g++ python3" in text and "-venv" in text and "-dev" in text
+    assert " make" not in text.split("install ")[1]
+
+
+# -- the locks -------------------------------------------------------------------------------------------------------
+
+
+def test_locks_pin_every_package_and_agree_with_each_other():
+    ros, python = pins("ros.lock"), pins("python.lock")
+    assert {name: (ros[name], python[name]) for name in ros.keys() & python.keys() if ros[name] != python[name]} == {}
+
+
+@pytest.mark.parametrize("lock", ["python.lock", "python-ros-jazzy.lock"])
+def test_locks_hold_everything_that_perch_asks_for(lock):
+    asked = re.findall(r"^([a-z][a-z0-9-]*)", (REQUIREMENTS / "python.in").read_text(), re.MULTILINE)
+    assert set(asked) <= set(pins(lock))
+
+
+def test_the_lock_for_an_installation_leaves_ros_alone_and_fits_its_binaries():
+    lock = pins("python-ros-jazzy.lock")
+    assert not [name for name in lock if name.startswith(("ros-", "ament-", "lark"))]
+    assert lock["numpy"].startswith("1.26.") and lock["empy"].startswith("3.")
+
+
+# -- stamps ----------------------------------------------------------------------------------------------------------
+
+
+def test_only_what_the_build_reads_changes_a_package_stamp(repository):
+    package = repository / "src" / "perch_x"
+    for folder in ("msg", "config", "perch_x"):
+        (package / folder).mkdir(parents=True)
+    (package / "setup.py").write_text("setup()")
+    (package / "msg" / "A.msg").write_text("float64 x")
+    (package / "perch_x" / "code.py").write_text("")
+    (package / "config" / "one.yaml").write_text("a: 1")
+    seen = [stamps.package_stamp(package, "environment")]
+
+    (package / "perch_x" / "code.py").write_text("print()")
+    (package / "config" / "one.yaml").write_text("a: 2")
+    assert stamps.package_stamp(package, "environment") == seen[0]
+
+    for name, text in (("setup.py", "setup(1)"), ("msg/A.msg", "float64 y"), ("msg/B.msg", ""), ("config/two.yaml", "")):
+        (package / name).write_text(text)
+        seen.append(stamps.package_stamp(package, "environment"))
+    seen.append(stamps.package_stamp(package, "another environment"))
+    assert len(set(seen)) == len(seen)
+
+
+def test_stamps_survive_and_a_damaged_file_means_nothing_is_done(repository):
+    stamps.save({"perch_x": "1"})
+    assert stamps.load() == {"perch_x": "1"}
+    (repository / ".perch" / "stamps.json").write_text('{"perch_x": "1"')
+    assert stamps.load() == {}
+    (repository / ".perch" / "stamps.json").write_text("[]")
+    assert stamps.load() == {}
+
+
+def test_an_environment_in_which_pip_was_killed_is_not_used(tmp_path, monkeypatch):
+    python = tmp_path / "python"
+    python.touch()
+    monkeypatch.setattr(virtualenv, "VENV_PYTHON", python)
+    monkeypatch.setattr(virtualenv, "_UNFINISHED", tmp_path / "installing")
+    assert virtualenv.usable()
+    (tmp_path / "installing").touch()
+    assert not virtualenv.usable()
+
+
+# -- steps -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_failing_tool_is_reported_with_its_last_lines_and_its_log(tmp_path, monkeypatch):
+    monkeypatch.setattr(progress, "STATE", tmp_path)
+    code = "print('first'); [print('line', i) for i in range(30)]; raise SystemExit(7)"
+    with pytest.raises(SetupError, match="exit code 7") as error, progress.Step("test") as step:
+        step.run([sys.executable, "-c", code], "tool", {})
+    assert error.value.exit_code == 1
+    assert "step tool" in str(error.value) and "line 29" in str(error.value) and "first" not in str(error.value)
+    assert "first" in (tmp_path / "log" / "tool.log").read_text()
+
+
+def test_a_second_set_up_waits_for_the_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(alone, "STATE", tmp_path)
+    code = (f"import sys, pathlib; sys.path.insert(0, {str(ROOT / 'scripts')!r}); from perch_setup import alone\n"
+            f"alone.STATE = pathlib.Path({str(tmp_path)!r})\nwith alone.alone(): print('inside', flush=True)")
+    with alone.alone():
+        second = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert "waiting" in second.stderr.readline()
+        assert second.poll() is None
+    out, _ = second.communicate(timeout=60)
+    assert out == "inside\n" and second.returncode == 0
+
+
+def test_wheel_exports_lose_the_paths_of_the_machine_that_built_them():
+    text = ('set_target_properties(a PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "/opt/python/cp311-cp311/include/python3.11;'
+            '/opt/python/cp311-cp311/lib/python3.11/site-packages/numpy/_core/include"\n  OTHER "${_IMPORT_PREFIX}/include")')
+    mended = wheel_paths.mend(text, "/usr/include/python3.11", "/venv/numpy")
+    assert '"/usr/include/python3.11;/venv/numpy"' in mended and '"${_IMPORT_PREFIX}/include"' in mended
+    assert wheel_paths.mend(mended, "/usr/include/python3.11", "/venv/numpy") == mended
