@@ -5,6 +5,7 @@ A `Scene` is a frozen description; `Scene.faces()` breaks it into the flat recta
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,7 +146,7 @@ def _room_faces(low: np.ndarray, high: np.ndarray) -> list[Face]:
     centre, half = (low + high) / 2, (high - low) / 2
     length, width, height = high - low
     walls = length * width + 2 * (length + width) * height
-    coarser = np.sqrt(max(1.0, (length * width / FLOOR_TEXEL**2 + walls / WALL_TEXEL**2) / ROOM_TEXELS))
+    coarser = math.sqrt(max(1.0, (length * width / FLOOR_TEXEL**2 + walls / WALL_TEXEL**2) / ROOM_TEXELS))
     x, y, z = np.eye(3)
     layout = ((x, y, 2, -1), (x, -y, 2, +1), (-y, z, 0, +1), (y, z, 0, -1), (x, z, 1, +1), (-x, z, 1, -1))
     faces = []
