@@ -132,8 +132,14 @@ class PerchMotion:
 
 
 def read_imu(motion: Motion, imu: ImuConfig, rng: np.random.Generator) -> ImuReadings:
-    """Readings of an IMU at the body's origin along a motion sampled at its rate: biases, walks, noise, saturation."""
+    """Readings of an IMU at the body's origin along a motion sampled at its rate: biases, walks, noise, saturation.
+
+    A sample is the mean over the period that ends at its stamp; over 2 ms the mean of both ends is that to 1e-4.
+    """
     n = len(motion.times)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return 0.5 * (values + np.concatenate([values[:1], values[:-1]]))
 
     def bias(init: float, walk: float) -> np.ndarray:
         steps = rng.normal(0.0, walk / np.sqrt(imu.rate), (n, 3))
@@ -141,7 +147,7 @@ def read_imu(motion: Motion, imu: ImuConfig, rng: np.random.Generator) -> ImuRea
         return np.cumsum(steps, axis=0)
 
     gyro_bias, accel_bias = bias(imu.gyro_bias_init, imu.gyro_bias_walk), bias(imu.accel_bias_init, imu.accel_bias_walk)
-    gyro = motion.w_WB_B + gyro_bias + rng.normal(0.0, imu.gyro_noise, (n, 3))
-    accel = motion.f_B + accel_bias + rng.normal(0.0, imu.accel_noise, (n, 3))
+    gyro = mean(motion.w_WB_B) + gyro_bias + rng.normal(0.0, imu.gyro_noise, (n, 3))
+    accel = mean(motion.f_B) + accel_bias + rng.normal(0.0, imu.accel_noise, (n, 3))
     return ImuReadings(np.clip(gyro, -imu.gyro_range, imu.gyro_range),
                        np.clip(accel, -imu.accel_range, imu.accel_range), gyro_bias, accel_bias)

@@ -20,9 +20,9 @@ class ImuNoise:
     gyro_bias_init: float = quantity(0.01, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
     accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, doc="saturation of one axis")
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, doc="saturation of one axis")
-    integration: str = choice("midpoint", options=("midpoint", "hold"), doc=(
-        "midpoint: samples are instantaneous, the step from k to k+1 takes their mean; "
-        "hold: sample k+1 is already the mean over that step"))
+    integration: str = choice("mean", options=("mean", "instant"), doc=(
+        "mean: a sample is the mean over the period that ends at its stamp, as IMUs with an averaging filter give it; "
+        "instant: samples are instantaneous, a step takes the mean of its two ends"))
 
 
 @dataclass(frozen=True)

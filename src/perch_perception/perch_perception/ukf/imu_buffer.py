@@ -45,7 +45,7 @@ class ImuBuffer:
 
     def __init__(self, imu: ImuNoise, faults: ImuFaults, history: float) -> None:
         self._imu, self._faults = imu, faults
-        self._midpoint = imu.integration == "midpoint"
+        self._instant = imu.integration == "instant"
         self._variances = (imu.gyro_noise**2, imu.accel_noise**2)
         self._keep = max(2, int(history * imu.rate))
         self._ends: list[int] = []
@@ -75,7 +75,7 @@ class ImuBuffer:
         if last is None:
             return outcome
         dt = (sample.stamp - last.stamp) * 1e-9
-        if self._midpoint:
+        if self._instant:
             u, g = last.w_B, last.f_B
             w = (0.5 * (w[0] + u[0]), 0.5 * (w[1] + u[1]), 0.5 * (w[2] + u[2]))
             f = (0.5 * (f[0] + g[0]), 0.5 * (f[1] + g[1]), 0.5 * (f[2] + g[2]))

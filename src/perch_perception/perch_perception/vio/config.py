@@ -17,6 +17,8 @@ class TrackerConfig:
     refill: float = quantity(0.85, low=0.1, high=1.0, doc="detect new features below this share of them")
     spacing: float = quantity(18.0, unit="px", above=2.0, doc="least distance between features")
     quality: float = quantity(0.01, above=0.0, high=1.0, doc="least corner strength, share of the strongest")
+    smoothing: float = quantity(1.5, unit="px", above=0.1, high=5.0, doc="sigma of the smoothing before detection and tracking")
+    noise_factor: float = quantity(2.0, low=0.0, high=100.0, doc="least corner strength, in those that noise alone makes")
     window: int = quantity(21, unit="px", low=5, high=61, doc="side of the tracked patch")
     levels: int = quantity(3, low=0, high=6, doc="pyramid levels above the image")
     back_check: float = quantity(0.7, unit="px", above=0.0, doc="tracking there and back must return this close")
@@ -30,6 +32,7 @@ class FilterConfig:
 
     clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
+    landmarks_per_frame: int = quantity(5, low=1, high=50, doc="most new landmarks per frame")
     pixel_noise: float = quantity(1.0, unit="px", above=0.0, doc="1 sigma of a track")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
     tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
@@ -58,8 +61,9 @@ class StartConfig:
     rest_time: float = quantity(0.25, unit="s", above=0.05, high=5.0, doc="IMU at rest needed for a start on the ground")
     motion_time: float = quantity(0.5, unit="s", above=0.2, high=3.0, doc="frames needed for a start in motion")
     rest_gyro: float = quantity(0.05, unit="rad/s", above=0.0, doc="largest mean rate over 0.1 s at rest, bias included")
-    rest_accel: float = quantity(0.35, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
+    rest_accel: float = quantity(0.25, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
     rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
+    rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
     rest_velocity: float = quantity(0.005, unit="m/s", above=0.0, doc="1 sigma of zero velocity on the ground")
 
 

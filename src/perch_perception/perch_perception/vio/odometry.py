@@ -1,0 +1,228 @@
+"""Visual-inertial odometry: IMU samples and images in, poses with covariance out. [M:IV-B]
+
+Ties tracker and filter together and decides what a frame is for: waiting for a start, standing still, tracking, blind, or
+lost. Free of ROS; the same inputs give the same outputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from perch_core import so3
+from perch_core.camera import CameraMount
+
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
+from perch_perception.vio import motion_start, rest, start
+from perch_perception.vio import state as at
+from perch_perception.vio.bearing import observe
+from perch_perception.vio.config import VioConfig
+from perch_perception.vio.msckf import FrameReport, Msckf
+from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.result import FrameOutcome, VioPoseEstimate, VioResult
+from perch_perception.vio.start import KnownPose
+from perch_perception.vio.tracker import Features, Tracker
+
+_FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
+
+
+class VisualInertialOdometry:
+    """Owns tracker, filter and IMU history.
+
+    Call `add_imu` with every sample; call `add_image` once `covers(stamp)` says that the IMU has passed the exposure.
+    """
+
+    def __init__(self, config: VioConfig, mount: CameraMount) -> None:
+        self.config, self.mount = config, mount
+        self.tracker = Tracker(config.tracker, mount.camera)
+        self.filter: Msckf | None = None
+        self.restarts = 0
+        self._imu = ImuBuffer(config.imu, config.faults, 2.0 + config.start.motion_time)
+        self._known = start.told(config)
+        self._gyro_bias = np.zeros(3)
+        self._rest_accel: np.ndarray | None = None  # the force at rest, while the ground has not been left for good
+        self._resting = self._seen = False
+        self._moving = motion_start.MotionStart(config, mount)
+        self._frame = 0
+        self._last_image = -1           # stamp of the last frame used, on the board's clock
+        self._last_exposed: int | None = None
+        self._informed = 0              # when vision or rest last updated the filter
+        self._bad_frames = 0
+
+    @property
+    def time_offset(self) -> float:
+        """Middle of the exposure on the IMU's clock minus the image's stamp, as estimated [s]."""
+        return self.filter.state.time_offset if self.filter else -self.mount.stamp_offset
+
+    def covers(self, stamp: int) -> bool:
+        """Whether the IMU has passed the exposure of an image with this stamp [ns], or the stamp cannot be waited for."""
+        newest = self._imu.last.stamp if self._imu.last else None
+        exposed = stamp + round(self.time_offset * 1e9)
+        return newest is not None and (exposed <= newest or exposed > newest + _FUTURE)
+
+    def add_imu(self, sample: ImuSample) -> ImuOutcome:
+        """Keep a sample; bad ones are bridged or refused, see `ImuOutcome`."""
+        return self._imu.add(sample)
+
+    def add_image(self, stamp: int, image: np.ndarray) -> VioResult:
+        """Use a frame.
+
+        Args:
+            stamp: of the board [ns].
+            image: grey, uint8 (height, width).
+        """
+        exposed = stamp + round(self.time_offset * 1e9)
+        problem = self._problem(stamp, exposed, image)
+        if problem is not None:
+            return VioResult(problem, restarts=self.restarts, message=f"frame {stamp} ns {problem.value}")
+        self._last_image = stamp
+        features = self._track(image, exposed)
+        self._frame += 1
+        if self.filter is None:
+            result = self._try_start(exposed, features)
+        else:
+            result = self._step(exposed, features)
+        self._last_exposed = exposed
+        return result
+
+    def _problem(self, stamp: int, exposed: int, image: np.ndarray) -> FrameOutcome | None:
+        camera = self.mount.camera
+        if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
+            return FrameOutcome.BAD_IMAGE
+        if self._imu.last is None:
+            return FrameOutcome.NO_IMU
+        if stamp <= self._last_image or (self.filter and exposed <= self.filter.state.stamp):
+            return FrameOutcome.NOT_NEWER
+        if exposed > self._imu.last.stamp:
+            return FrameOutcome.FUTURE
+        if exposed < self._imu.oldest or (self.filter and self.filter.state.stamp < self._imu.oldest):
+            return FrameOutcome.TOO_OLD
+        return None
+
+    def _track(self, image: np.ndarray, exposed: int) -> Features:
+        state = self.filter.state if self.filter else None
+        R_BC = state.R_BC if state else self.mount.R_BC
+        turn = np.eye(3)
+        if self._last_exposed is not None:
+            steps = self._imu.run(self._last_exposed, exposed)
+            turn = preintegrate(steps, state.gyro_bias if state else self._gyro_bias, np.zeros(3)).dR
+        return self.tracker.track(image, R_BC.T @ turn.T @ R_BC)
+
+    # -- before the start --------------------------------------------------------------------------------------------
+
+    def _try_start(self, exposed: int, features: Features) -> VioResult:
+        """Start at rest or, when the vehicle moves, from the frames of the last half second."""
+        s = self.config.start
+        steps = self._imu.run(max(self._imu.oldest, exposed - round(s.rest_time * 1e9)), exposed)
+        long_enough = len(steps) > 0 and steps[:, 0].sum() > 0.9 * s.rest_time
+        still = features.disparity < s.rest_disparity or not np.isfinite(features.disparity)
+        if self.restarts == 0 and long_enough and still and rest.looks_at_rest(s, steps, np.zeros(3), None):
+            self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known))
+            self._rest_accel, self._resting, self._seen = steps[:, 4:7].mean(axis=0), False, False
+            return self._hold(exposed, features)
+        self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
+        state = self._moving.solve(self._imu, self._known, self._gyro_bias)
+        if state is not None:
+            self._begin(state)
+            self._rest_accel = None
+            return self._result(FrameOutcome.TRACKING, features, FrameReport())
+        outcome = FrameOutcome.LOST if self.restarts else FrameOutcome.INITIALISING
+        return VioResult(outcome, None, len(features.ids), restarts=self.restarts, message=outcome.value)
+
+    def _begin(self, state: at.State) -> None:
+        self.filter = Msckf(self.config, state, self.mount.camera.fx)
+        self._informed, self._bad_frames = state.stamp, 0
+
+    # -- afterwards --------------------------------------------------------------------------------------------------
+
+    def _step(self, exposed: int, features: Features) -> VioResult:
+        if self._rest_accel is not None and not self._seen:
+            if self._is_still(exposed, features):
+                return self._hold(exposed, features)
+            self._resting = False
+        self.filter.propagate(self._imu.run(self.filter.state.stamp, exposed), exposed)
+        report = self.filter.add_frame(self._frame, features.ids, observe(self.mount.camera, features.pixels))
+        self._seen = self._seen or report.used > 0  # in the air: from here on only vision counts
+        return self._judge(exposed, features, report)
+
+    def _is_still(self, exposed: int, features: Features) -> bool:
+        """Whether the vehicle still (or again) stands where it was told to start."""
+        s = self.config.start
+        quiet = features.disparity < s.rest_disparity or len(features.ids) < self.config.loss.least_tracks
+        span = 0.1 if self._resting else s.rest_time  # leaving is believed at once, coming back is not
+        recent = self._imu.run(max(self._imu.oldest, exposed - round(span * 1e9)), exposed)
+        return quiet and rest.looks_at_rest(s, recent, self.filter.state.gyro_bias, self._rest_accel)
+
+    def _hold(self, exposed: int, features: Features) -> VioResult:
+        """Tell the filter that the vehicle stood still, up to a little before now.
+
+        A take-off is noticed some time after it began. The filter stays behind by `rest_lag`, so that what it was told
+        remains true, and catches up with the IMU when the vehicle leaves.
+        """
+        state = self.filter.state
+        if not self._resting:
+            state.drop_clones(list(range(len(state.clones))))
+            state.add_clone(self._frame, np.zeros(3))  # what `rest.hold` holds on to
+            self._resting = True
+        until = max(state.stamp, exposed - round(self.config.start.rest_lag * 1e9))
+        steps = self._imu.run(state.stamp, until)
+        if len(steps):
+            self.filter.propagate(steps, until)
+            rest.hold(self.filter, steps, self.config.start, self.config.imu.gyro_noise)
+        self._informed = exposed
+        result = self._result(FrameOutcome.RESTING, features, FrameReport())
+        return replace(result, blind_for=0.0, estimate=replace(result.estimate, stamp=exposed, w_WB_B=np.zeros(3)))
+
+    def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
+        """Whether the filter still sees, or has to start again."""
+        loss, s = self.config.loss, self.filter.state
+        if report.used or len(features.ids) - features.new >= loss.least_tracks:
+            self._informed = exposed  # tracks that go on carry information that is used when they end
+        self._bad_frames = self._bad_frames + 1 if report.refused > 2 * report.used + 2 else 0
+        sigma = np.sqrt(np.diag(s.P))
+        why = ""
+        if not np.isfinite(s.P).all() or not np.isfinite(s.p_WB).all():
+            why = "state is not finite"
+        elif self._bad_frames >= loss.rejected_frames:
+            why = f"most observations refused in {self._bad_frames} frames in a row"
+        elif sigma[at.VELOCITY].max() > loss.restart_velocity:
+            why = f"velocity known only to {sigma[at.VELOCITY].max():.1f} m/s"
+        if why:
+            return self._lose(features, why)
+        blind = (exposed - self._informed) * 1e-9
+        outcome = FrameOutcome.BLIND if blind > loss.degraded_after else FrameOutcome.TRACKING
+        return self._result(outcome, features, report)
+
+    def _lose(self, features: Features, why: str) -> VioResult:
+        """Keep what is known of position and yaw, and start again in motion."""
+        s = self.filter.state
+        if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
+            covariance = pose_covariance(s)
+            rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
+            self._known = KnownPose(s.p_WB.copy(), float(so3.yaw_of(s.R_WB)), covariance[rows])
+            self._gyro_bias = s.gyro_bias.copy()
+        self._moving = motion_start.MotionStart(self.config, self.mount)
+        self.filter, self.restarts = None, self.restarts + 1
+        return VioResult(FrameOutcome.LOST, None, len(features.ids), restarts=self.restarts, message=f"lost: {why}")
+
+    def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
+        s = self.filter.state
+        estimate = VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), self.filter.w_WB_B.copy(),
+                                   pose_covariance(s), velocity_covariance(s)) if outcome.has_pose else None
+        return VioResult(outcome, estimate, len(features.ids), report.used, report.refused, report.nis,
+                         report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
+
+
+def pose_covariance(state: at.State) -> np.ndarray:
+    """Covariance of (position, rotation about W's axes), shape (6, 6)."""
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = np.eye(3), state.R_WB
+    return J @ state.P[:6, :6] @ J.T
+
+
+def velocity_covariance(state: at.State) -> np.ndarray:
+    """Covariance of the velocity in B, shape (3, 3): v_B = R^T v, whose attitude error turns it."""
+    J = np.zeros((3, 9))
+    J[:, at.THETA] = so3.hat(state.R_WB.T @ state.v_WB)
+    J[:, at.VELOCITY] = state.R_WB.T
+    return J @ state.P[:9, :9] @ J.T

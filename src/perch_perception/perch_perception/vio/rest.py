@@ -1,0 +1,54 @@
+"""Standing still: how it is recognised, and what it tells the filter.
+
+On the ground before take-off the downward camera looks at a few square centimetres of floor from 2-5 cm. Nothing can
+be triangulated there, but nothing moves either: zero velocity, zero rate and an unchanged pose say more than any track.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from perch_core import so3
+from perch_core.vehicle import GRAVITY
+
+from perch_perception.ukf.unscented import ACCEL, GYRO
+from perch_perception.vio import state as at
+from perch_perception.vio.config import StartConfig
+from perch_perception.vio.msckf import Msckf
+
+_HOLD = 0.0005  # 1 sigma of "the pose has not changed": [m] and [rad]
+
+
+def looks_at_rest(config: StartConfig, steps: np.ndarray, gyro_bias: np.ndarray, accel: np.ndarray | None) -> bool:
+    """Whether IMU steps (m, 9) look like standing still.
+
+    Args:
+        config: thresholds.
+        steps: IMU steps of about 0.1 s or more.
+        gyro_bias: what the gyro reads at rest [rad/s], shape (3,).
+        accel: what the accelerometer read at rest before [m/s^2], shape (3,); None: only its length is known.
+    """
+    if len(steps) < 10:
+        return False
+    w, f = steps[:, GYRO].mean(axis=0) - gyro_bias, steps[:, ACCEL].mean(axis=0)
+    change = abs(np.linalg.norm(f) - GRAVITY) if accel is None else np.linalg.norm(f - accel)
+    return bool(np.linalg.norm(w) < config.rest_gyro and change < config.rest_accel)
+
+
+def hold(filter: Msckf, steps: np.ndarray, config: StartConfig, gyro_noise: float) -> None:
+    """Update with standing still over IMU steps (m, 9), the last of which ends now.
+
+    v = 0; the gyro's mean is its bias; and the pose is that of the window's oldest clone, made when the rest began. The last is
+    relative: it says nothing of where in W that is.
+    """
+    s = filter.state
+    H = np.zeros((12, at.INERTIAL_SIZE + at.CLONE_SIZE))
+    H[0:3, at.VELOCITY] = np.eye(3)
+    H[3:6, at.GYRO_BIAS] = np.eye(3)
+    H[6:9, at.THETA], H[6:9, 15:18] = np.eye(3), -np.eye(3)
+    H[9:12, at.POSITION], H[9:12, 18:21] = np.eye(3), -np.eye(3)
+    anchor = s.clones[0]
+    r = np.concatenate([-s.v_WB, steps[:, GYRO].mean(axis=0) - s.gyro_bias,
+                        so3.log(s.R_WB.T @ anchor.R_WB), anchor.p_WB - s.p_WB])
+    variance = np.repeat([config.rest_velocity**2, gyro_noise**2 / len(steps), _HOLD**2, _HOLD**2], 3)
+    columns = np.concatenate([np.arange(at.INERTIAL_SIZE), s.clone_at(0) + np.arange(6)])
+    filter.apply(columns, H, r, variance)

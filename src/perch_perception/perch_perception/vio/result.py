@@ -1,0 +1,76 @@
+"""What visual-inertial odometry says of each frame."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+
+
+class FrameOutcome(enum.Enum):
+    """What became of a frame."""
+
+    INITIALISING = "waiting for a start at rest or in motion"
+    RESTING = "standing still on the ground"
+    TRACKING = "tracked"
+    BLIND = "integrating the IMU alone: nothing usable in the image"
+    LOST = "lost: starting again in motion"
+    NOT_NEWER = "refused: stamp is not newer than the frame before"
+    FUTURE = "refused: stamp lies ahead of the IMU"
+    TOO_OLD = "refused: older than the IMU history"
+    NO_IMU = "refused: no IMU data yet"
+    BAD_IMAGE = "refused: not a grey image of the camera's size"
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether a pose comes with it."""
+        return self in (FrameOutcome.RESTING, FrameOutcome.TRACKING)
+
+
+@dataclass(frozen=True)
+class VioPoseEstimate:
+    """The body's state at the middle of a frame's exposure.
+
+    Attributes:
+        stamp: on the IMU's clock, the estimated time offset applied [ns].
+        p_WB, v_WB: [m], [m/s], shape (3,).
+        R_WB: shape (3, 3).
+        w_WB_B: bias removed [rad/s], shape (3,).
+        pose_covariance: of (position, rotation about W's axes), shape (6, 6).
+        velocity_covariance: of the velocity in B, shape (3, 3).
+    """
+
+    stamp: int
+    p_WB: np.ndarray
+    R_WB: np.ndarray
+    v_WB: np.ndarray
+    w_WB_B: np.ndarray
+    pose_covariance: np.ndarray
+    velocity_covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class VioResult:
+    """One frame's result.
+
+    Attributes:
+        outcome: see `FrameOutcome`.
+        estimate: None where the outcome has no pose.
+        features: tracked features; used, refused: observations that changed the state and that the gate refused.
+        nis, nis_dimension: normalised innovation squared of all observations together, and its dimension.
+        blind_for: time since the last visual or rest update [s].
+        restarts: starts after the first.
+        message: for people.
+    """
+
+    outcome: FrameOutcome
+    estimate: VioPoseEstimate | None = None
+    features: int = 0
+    used: int = 0
+    refused: int = 0
+    nis: float = 0.0
+    nis_dimension: int = 0
+    blind_for: float = 0.0
+    restarts: int = 0
+    message: str = ""

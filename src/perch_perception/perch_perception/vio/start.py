@@ -1,0 +1,76 @@
+"""The filter's first state, on the ground: level by gravity, gyro bias from the mean, pose as told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from perch_core import so3
+from perch_core.camera import CameraMount
+from perch_core.vehicle import GRAVITY
+
+from perch_perception.ukf.start import level
+from perch_perception.ukf.unscented import ACCEL, GYRO
+from perch_perception.vio import ekf
+from perch_perception.vio import state as at
+from perch_perception.vio.config import VioConfig
+from perch_perception.vio.state import State
+
+
+@dataclass(frozen=True)
+class KnownPose:
+    """Position and yaw in W at the start, with covariance of (p, yaw), shape (4, 4)."""
+
+    p_WB: np.ndarray
+    yaw: float
+    covariance: np.ndarray
+
+
+def told(config: VioConfig) -> KnownPose:
+    """The pose that the configuration gives."""
+    s = config.start
+    return KnownPose(np.array(s.position), s.yaw, np.diag([s.position_sigma**2] * 3 + [s.yaw_sigma**2]))
+
+
+def with_yaw(q_WB: np.ndarray, yaw: float) -> np.ndarray:
+    """Attitude R_WB (3, 3) with the tilt of a quaternion xyzw (4,) and a given yaw [rad]."""
+    R = so3.quat_to_matrix(q_WB)
+    return so3.exp(np.array([0.0, 0.0, yaw - float(so3.yaw_of(R))])) @ R
+
+
+def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, pose: KnownPose, v_WB: np.ndarray,
+          gyro_bias: np.ndarray, tilt_sigma: float, velocity_sigma: float, gyro_sigma: float) -> State:
+    """A state without clones; attitude uncertainty is `tilt_sigma` about the horizontal axes and the pose's about z."""
+    c = config.calibration
+    P = np.zeros((at.CORE_SIZE, at.CORE_SIZE))
+    # theta = R^T (tilt_x, tilt_y, yaw): the pose's covariance couples yaw and position
+    J = np.zeros((6, 6))
+    J[:3, :3], J[3:, 3:] = R_WB.T, np.eye(3)
+    W = np.zeros((6, 6))
+    W[0, 0] = W[1, 1] = tilt_sigma**2
+    W[2, 2], W[3:, 3:] = pose.covariance[3, 3], pose.covariance[:3, :3]
+    W[2, 3:] = W[3:, 2] = pose.covariance[3, :3]
+    P[:6, :6] = J @ W @ J.T
+    sigma = np.concatenate([np.repeat([velocity_sigma, gyro_sigma, config.imu.accel_bias_init, c.rotation / np.sqrt(3),
+                                       c.translation], 3), [c.time_offset, c.focal]])
+    P[6:, 6:] = np.diag(sigma**2)
+    return State(stamp, R_WB, pose.p_WB.copy(), v_WB, gyro_bias, np.zeros(3), mount.R_BC.copy(), mount.p_BC.copy(),
+                 -mount.stamp_offset, P)
+
+
+def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray, pose: KnownPose) -> State:
+    """State of a vehicle that stood still over IMU steps (m, 9).
+
+    Tilt and accelerometer bias cannot be told apart at rest: the update with the mean force leaves exactly that correlation.
+    """
+    gyro, accel = steps[:, GYRO].mean(axis=0), steps[:, ACCEL].mean(axis=0)
+    R_WB = with_yaw(level(accel), pose.yaw)
+    gyro_sigma = config.imu.gyro_noise / np.sqrt(len(steps))
+    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.1, config.start.rest_velocity, gyro_sigma)
+    up_B = R_WB.T @ np.array([0.0, 0.0, GRAVITY])
+    H = np.zeros((3, at.INERTIAL_SIZE))
+    H[:, at.THETA], H[:, at.ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
+    dx, state.P = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, config.imu.accel_noise**2 / len(steps))
+    state.inject(dx)
+    state.freeze()
+    return state

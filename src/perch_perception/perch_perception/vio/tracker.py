@@ -1,0 +1,141 @@
+"""KLT tracks: pyramidal Lucas-Kanade from frame to frame, predicted by the gyro, checked there and back.
+
+Outliers are found with the known rotation: two tracks then give the direction of translation, and RANSAC over pairs needs
+only a few draws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from perch_core.camera import Camera
+
+from perch_perception.vio.config import TrackerConfig
+
+_DRAWS = 24
+# strength (least eigenvalue over 5 x 5 px, as OpenCV scales it) of the corners that unit white noise makes in an image smoothed
+# with sigma = 1.5 px: measured on 640 x 480 noise images
+_NOISE_CORNER = 1.15e-6
+
+
+def _noise(image: np.ndarray) -> float:
+    """1 sigma of an image's white noise [grey levels], from second differences along some rows."""
+    rows = image[::8].astype(np.int16)
+    second = 2 * rows[:, 1:-1] - rows[:, :-2] - rows[:, 2:]
+    return float(np.median(np.abs(second))) / (0.6745 * np.sqrt(6.0))
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one frame.
+
+    Attributes:
+        ids: numbers, shape (n,); the last `new` of them are new in this frame.
+        pixels: shape (n, 2).
+        new: how many are new.
+        disparity: median motion since the frame before, rotation removed [px]; inf without tracks.
+    """
+
+    ids: np.ndarray
+    pixels: np.ndarray
+    new: int
+    disparity: float
+
+
+class Tracker:
+    """Owns the previous frame and the features in it."""
+
+    def __init__(self, config: TrackerConfig, camera: Camera) -> None:
+        self.config, self.camera = config, camera
+        self.latest: Features | None = None
+        self._previous: np.ndarray | None = None
+        self._pixels, self._ids, self._next = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4])
+        inside = np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(config.view_angle)
+        mask = cv2.resize(inside.astype(np.uint8) * 255, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+        border = 8  # a patch at the border has no gradient beyond it
+        mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
+        self._view = mask
+
+    def reset(self) -> None:
+        """Forget the previous frame; numbers are not used again."""
+        self._previous, self._pixels, self._ids = None, np.zeros((0, 2), np.float32), np.zeros(0, int)
+
+    def track(self, image: np.ndarray, R_now_before: np.ndarray) -> Features:
+        """Follow the features into a new frame and refill them.
+
+        Args:
+            image: grey, uint8 (height, width).
+            R_now_before: rotation of the camera since the frame before, takes rays of then into C of now, (3, 3).
+        """
+        disparity = np.inf
+        noise = _noise(image)
+        smooth = cv2.GaussianBlur(image, (0, 0), self.config.smoothing)
+        if self._previous is not None and len(self._pixels):
+            disparity = self._follow(image, R_now_before)
+        self._previous = image
+        new = 0
+        if len(self._pixels) < self.config.features * self.config.refill:
+            new = self._refill(smooth, noise)
+        self.latest = Features(self._ids, self._pixels.astype(float), new, disparity)
+        return self.latest
+
+    def _follow(self, image: np.ndarray, R_now_before: np.ndarray) -> float:
+        c, before = self.config, self._pixels
+        rays = self.camera.unproject(before.astype(float)) @ R_now_before.T
+        guess, valid = self.camera.project(rays)
+        guess = np.where(valid[:, None], guess, before).astype(np.float32)
+        size, stop = (c.window, c.window), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
+        after, found, _ = cv2.calcOpticalFlowPyrLK(
+            self._previous, image, before.reshape(-1, 1, 2), guess.reshape(-1, 1, 2).copy(), winSize=size,
+            maxLevel=c.levels, criteria=stop, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+            image, self._previous, after, before.reshape(-1, 1, 2).copy(), winSize=size, maxLevel=1, criteria=stop,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        after = after.reshape(-1, 2)
+        place = np.clip(np.nan_to_num(np.rint(after), nan=-1.0, posinf=-1, neginf=-1), 0,
+                        [image.shape[1] - 1, image.shape[0] - 1]).astype(int)
+        good = ((found.ravel() > 0) & (returned.ravel() > 0) & valid & self.camera.contains(after)
+                & (np.linalg.norm(back.reshape(-1, 2) - before, axis=1) < c.back_check)
+                & (self._view[place[:, 1], place[:, 0]] > 0))
+        good &= self._one_translation(rays, after, good)
+        disparity = float(np.median(np.linalg.norm(after - guess, axis=1)[good])) if good.any() else np.inf
+        self._pixels, self._ids = after[good], self._ids[good]
+        return disparity
+
+    def _one_translation(self, rays: np.ndarray, after: np.ndarray, good: np.ndarray) -> np.ndarray:
+        """Tracks that agree with the translation most of them share, (n,) bool; rays are those before, turned."""
+        index = np.flatnonzero(good)
+        if len(index) < 8:
+            return good
+        now = self.camera.unproject(after[index].astype(float))
+        normals = np.nan_to_num(np.cross(rays[index], now))  # of the epipolar planes: orthogonal to the translation
+        rng = np.random.default_rng(len(index))  # the same draws for the same situation: flights repeat
+        pairs = rng.integers(0, len(index), (_DRAWS, 2))
+        t = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+        length = np.linalg.norm(t, axis=1, keepdims=True)
+        t = np.where(length > 1e-12, t / np.maximum(length, 1e-12), 0.0)
+        inliers = np.abs(normals @ t.T) < self.config.epipolar / self.camera.fx
+        best = inliers[:, np.argmax(inliers.sum(axis=0) * (length.ravel() > 1e-12))]
+        out = np.zeros(len(good), bool)
+        out[index[best]] = True
+        return out
+
+    def _refill(self, image: np.ndarray, noise: float) -> int:
+        """Detect corners away from the features there are; those that noise alone would make are not taken."""
+        c, mask = self.config, self._view.copy()
+        for x, y in self._pixels:
+            cv2.circle(mask, (int(x), int(y)), int(c.spacing), 0, -1)
+        corners, strength = cv2.goodFeaturesToTrackWithQuality(
+            image, c.features - len(self._pixels), c.quality, c.spacing, mask, blockSize=5)
+        if corners is None:
+            return 0
+        strong = strength.ravel() > c.noise_factor * _NOISE_CORNER * noise**2
+        corners = corners.reshape(-1, 2)[strong].astype(np.float32)
+        self._pixels = np.concatenate([self._pixels, corners])
+        self._ids = np.concatenate([self._ids, np.arange(self._next, self._next + len(corners))])
+        self._next += len(corners)
+        return len(corners)
