@@ -3,8 +3,9 @@
 It exists so that the rest of the stack can be tried without images; flights that count use `perch_perception vio`.
 
 Error model, per pose: position and yaw drift as random walks, roll and pitch do not drift (gravity shows them); on top
-comes white noise on position, attitude and velocity. The covariance that goes with a pose is the white part plus what
-the drift has grown to.
+comes white noise on position, attitude and velocity. A filter's pose is smooth: from frame to frame it jumps by a
+millimetre or two, while its drift grows to a centimetre within a flight. The covariance that goes with a pose is the
+white part plus what the drift has grown to.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class VioModelParameters:
                               doc="exposure to output in real time; in lockstep the scenario's latency.vio counts")
     position_drift: float = quantity(0.004, unit="m/sqrt(s)", low=0.0, doc="random walk of each axis")
     yaw_drift: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="random walk")
-    position_noise: float = quantity(0.004, unit="m", low=0.0, doc="1 sigma of each axis, white")
-    attitude_noise: float = quantity(0.004, unit="rad", low=0.0, doc="1 sigma of each axis, white")
+    position_noise: float = quantity(0.0015, unit="m", low=0.0, doc="1 sigma of each axis, white")
+    attitude_noise: float = quantity(0.0015, unit="rad", low=0.0, doc="1 sigma of each axis, white")
     velocity_noise: float = quantity(0.03, unit="m/s", low=0.0, doc="1 sigma of each axis, white")
 
 
