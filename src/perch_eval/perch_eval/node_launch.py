@@ -175,7 +175,9 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants or [""]},
         "vio": vehicle, "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,
         "target_localizer": vehicle | {"board": scenario.target.board},
-        "perching_planner": vehicle, "powerline_planner": vehicle, "controller": vehicle,
+        "perching_planner": vehicle, "powerline_planner": vehicle,
+        # In lockstep a busy machine stops time for everybody: only much longer silence means that odometry is gone.
+        "controller": vehicle | ({"blind_after": 8.0} if lockstep else {}),
         "mission": {"mission.planner_latency": scenario.latency.perching_planner},
     }
 
