@@ -1,0 +1,93 @@
+"""Which sighting belongs to which wire."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Sequence
+
+import numpy as np
+
+from perch_core import config
+from perch_perception.line_mapping.observation import LineObservation
+from perch_perception.line_mapping.triangulation import WireEstimate
+
+
+@dataclass(frozen=True)
+class AssociationConfig:
+    """How near a sighting must be to what is expected."""
+
+    mapped_gate: float = config.quantity(1.2, unit="deg", above=0.0, high=20.0, doc="to a triangulated wire")
+    followed_gate: float = config.quantity(5.0, unit="deg", above=0.0, high=45.0,
+                                           doc="to the last sighting of a wire that is not triangulated yet")
+    distinct: float = config.quantity(2.0, low=1.0, high=10.0, doc="the second-best wire must be so many times worse")
+    reach: float = config.quantity(1.5, unit="m", low=0.0, high=20.0, doc="how far a wire may go on beyond what was seen")
+
+
+class Track(Protocol):
+    """What is needed of a wire that is being followed."""
+
+    estimate: WireEstimate | None
+    last: LineObservation
+    extent: tuple[float, float] | None
+
+
+def score(track: Track, seen: LineObservation, settings: AssociationConfig) -> float:
+    """Misfit of a sighting to a wire in units of the gate; inf where it cannot be the same."""
+    if track.estimate is not None:
+        return _score_mapped(track, seen, settings)
+    return _score_followed(track.last, seen) / np.radians(settings.followed_gate)
+
+
+def _score_mapped(track: Track, seen: LineObservation, settings: AssociationConfig) -> float:
+    curve = track.estimate.curve
+    centres = np.tile(seen.p_WC, (len(seen.rays_W), 1))
+    against = curve.offsets(centres, seen.rays_W)
+    if not np.all(against.ahead > 0):
+        return np.inf
+    s = against.s
+    if track.extent is not None:
+        low, high = track.extent
+        if s.max() < low - settings.reach or s.min() > high + settings.reach:
+            return np.inf
+    middle = float(s[len(s) // 2])
+    distance = float(np.linalg.norm(curve.at(middle) - seen.p_WC))
+    unsure = np.sqrt(np.linalg.eigvalsh(track.estimate.point_covariance(middle))[-1]) / max(distance, 0.1)
+    return float(np.sqrt(np.mean(against.angles**2))) / (np.radians(settings.mapped_gate) + 2.0 * float(unsure))
+
+
+def _score_followed(last: LineObservation, seen: LineObservation) -> float:
+    """Angle by which a sighting left the plane of the last one [rad]: parallax only, as rays are in W."""
+    normal = last.normal
+    offset = float(np.sqrt(np.mean((seen.rays_W @ normal) ** 2)))
+    turned = float(np.arccos(np.clip(abs(seen.normal @ normal), 0.0, 1.0)))
+    # along the arc: the pieces must overlap
+    along = np.cross(normal, last.middle)
+    spans = [sorted((float(np.arcsin(np.clip(r @ along, -1, 1))) for r in o.ends_W)) for o in (last, seen)]
+    gap = max(spans[0][0], spans[1][0]) - min(spans[0][1], spans[1][1])
+    if gap > 0.05 or turned > 0.35:
+        return np.inf
+    return offset
+
+
+def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings: AssociationConfig) -> list[int | None]:
+    """For each sighting the index of its wire, -1 for a new one, or None where it could be one of several.
+
+    A triangulated wire may be seen in several pieces at once; one that is only followed, in one.
+    """
+    scores = np.array([[score(track, one, settings) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
+    answer: list[int | None] = [-1] * len(seen)
+    taken: set[int] = set()
+    order = sorted(((scores[i, j], i, j) for i in range(len(seen)) for j in range(len(tracks)) if scores[i, j] <= 1.0))
+    done: set[int] = set()
+    for value, i, j in order:
+        if i in done or j in taken:
+            continue
+        done.add(i)
+        rivals = [scores[i, k] for k in range(len(tracks)) if k != j]
+        if rivals and min(rivals) < min(1.0, settings.distinct * max(value, 0.1)):
+            answer[i] = None
+            continue
+        answer[i] = j
+        if tracks[j].estimate is None:
+            taken.add(j)
+    return answer

@@ -1,0 +1,114 @@
+"""The shape of a hanging wire near a point: a straight line with a little sag.
+
+A catenary is, over a few metres, a parabola in the vertical plane: X(s) = p + s d + kappa/2 s^2 u, with u the upward
+normal to d. kappa is w/H, weight per length over tension; a taut wire has kappa = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import so3
+
+UP = np.array([0.0, 0.0, 1.0])
+PARAMETERS = 5  # offset along e1 and e2 [m], tilt towards e1 and e2 [rad], kappa [1/m]
+
+
+@dataclass(frozen=True)
+class WireCurve:
+    """A wire in W.
+
+    Attributes:
+        point: p, where s = 0 [m], shape (3,).
+        direction: d, unit, shape (3,).
+        curvature: kappa [1/m].
+    """
+
+    point: np.ndarray
+    direction: np.ndarray
+    curvature: float = 0.0
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Columns e1 (horizontal), e2 = u (upward normal) and d, right-handed up to sign, shape (3, 3)."""
+        side = np.cross(UP, self.direction)
+        if np.linalg.norm(side) < 1e-3:  # a vertical wire does not sag; any normals will do
+            side = np.array([1.0, 0.0, 0.0]) - self.direction[0] * self.direction
+        side = side / np.linalg.norm(side)
+        return np.stack([side, np.cross(self.direction, side), self.direction], axis=1)
+
+    def at(self, s: np.ndarray) -> np.ndarray:
+        """Points at s [m], shapes (...) -> (..., 3)."""
+        s = np.asarray(s, float)[..., None]
+        return self.point + s * self.direction + 0.5 * self.curvature * s * s * self.axes[:, 1]
+
+    def tangent(self, s: np.ndarray) -> np.ndarray:
+        """Tangents (not normalised) at s, shapes (...) -> (..., 3)."""
+        return self.direction + self.curvature * np.asarray(s, float)[..., None] * self.axes[:, 1]
+
+    def moved(self, step: np.ndarray) -> WireCurve:
+        """The curve after a change of its five parameters."""
+        axes = self.axes
+        turn = so3.exp(np.cross(self.direction, axes[:, :2] @ step[2:4]))
+        direction = turn @ self.direction
+        return WireCurve(self.point + axes[:, :2] @ step[:2], direction / np.linalg.norm(direction),
+                         self.curvature + float(step[4]))
+
+    def nearest(self, centres: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """s of the points that pass nearest to rays, with two Newton-like corrections for the sag.
+
+        Args:
+            centres: origins of the rays [m], shape (n, 3).
+            rays: unit rays, shape (n, 3).
+        """
+        s = np.zeros(len(rays))
+        for _ in range(3 if self.curvature else 1):
+            point, tangent = self.at(s), self.tangent(s)
+            w = point - centres
+            across = tangent - np.sum(tangent * rays, axis=1, keepdims=True) * rays  # tangent without its part on the ray
+            s = s - np.sum(w * across, axis=1) / np.maximum(np.sum(tangent * across, axis=1), 1e-9)
+        return s
+
+    def offsets(self, centres: np.ndarray, rays: np.ndarray) -> Offsets:
+        """How far rays pass by the wire, and what that depends on.
+
+        The plane through a ray's origin c and the tangent T at the nearest point P has the normal (P - c) x T; the
+        offset is the ray's angle to it. Near zero offset neither s nor the normal's length matters to first order.
+
+        Args:
+            centres: origins of the rays [m], shape (n, 3).
+            rays: unit rays, shape (n, 3).
+        """
+        s = self.nearest(centres, rays)
+        to_point, tangent = self.at(s) - centres, self.tangent(s)
+        normals = np.cross(to_point, tangent)
+        size = np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
+        by_point = np.cross(tangent, rays) / size[:, None]     # r . (dP x T) = dP . (T x r)
+        by_tangent = np.cross(rays, to_point) / size[:, None]
+        e1, e2, _ = self.axes.T
+        jacobian = np.stack([by_point @ e1, by_point @ e2, s * (by_point @ e1) + by_tangent @ e1,
+                             s * (by_point @ e2) + by_tangent @ e2,
+                             0.5 * s * s * (by_point @ e2) + s * (by_tangent @ e2)], axis=1)
+        return Offsets(np.sum(normals * rays, axis=1) / size, normals / size[:, None], jacobian,
+                       np.sum(to_point * rays, axis=1), s)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Rays against a wire.
+
+    Attributes:
+        angles: signed angles by which the rays pass the wire [rad], shape (n,).
+        normals: unit normals of the planes through the rays' origins and the wire, shape (n, 3).
+        jacobian: derivative of the angles by the wire's five parameters, shape (n, 5).
+        ahead: how far along each ray the wire is [m], shape (n,); negative: behind its origin.
+        s: the nearest points of the wire [m], shape (n,).
+    """
+
+    angles: np.ndarray
+    normals: np.ndarray
+    jacobian: np.ndarray
+    ahead: np.ndarray
+    s: np.ndarray

@@ -1,0 +1,187 @@
+"""Red cables in a colour image: arcs on the sphere of rays.
+
+A straight wire is seen as a plane through the optical centre, under any lens; one that sags, as an arc near a plane. So
+pixels of redness R - max(G, B) become ridge points across each blob, these become rays, and parabolas about the blob's
+plane are fitted to them. The threshold on redness gives no false segments on a textured background, where a line
+detector on the red channel gave thousands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perch_core import config
+from perch_core.camera import Camera
+
+SAMPLES = 7          # rays that stand for a sighting
+HYPOTHESES = 64      # arcs tried per blob and round
+MAX_BEND = 0.6       # second derivative of an arc: a wire bends no more [1/rad]
+MAX_LINES = 6        # lines in one blob: cables that cross in the image share one
+
+
+@dataclass(frozen=True)
+class LineDetectionConfig:
+    """What counts as a cable in the image."""
+
+    redness: float = config.quantity(20.0, low=1.0, high=255.0, doc="least R - max(G, B) of a cable [grey values]")
+    min_length: float = config.quantity(30.0, unit="px", above=0.0, high=640.0, doc="shorter arcs are not used")
+    tolerance: float = config.quantity(1.5, unit="px", above=0.0, high=20.0, doc="of ridge points from their arc")
+    max_gap: float = config.quantity(25.0, unit="px", above=0.0, high=200.0, doc="hole after which an arc is another one")
+    sigma: float = config.quantity(0.2, unit="px", above=0.0, high=5.0, doc="error of an arc that averaging does not remove")
+
+
+@dataclass(frozen=True)
+class LineSighting:
+    """One arc of a straight wire in one image.
+
+    Attributes:
+        rays_C: unit rays to its axis in C, in order along it, shape (7, 3).
+        ends_C: rays to its visible ends, shape (2, 3).
+        sigma: 1-sigma of a ray across the arc [rad].
+        width: angle that the wire's thickness subtends [rad].
+        length: in the image [px].
+    """
+
+    rays_C: np.ndarray
+    ends_C: np.ndarray
+    sigma: float
+    width: float
+    length: float
+
+
+def redness(image: np.ndarray) -> np.ndarray:
+    """R - max(G, B) of an rgb8 image (h, w, 3), not below 0, slightly smoothed, uint8 (h, w)."""
+    r, g, b = cv2.split(image)
+    return cv2.GaussianBlur(cv2.subtract(r, cv2.max(g, b)), (0, 0), 1.0)
+
+
+def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> list[LineSighting]:
+    """Red wires in an rgb8 image, shape (height, width, 3); the longest first."""
+    red = redness(image)
+    mask = (red > settings.redness).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    sightings = []
+    for label in range(1, count):
+        x, y, w, h = stats[label, :4]
+        if max(w, h) < settings.min_length:
+            continue
+        window = slice(y, y + h), slice(x, x + w)
+        blob = np.where(labels[window] == label, red[window], 0).astype(float)
+        pixels, widths = ridge_points(blob)
+        sightings += _arcs(pixels + (x, y), widths, camera, settings)
+    return sorted(sightings, key=lambda sighting: -sighting.length)
+
+
+def ridge_points(blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle of every run of pixels across a blob.
+
+    Args:
+        blob: weights, 0 outside the blob, shape (h, w).
+
+    Returns:
+        Pixels (n, 2) and the width of the runs, along the scanning direction, as weight over the peak weight [px] (n,).
+    """
+    upright = blob.shape[0] > blob.shape[1]  # scan across the longer side
+    across = blob.T if upright else blob
+    inside = np.zeros((across.shape[0] + 2, across.shape[1]), np.int8)
+    inside[1:-1] = across > 0
+    edge = np.diff(inside, axis=0).T
+    column, first = np.nonzero(edge == 1)  # row-major in the transposed array: runs in order, column by column
+    _, last = np.nonzero(edge == -1)
+    sums = np.zeros((3, across.shape[0] + 1, across.shape[1]))
+    sums[0, 1:] = np.cumsum(across, axis=0)
+    sums[1, 1:] = np.cumsum(across * np.arange(across.shape[0])[:, None], axis=0)
+    weight, moment = (sums[k, last, column] - sums[k, first, column] for k in (0, 1))
+    middle = moment / weight
+    pixels = np.stack([middle, column] if upright else [column, middle], axis=-1).astype(float)
+    return pixels, weight / np.percentile(across[across > 0], 95)
+
+
+def _arcs(pixels, widths, camera, settings) -> list[LineSighting]:
+    """Arcs through the ridge points of one blob, the best first, each split where it has holes."""
+    rays = camera.unproject(pixels)
+    seen = np.all(np.isfinite(rays), axis=1)
+    pixels, widths, rays = pixels[seen], widths[seen], rays[seen]
+    if len(rays) < settings.min_length:
+        return []
+    along, across = _arc_coordinates(rays)
+    rng = np.random.default_rng(len(pixels))  # the same image gives the same arcs
+    tolerance = settings.tolerance / camera.fx
+    left = np.arange(len(pixels))
+    sightings: list[LineSighting] = []
+    for _ in range(MAX_LINES):
+        if len(left) < settings.min_length:
+            break
+        inlier, spread = _best_arc(along[left], across[left], rng, tolerance)
+        if inlier.sum() < settings.min_length:
+            break
+        chosen = left[inlier]
+        chosen = chosen[np.argsort(along[chosen], kind="stable")]
+        for piece in _pieces(chosen, pixels, settings):
+            sightings.append(_sighting(piece, pixels, widths, rays, spread, camera, settings))
+        left = left[~inlier]
+    return sightings
+
+
+def _arc_coordinates(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles along and across the plane through the origin that is nearest to rays (n, 3) [rad]."""
+    normal = np.linalg.eigh(rays.T @ rays)[1][:, 0]
+    forward = rays.mean(axis=0)
+    forward = forward - (forward @ normal) * normal
+    forward /= np.linalg.norm(forward)
+    return np.arctan2(rays @ np.cross(normal, forward), rays @ forward), np.arcsin(np.clip(rays @ normal, -1.0, 1.0))
+
+
+def _best_arc(along: np.ndarray, across: np.ndarray, rng: np.random.Generator, tolerance: float
+              ) -> tuple[np.ndarray, float]:
+    """Inliers (n,) of the parabola through most points, by RANSAC and two refits, and their scatter [rad]."""
+    none = np.zeros(len(along), bool), 0.0
+    triples = rng.integers(0, len(along), (HYPOTHESES, 3))
+    t = along[triples]
+    apart = np.abs(t - np.roll(t, 1, axis=1)).min(axis=1) > 0.05 * np.ptp(along)
+    if not apart.any():
+        return none
+    arcs = np.linalg.solve(_powers(t[apart]), across[triples[apart]][..., None])[..., 0]
+    arcs = arcs[np.abs(2.0 * arcs[:, 2]) < MAX_BEND]
+    if len(arcs) == 0:
+        return none
+    sparse = slice(None, None, max(1, len(along) // 200))
+    misfit = np.abs(_powers(along[sparse]) @ arcs.T - across[sparse, None])
+    arc = arcs[np.argmax((misfit < tolerance).sum(axis=0))]
+    for _ in range(2):
+        inlier = np.abs(_powers(along) @ arc - across) < tolerance
+        if inlier.sum() < 3:
+            return none
+        arc = np.linalg.lstsq(_powers(along[inlier]), across[inlier], rcond=None)[0]
+    rest = _powers(along) @ arc - across
+    inlier = np.abs(rest) < tolerance
+    return inlier, float(np.std(rest[inlier])) if inlier.any() else 0.0
+
+
+def _powers(t: np.ndarray) -> np.ndarray:
+    """1, t, t^2 on a new last axis."""
+    return np.stack([np.ones_like(t), t, t * t], axis=-1)
+
+
+def _pieces(ordered: np.ndarray, pixels: np.ndarray, settings: LineDetectionConfig) -> list[np.ndarray]:
+    """Indices of the points of each unbroken piece of an arc, in order along it."""
+    steps = np.linalg.norm(np.diff(pixels[ordered], axis=0), axis=1)
+    pieces = np.split(ordered, np.nonzero(steps > settings.max_gap)[0] + 1)
+    return [p for p in pieces if len(p) >= 2 * SAMPLES
+            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.min_length]
+
+
+def _sighting(piece, pixels, widths, rays, spread, camera, settings) -> LineSighting:
+    groups = np.array_split(piece, SAMPLES)
+    means = np.array([rays[group].mean(axis=0) for group in groups])
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    span = pixels[piece[-1]] - pixels[piece[0]]
+    length = float(np.linalg.norm(span))
+    slant = max(abs(span)) / length  # runs are cut along an image axis, not across the wire
+    sigma = np.hypot(spread / np.sqrt(len(piece) / SAMPLES), settings.sigma / camera.fx)
+    return LineSighting(means, rays[piece[[0, -1]]], float(sigma),
+                        float(np.median(widths[piece]) * slant / camera.fx), length)

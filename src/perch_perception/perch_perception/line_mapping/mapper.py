@@ -1,0 +1,259 @@
+"""The map of wires: sightings come in with the poses of their exposures, segments with covariance come out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Sequence
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.lines import Segment
+from perch_perception.line_mapping.association import AssociationConfig, associate
+from perch_perception.line_mapping.curve import WireCurve
+from perch_perception.line_mapping.observation import LineObservation
+from perch_perception.line_mapping.triangulation import (
+    DegenerateBaseline, TriangulationConfig, WireEstimate, triangulate)
+from perch_perception.pose_buffer import BodyState
+
+PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
+MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
+LEAST_WIDTH_PX = 3.0  # a wire thinner than this in the image has no measurable radius
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """What is kept and published."""
+
+    min_baseline: float = config.quantity(0.03, unit="m", above=0.0, high=1.0, doc="motion between the sightings kept")
+    min_turn: float = config.quantity(3.0, unit="deg", above=0.0, high=90.0, doc="or rotation between them")
+    max_observations: int = config.quantity(40, low=5, high=500, doc="sightings kept per wire")
+    forget_after: float = config.quantity(2.0, unit="s", above=0.0, high=60.0,
+                                          doc="a wire that was never triangulated and is not seen is dropped")
+    max_range: float = config.quantity(8.0, unit="m", above=0.0, high=100.0, doc="ends are not believed beyond this distance")
+    max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
+    straightness: float = config.quantity(0.02, unit="m", above=0.0, high=1.0,
+                                          doc="a sagging wire is cut into chords that stay within this")
+    radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5, doc="radius of a wire too thin to be measured")
+    rotation_sigma: float = config.quantity(0.29, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis, 1 sigma")
+    triangulation: TriangulationConfig = config.part(TriangulationConfig)
+    association: AssociationConfig = config.part(AssociationConfig)
+
+
+@dataclass(frozen=True)
+class MappedLine:
+    """One straight segment of the map.
+
+    Attributes:
+        segment: ends, radius and id.
+        covariance: of the segment's middle, across the wire [m^2], shape (3, 3).
+        direction_sigma: [rad].
+        observations: sightings that it rests on.
+    """
+
+    segment: Segment
+    covariance: np.ndarray
+    direction_sigma: float
+    observations: int
+
+
+@dataclass(frozen=True)
+class LineMap:
+    """What is known of the wires.
+
+    Attributes:
+        time: of the last image [s].
+        lines: segments, by id.
+        degenerate: some wire that is being followed is not determined by the motion so far.
+        message: what is missing, for people; empty when nothing is.
+    """
+
+    time: float
+    lines: tuple[MappedLine, ...]
+    degenerate: bool
+    message: str
+
+
+@dataclass
+class _Track:
+    id: int
+    observations: list[LineObservation]
+    last: LineObservation
+    count: int = 1
+    estimate: WireEstimate | None = None
+    extent: tuple[float, float] | None = None
+    refusal: str = ""
+    radii: list[float] = field(default_factory=list)
+
+
+class LineMapper:
+    """Follows, triangulates and keeps wires. The state is the list of wires."""
+
+    def __init__(self, settings: MapperConfig | None = None) -> None:
+        self.settings = settings or MapperConfig()
+        self._tracks: list[_Track] = []
+        self._next_id = 0
+        self._body: BodyState | None = None
+
+    def update(self, time: float, body: BodyState, seen: Sequence[LineObservation]) -> LineMap:
+        """Take the sightings of one image.
+
+        Args:
+            time: of the exposure [s].
+            body: state of the body then; its covariance is the odometry's share of the map's.
+            seen: the sightings, placed with this state.
+        """
+        self._body = body
+        changed = set()
+        for one, owner in zip(seen, associate(self._tracks, seen, self.settings.association)):
+            if owner is None:
+                continue
+            if owner < 0:
+                self._tracks.append(_Track(self._next_id, [one], one))
+                self._next_id += 1
+            elif self._extend(self._tracks[owner], one):
+                changed.add(owner)
+        for index in sorted(changed):
+            self._triangulate(self._tracks[index])
+        self._merge()
+        self._tracks = [t for t in self._tracks
+                        if t.estimate is not None or time - t.last.time <= self.settings.forget_after]
+        return self.map(time)
+
+    def map(self, time: float) -> LineMap:
+        """The present map."""
+        lines, missing = [], []
+        for track in self._tracks:
+            if track.count < MIN_OBSERVATIONS:
+                continue
+            if track.estimate is None:
+                missing.append(f"line {track.id}: {track.refusal}")
+            else:
+                lines += self._segments(track, missing)
+        return LineMap(time, tuple(sorted(lines, key=lambda line: line.segment.id)), bool(missing), "; ".join(missing))
+
+    def _extend(self, track: _Track, one: LineObservation) -> bool:
+        """Add a sighting; False where it is from the same place as the last and adds nothing."""
+        before = track.observations[-1]
+        track.last = one
+        track.count += 1
+        moved = np.linalg.norm(one.p_WC - before.p_WC) >= self.settings.min_baseline
+        elsewhere = float(one.middle @ before.middle) < np.cos(np.radians(self.settings.min_turn))
+        if not moved and not elsewhere:
+            return False
+        track.observations.append(one)
+        if len(track.observations) > self.settings.max_observations:
+            track.observations = _thinned(track.observations)
+        return True
+
+    def _triangulate(self, track: _Track) -> None:
+        start = track.estimate.curve if track.estimate is not None else None
+        try:
+            track.estimate = triangulate(track.observations, self.settings.triangulation, start)
+        except DegenerateBaseline as refusal:
+            if track.estimate is None:
+                track.refusal = str(refusal)
+            return
+        track.extent = self._extent(track)
+        self._measure_radius(track)
+
+    def _extent(self, track: _Track) -> tuple[float, float] | None:
+        """Range of s that was seen at least twice."""
+        curve, ends = track.estimate.curve, []
+        for one, used in zip(track.observations, track.estimate.used):
+            if not used:
+                continue
+            centres = np.tile(one.p_WC, (2, 1))
+            s = curve.nearest(centres, one.ends_W)
+            point, tangent = curve.at(s), curve.tangent(s)
+            steep = np.abs(np.sum(one.ends_W * tangent, axis=1)) / np.linalg.norm(tangent, axis=1) < np.cos(np.radians(8))
+            near = np.linalg.norm(point - centres, axis=1) < self.settings.max_range
+            if np.all(steep & near):
+                ends.append(sorted(s.tolist()))
+        if len(ends) < 2:
+            return None
+        low, high = sorted(e[0] for e in ends)[1], sorted(e[1] for e in ends)[-2]
+        return (low, high) if high - low > 0.1 else None
+
+    def _measure_radius(self, track: _Track) -> None:
+        one, curve = track.last, track.estimate.curve
+        centre = one.p_WC[None]
+        s = curve.nearest(centre, one.middle[None])
+        distance = float(np.linalg.norm(curve.at(s) - centre))
+        if one.width > LEAST_WIDTH_PX * one.sigma / 0.2 and 0.3 < distance < self.settings.max_range:
+            track.radii = (track.radii + [0.5 * one.width * distance])[-30:]
+
+    def _merge(self) -> None:
+        """Make one of two wires that turned out to be the same: the older keeps its id."""
+        kept: list[_Track] = []
+        for track in self._tracks:
+            twin = next((other for other in kept if _same_wire(other, track)), None)
+            if twin is None:
+                kept.append(track)
+                continue
+            merged = sorted(twin.observations + track.observations, key=lambda one: one.time)
+            while len(merged) > self.settings.max_observations:
+                merged = _thinned(merged)
+            twin.observations, twin.count = merged, twin.count + track.count
+            self._triangulate(twin)
+        self._tracks = kept
+
+    def _segments(self, track: _Track, missing: list[str]) -> list[MappedLine]:
+        """The wire as chords that stay within `straightness`; none where it is not known well enough."""
+        estimate = track.estimate
+        if track.extent is None:
+            missing.append(f"line {track.id}: its ends were not seen yet")
+            return []
+        low, high = track.extent
+        length = high - low
+        sag = abs(estimate.curve.curvature) * length**2 / 8.0
+        # chords of a parabola leave it by their share of its sag; half of it once they are moved to its middle
+        pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * self.settings.straightness)))))
+        radius = float(np.median(track.radii)) if len(track.radii) >= 5 else self.settings.radius
+        lines = []
+        for k in range(pieces):
+            a, b = low + length * k / pieces, low + length * (k + 1) / pieces
+            covariance = self._covariance(estimate, 0.5 * (a + b))
+            if np.sqrt(np.linalg.eigvalsh(covariance)[-1]) > self.settings.max_sigma:
+                missing.append(f"line {track.id}: known to {np.sqrt(np.linalg.eigvalsh(covariance)[-1]):.2f} m only")
+                return []
+            lines.append(MappedLine(_chord(estimate.curve, a, b, radius, track.id + PIECE_IDS * k), covariance,
+                                    self._direction_sigma(estimate), track.count))
+        return lines
+
+    def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
+        """Of the point at s, from the sightings, the calibration and the odometry, shape (3, 3) [m^2]."""
+        lever = so3.hat(estimate.curve.at(np.array(s)) - self._body.p_WB)
+        turned = self._body.covariance[3:, 3:] + np.radians(self.settings.rotation_sigma) ** 2 * np.eye(3)
+        return estimate.point_covariance(s) + lever @ turned @ lever.T + self._body.covariance[:3, :3]
+
+    def _direction_sigma(self, estimate: WireEstimate) -> float:
+        attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1] + np.radians(self.settings.rotation_sigma) ** 2
+        return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
+
+
+def _chord(curve: WireCurve, a: float, b: float, radius: float, id: int) -> Segment:
+    """The straight piece nearest to the wire between a and b: the chord, moved by a third of the sag's two thirds."""
+    lift = -curve.curvature * (b - a) ** 2 / 12.0  # mean of the parabola below its chord
+    shift = lift * curve.axes[:, 1]
+    return Segment.between(curve.at(np.array(a)) + shift, curve.at(np.array(b)) + shift, radius, id)
+
+
+def _thinned(observations: list[LineObservation]) -> list[LineObservation]:
+    """Without the sighting whose neighbours are nearest to each other: the baseline stays, the crowd goes."""
+    centres = np.array([o.p_WC for o in observations])
+    gaps = np.linalg.norm(centres[2:] - centres[:-2], axis=1)
+    out = int(np.argmin(gaps)) + 1
+    return observations[:out] + observations[out + 1:]
+
+
+def _same_wire(a: _Track, b: _Track) -> bool:
+    """Whether two triangulated wires coincide: within 6 cm where the second was seen, and 3 deg."""
+    if a.estimate is None or b.estimate is None or b.extent is None:
+        return False
+    if abs(a.estimate.curve.direction @ b.estimate.curve.direction) < np.cos(np.radians(3.0)):
+        return False
+    points = b.estimate.curve.at(np.linspace(*b.extent, 3))
+    along = a.estimate.curve.direction
+    s = (points - a.estimate.curve.point) @ along
+    return bool(np.all(np.linalg.norm(points - a.estimate.curve.at(s), axis=1) < 0.06))

@@ -1,0 +1,49 @@
+"""A sighting of a wire, placed in the map by the pose of the camera at the exposure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.camera import CameraMount
+from perch_perception.line_mapping.detection import LineSighting
+from perch_perception.pose_buffer import BodyState
+
+
+@dataclass(frozen=True)
+class LineObservation:
+    """One arc in W.
+
+    Attributes:
+        time: of the exposure [s].
+        p_WC: optical centre [m], shape (3,).
+        rays_W: unit rays to the wire's axis, in order, shape (7, 3).
+        ends_W: rays to the visible ends, shape (2, 3).
+        sigma: 1-sigma of a ray across the arc [rad].
+        width: angle that the wire's thickness subtends [rad].
+    """
+
+    time: float
+    p_WC: np.ndarray
+    rays_W: np.ndarray
+    ends_W: np.ndarray
+    sigma: float
+    width: float
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normal in W of the plane through the optical centre, shape (3,)."""
+        return np.linalg.eigh(self.rays_W.T @ self.rays_W)[1][:, 0]
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Ray to the middle of what is seen, shape (3,)."""
+        return self.rays_W[len(self.rays_W) // 2]
+
+
+def place(sighting: LineSighting, body: BodyState, mount: CameraMount) -> LineObservation:
+    """A sighting seen by a camera on the body."""
+    p_WC, R_WC = mount.pose(body.p_WB, body.R_WB)
+    return LineObservation(body.time, p_WC, sighting.rays_C @ R_WC.T, sighting.ends_C @ R_WC.T, sighting.sigma,
+                           sighting.width)

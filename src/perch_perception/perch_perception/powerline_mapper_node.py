@@ -1,0 +1,132 @@
+"""Node `powerline_mapper`: colour images of the front camera in, the map of powerlines out. [P:sec. VI]"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from nav_msgs.msg import Odometry
+from perch_core import config
+from perch_core.errors import ConfigError
+from perch_core.ros import qos
+from perch_core.ros.conversions import odometry_arrays, to_point, to_seconds, to_stamp
+from perch_core.ros.lockstep import Participant
+from perch_core.ros.node import PerchNode, spin_main
+from perch_core.vehicle import load_vehicle
+from perch_msgs.msg import Powerline, PowerlineArray
+from sensor_msgs.msg import Image
+
+from perch_perception.images import ImageError, rgb_image
+from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
+from perch_perception.pending_images import PendingImages
+from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+
+DIAGNOSTICS_PERIOD = 1.0  # [s]
+
+
+@dataclass(frozen=True)
+class PowerlineMapperConfig:
+    """Parameters of the node."""
+
+    vehicle: str = config.text("rpg", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    camera: str = config.text("front", doc="colour camera of the vehicle; its images are on camera_<name>/image_raw")
+    rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
+    max_pose_sigma: float = config.quantity(0.3, unit="m", above=0.0, high=10.0,
+                                            doc="odometry less certain than this maps nothing")
+    detection: LineDetectionConfig = config.part(LineDetectionConfig)
+    mapper: MapperConfig = config.part(MapperConfig)
+
+
+class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
+    """Publishes the whole map on `powerlines` for every image that is used; every image gets a step report."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("powerline_mapper", PowerlineMapperConfig, **kwargs)
+        cv2.setNumThreads(1)
+        vehicle = load_vehicle(self.params.vehicle)
+        mount = vehicle.mounts.get(self.params.camera)
+        if mount is None or not mount.colour:
+            colour = [name for name, m in vehicle.mounts.items() if m.colour]
+            self.destroy_node()
+            raise ConfigError("powerline_mapper", "camera", f"{self.params.camera!r} is no colour camera of "
+                              f"{self.params.vehicle}; there are: {', '.join(colour) or 'none'}")
+        self._mount = mount
+        self._mapper = LineMapper(self.params.mapper)
+        self._buffer = PoseBuffer(reach=0.0)
+        self._used = -np.inf
+        self._costs: deque[float] = deque(maxlen=100)
+        self._images, self._diagnosed = 0, -np.inf
+        self._participant = Participant(self)
+        self._participant.chain(Odometry, "odometry", self._receive_odometry)
+        self._lines = self._participant.publisher(PowerlineArray, "powerlines")
+        self._pending = PendingImages(mount.stamp_offset, self._handle)
+        self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
+        self._participant.greet()
+
+    def _receive_odometry(self, msg: Odometry) -> None:
+        p, q, v, w = odometry_arrays(msg)
+        covariance = np.array(msg.pose.covariance).reshape(6, 6)
+        if self._buffer.add(BodyState(to_seconds(msg.header.stamp), p, q, v, w, covariance)):
+            self._pending.advance(self._buffer.newest)
+
+    def _receive_image(self, msg: Image) -> None:
+        self._pending.add(msg, self._buffer.newest, keep_all=self._participant.lockstep is not False)
+
+    def _handle(self, msg: Image, exposed: float, refusal: str) -> None:
+        """Map one image where it is its turn, publish, and report, whatever happens.
+
+        Args:
+            msg: the image.
+            exposed: middle of its exposure on the IMU's clock [s].
+            refusal: why the image must not be used; empty when it may.
+        """
+        if not refusal and exposed - self._used >= 1.0 / self.params.rate - 1e-3:
+            self._used = exposed
+            begin = time.perf_counter()
+            try:
+                self._publish(self._map(msg, exposed), exposed)
+            except (ImageError, StampError) as error:
+                self._publish(self._mapper.map(exposed), exposed, str(error))
+            self._costs.append(time.perf_counter() - begin)
+        self._participant.report(msg.header.stamp)
+
+    def _map(self, msg: Image, exposed: float) -> LineMap:
+        image, body = rgb_image(msg, self._mount.camera), self._buffer.at(exposed)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(body.covariance[:3, :3])[-1]))
+        if sigma > self.params.max_pose_sigma:
+            raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")
+        self._images += 1
+        sightings = detect_lines(image, self._mount.camera, self.params.detection)
+        return self._mapper.update(exposed, body, [place(one, body, self._mount) for one in sightings])
+
+    def _publish(self, lines: LineMap, exposed: float, problem: str = "") -> None:
+        msg = PowerlineArray(degenerate=lines.degenerate,
+                             message="; ".join(part for part in (problem, lines.message) if part))
+        msg.header.stamp, msg.header.frame_id = to_stamp(float(exposed)), "map"
+        for line in lines.lines:
+            start, end = line.segment.ends
+            msg.lines.append(Powerline(
+                id=int(line.segment.id), start=to_point(start), end=to_point(end), radius=float(line.segment.radius),
+                covariance=line.covariance.astype(float).ravel(), direction_sigma=float(line.direction_sigma),
+                observations=int(line.observations)))
+        self._lines.publish(msg)
+        if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD and self._costs:
+            self._diagnosed = exposed
+            costs = 1e3 * np.array(self._costs)
+            values = {"images": self._images, "lines": len(msg.lines), "dropped": self._pending.dropped,
+                      "cost_ms_median": float(np.median(costs)), "cost_ms_p99": float(np.percentile(costs, 99))}
+            self.publish_diagnostics(exposed, values, 1 if msg.message else 0, msg.message or "ok")
+
+
+def create(**kwargs: Any) -> PowerlineMapperNode:
+    """The node, for its own process or a composed one."""
+    return PowerlineMapperNode(**kwargs)
+
+
+def main() -> None:
+    """Entry point of the executable `powerline_mapper`."""
+    spin_main(create)
