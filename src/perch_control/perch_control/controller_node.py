@@ -29,9 +29,9 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import load_vehicle
 
 STATUS_STEPS = 10        # 50 Hz: the mission takes controller/status at every tenth step
+ESTIMATOR_STEPS = 50     # 10 Hz: estimator/status
 DIAGNOSTICS_STEPS = 500  # 1 Hz
 PERIOD = 0.002
-_OFF_TIME_LOG = 1.0      # the same refusal is logged at most once in this time [s]
 
 
 class ControllerNode(PerchNode[ControllerParameters]):
@@ -57,9 +57,11 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._participant = Participant(self)
         self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
         self._participant.subscribe(ControllerCommand, "controller/command", self._receive_command)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
         self._participant.chain(Odometry, "odometry", self._receive_odometry)
-        self.create_subscription(EstimatorStatus, "estimator/status", self._receive_estimator, qos.CHAIN)
-        self.create_subscription(Imu, "imu/data_raw", self._receive_imu, qos.SENSOR)
+        if self.params.estimator_status:
+            self._participant.chain(EstimatorStatus, "estimator/status", self._receive_estimator, ESTIMATOR_STEPS)
+        self.create_subscription(Imu, "imu/data_raw", self._watch_odometry, qos.SENSOR)
         self.create_service(SetController, "set_controller", self._set_controller)
         self.create_service(Trigger, "abort", self._abort)
 
@@ -68,8 +70,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         if value.vehicle != self.params.vehicle:
             raise PerchError("vehicle: fixed after the start")
         gains = value.gain_set(self._vehicle.name)
-        self._flight.settings = value.flight
-        self._flight.use(GeometricController(self._vehicle, gains), gains)
+        self._flight.use(GeometricController(self._vehicle, gains), gains, value.flight)
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
@@ -85,14 +86,14 @@ class ControllerNode(PerchNode[ControllerParameters]):
             self._flight.follow(Order(msg.id, source, trajectory.start_time, at_end, float(msg.contact_time),
                                       float(msg.recovery_start)))
         except PerchError as error:
-            self._flight.message = f"trajectory {msg.id} refused: {error}"
-            self.get_logger().warning(self._flight.message)
+            self._flight.maneuvers.message = f"trajectory {msg.id} refused: {error}"
+            self.get_logger().warning(self._flight.maneuvers.message)
 
     def _receive_command(self, msg: ControllerCommand) -> None:
         try:
             self._flight.command(Command(msg.command), msg.reason)
         except ValueError as error:  # CommandRefused, or no such command
-            self._flight.message = str(error)
+            self._flight.maneuvers.message = str(error)
             self.get_logger().warning(f"command: {error}")
 
     def _receive_estimator(self, msg: EstimatorStatus) -> None:
@@ -100,10 +101,13 @@ class ControllerNode(PerchNode[ControllerParameters]):
 
     def _receive_imu(self, msg: Imu) -> None:
         w, f = msg.angular_velocity, msg.linear_acceleration
+        self._flight.imu(to_seconds(msg.header.stamp), (w.x, w.y, w.z), (f.x, f.y, f.z))
+
+    def _watch_odometry(self, msg: Imu) -> None:
+        """Odometry that has stopped altogether would stop the lockstep: then the IMU's steps are answered instead."""
         stamp = to_seconds(msg.header.stamp)
-        self._flight.imu(stamp, (w.x, w.y, w.z), (f.x, f.y, f.z))
-        # Odometry that has stopped altogether would stop the lockstep: then the IMU's steps are answered instead.
-        if time.monotonic() - self._last_odometry > self.params.blind_after and stamp > self._flight.now + PERIOD / 2:
+        if time.monotonic() - self._last_odometry > self.params.blind_after and stamp > self._flight.maneuvers.now + PERIOD / 2:
+            self._receive_imu(msg)
             self._answer(msg.header.stamp, self._flight.step_blind(stamp))
 
     def _receive_odometry(self, msg: Odometry) -> None:
@@ -143,20 +147,20 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._steps += 1
 
     def _publish_status(self, stamp: Any) -> None:
-        flight = self._flight
-        running = flight.order
+        flight, maneuvers = self._flight, self._flight.maneuvers
+        running = maneuvers.order
         msg = ControllerStatus(
-            state=int(flight.state), controller=flight.law_name, trajectory_id=flight.trajectory_id,
+            state=int(flight.state), controller=flight.law_name, trajectory_id=maneuvers.trajectory_id,
             trajectory_time=float(flight.trajectory_time), trajectory_duration=float(running.source.duration) if running else 0.0,
             position_error=float(flight.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
-            thrust_margin=float(flight.margin), message=flight.message)
+            thrust_margin=float(flight.margin), message=maneuvers.message)
         msg.header.stamp, msg.header.frame_id = stamp, "map"
         self._status.publish(msg)
 
     def _publish_reference(self, stamp: Any, result: StepResult) -> None:
         x = result.setpoint
         msg = ControlReference(
-            trajectory_id=self._flight.trajectory_id, pose=to_pose(x.p, result.q_C), linear_velocity=to_vector(x.v),
+            trajectory_id=self._flight.maneuvers.trajectory_id, pose=to_pose(x.p, result.q_C), linear_velocity=to_vector(x.v),
             linear_acceleration=to_vector(x.a), angular_velocity=to_vector(result.w_C),
             angular_acceleration=to_vector(result.dw_C), thrust=float(result.wrench[0]), moment=to_vector(result.wrench[1:4]))
         msg.header.stamp, msg.header.frame_id = stamp, "map"
@@ -172,7 +176,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         if len(self._arrivals) > 2:
             values["jitter_us_p99"] = 1e6 * float(np.percentile(np.abs(np.diff(self._arrivals) - PERIOD), 99))
         level = 2 if flight.state.name == "FAILED" else 1 if flight.state.name in ("RECOVERING", "LANDING") else 0
-        self.publish_diagnostics(now, values, level, flight.message)
+        self.publish_diagnostics(now, values, level, flight.maneuvers.message)
 
     # -- services ----------------------------------------------------------------------------------------------------
 

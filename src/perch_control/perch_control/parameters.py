@@ -24,6 +24,7 @@ class ControllerParameters:
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
     gains: str = choice("vehicle", options=("vehicle", "snapdragon", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
+    estimator_status: bool = quantity(True, doc="estimator/status is awaited at every 50th step; false: there is no estimator that sends it")
     blind_after: float = quantity(1.0, unit="s", above=0.0, doc="wall-clock time without odometry while the IMU goes on: descend on the IMU alone")
     controller: ControllerChoice = part(ControllerChoice)
     snapdragon: GeometricGains = part(GeometricGains)

@@ -1,14 +1,15 @@
 """The way back to a hover from any attitude: away from the surface, upright, then stop.
 
-After a missed perch the vehicle lies tilted beside the wall and falls. While the thrust still points away from the wall it
-pushes off (turning upright moves the upper edge of the body towards the wall by its radius), then it turns upright with all
-the moment there is, catches the fall, and hands over to a hover when it is slow and level.
+After a missed perch the vehicle lies tilted beside the wall and falls. Turning upright moves the upper edge of its body
+towards the wall by its radius, so it pushes off first; then it turns with all the moment there is *and* with high thrust:
+as long as the thrust points away from the wall it makes room, and from half way up it brakes the fall. The commanded
+direction leads the present one by a bounded angle, which keeps most of the thrust while the moment is saturated.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, radians
+from math import cos, radians, sin
 
 from perch_control.guidance import horizontal
 from perch_control.reference import Setpoint
@@ -21,15 +22,16 @@ from perch_core.vehicle import GRAVITY
 class RecoverySettings:
     """How a recovery flies."""
 
-    push_time: float = quantity(0.12, unit="s", low=0.0, high=1.0, doc="longest push away from the surface")
-    push_clearance: float = quantity(0.12, unit="m", low=0.0, doc="the push ends at this distance from where contact was missed")
-    push_share: float = quantity(0.7, unit="-", above=0.0, high=1.0, doc="share of the greatest thrust while pushing")
+    push_time: float = quantity(0.04, unit="s", low=0.0, high=1.0, doc="longest push away from the surface")
+    push_clearance: float = quantity(0.10, unit="m", low=0.0, doc="the push ends at this distance from where contact was missed")
+    thrust_share: float = quantity(0.95, unit="-", above=0.0, high=1.0, doc="share of the greatest thrust while pushing and turning")
+    turn_ahead_deg: float = quantity(50.0, unit="deg", above=5.0, high=90.0, doc="the commanded direction leads the present one by so much")
     away_speed: float = quantity(0.5, unit="m/s", low=0.0, doc="speed away from the surface until the clearance is reached")
     away_distance: float = quantity(0.5, unit="m", low=0.0, doc="distance from the surface at which to hover")
-    velocity_gain: float = quantity(4.0, unit="1/s", above=0.0)
+    velocity_gain: float = quantity(6.0, unit="1/s", above=0.0)
     climb_gain: float = quantity(1.0, unit="1/s", low=0.0, doc="vertical speed per height lost")
     climb_speed_max: float = quantity(1.0, unit="m/s", above=0.0)
-    acceleration_max: float = quantity(5.0, unit="m/s^2", above=0.0, doc="horizontal")
+    acceleration_max: float = quantity(4.0, unit="m/s^2", above=0.0, doc="horizontal")
     level_deg: float = quantity(25.0, unit="deg", above=0.0, high=90.0, doc="hand-over to hover below this tilt ...")
     rate: float = quantity(3.0, unit="rad/s", above=0.0, doc="... this body rate ...")
     speed: float = quantity(0.8, unit="m/s", above=0.0, doc="... and this speed")
@@ -67,7 +69,7 @@ class Recovery:
         if self._pushing and (elapsed > s.push_time or clearance > s.push_clearance):
             self._pushing = False
         if self._pushing:
-            f = scale(s.push_share * self._thrust_max, self._normal)
+            f = scale(s.thrust_share * self._thrust_max, self._normal)
             self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._h)
             return
         climb = min(max(-s.climb_gain * moved[2], -s.climb_speed_max), s.climb_speed_max)
@@ -77,10 +79,18 @@ class Recovery:
             away = scale(s.away_speed, (nx, ny, 0.0))
         demand = axpy(-s.velocity_gain, v, scale(s.velocity_gain, (away[0], away[1], climb)))
         side = limited((demand[0], demand[1], 0.0), s.acceleration_max)
-        up = min(max(demand[2], -0.4 * GRAVITY), 0.85 * self._thrust_max - GRAVITY)
-        # A body more than 90 degrees over turns about its own b2 or b1, whichever way is shorter: heading can wait.
+        up = min(max(demand[2], -0.4 * GRAVITY), s.thrust_share * self._thrust_max - GRAVITY)
+        f = (side[0], side[1], up + GRAVITY)
+        ahead = radians(s.turn_ahead_deg)
+        c = dot(b3, f) / norm(f)
+        if c < cos(ahead):
+            # Turn from b3 towards f, in their plane; opposite ones turn about b2.
+            across = axpy(-dot(b3, f), b3, f)
+            across = scale(1.0 / norm(across), across) if norm(across) > 1e-6 * norm(f) else b1
+            f = scale(s.thrust_share * self._thrust_max, axpy(sin(ahead), across, scale(cos(ahead), b3)))
+        # Turning upright, the heading can wait: b2 stays where it is.
         h = b2 if b3[2] < 0.5 else horizontal(b2)
-        self._setpoint = Setpoint(p, v, (side[0], side[1], up), h=h)
+        self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=h)
         self.finished = (b3[2] > cos(radians(s.level_deg)) and norm(w) < s.rate and norm(v) < s.speed
                          and clearance >= 0.5 * s.away_distance)
 

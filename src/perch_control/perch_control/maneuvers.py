@@ -1,0 +1,161 @@
+"""The state of a flight and the changes between its states: stop, recover, land, descend, motors off."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from perch_control.admission import AtEnd, Order
+from perch_control.descent import BlindDescent
+from perch_control.flight_settings import FlightSettings
+from perch_control.guidance import Hold, brake
+from perch_control.modes import FLYING, State
+from perch_control.monitors import reference_tilt_deg
+from perch_control.recovery import Recovery
+from perch_control.reference import Setpoint
+from perch_control.rotor_lag import RotorEstimate
+from perch_control.settings import GeometricGains
+from perch_control.vector3 import axes_of, axpy, norm, scale
+from perch_core.vehicle import GRAVITY, Vehicle
+
+_NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
+_FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
+_ZERO = (0.0, 0.0, 0.0)
+
+
+class Maneuvers:
+    """Owns state, running reference, belief and rotor estimate of a flight.
+
+    Attributes:
+        state, message: as published.
+        now: time of the step [s].
+        belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
+        rotors: rotor speeds as the lag model has them.
+        source, start: running reference and the time at which it began [s].
+        order, trajectory_id: trajectory that is being tracked; the id stays until another one or the motors' stop.
+        attached_to: normal of the surface that carries the vehicle, None: none does.
+        blind: the descent without position that is under way.
+        events: what has happened since the last step.
+    """
+
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings) -> None:
+        self.vehicle, self.gains, self.settings = vehicle, gains, settings
+        self.state, self.message = State.DISARMED, "disarmed"
+        self.now = 0.0
+        self.belief: tuple[float, ...] = ()
+        self.rotors = RotorEstimate((0.0,) * 4, (0.0,) * 4)
+        self.source: Any = Hold(Setpoint(_ZERO))
+        self.start = 0.0
+        self.order: Order | None = None
+        self.trajectory_id = 0
+        self.attached_to: tuple[float, ...] | None = None
+        self.blind: BlindDescent | None = None
+        self.events: list[str] = []
+
+    @property
+    def flying(self) -> bool:
+        """The motors carry the vehicle."""
+        return self.state in FLYING
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the running reference began [s]."""
+        return self.now - self.start
+
+    def setpoint(self, ahead: float = 0.0) -> Setpoint:
+        """The running reference `ahead` seconds from now."""
+        return self.source.setpoint(self.elapsed + ahead)
+
+    def expected(self, time: float) -> Setpoint:
+        """Where the vehicle will be at a time [s]: on its reference in flight, where it is on the ground."""
+        if self.state in (State.TRACKING, State.HOVERING):
+            return self.source.setpoint(time - self.start)
+        return Setpoint(self.belief[0:3], self.belief[3:6])
+
+    def enter(self, state: State, message: str) -> None:
+        """Change the state, and say why."""
+        self.state, self.message = state, message
+        self.events.append(message)
+        if state is not State.TRACKING:
+            self.order = None
+
+    def run(self, source: Any) -> None:
+        """Follow a reference from now on."""
+        self.source, self.start = source, self.now
+
+    def track(self, order: Order, source: Any) -> None:
+        """Follow a trajectory, by the reference made from it."""
+        self.enter(State.TRACKING, f"tracking trajectory {order.id}")
+        self.order, self.source, self.start, self.trajectory_id = order, source, order.start, order.id
+
+    def motors_off(self, state: State, message: str) -> None:
+        """Stop the motors."""
+        self.enter(state, message)
+        self.blind, self.trajectory_id = None, 0
+        self.rotors = RotorEstimate((0.0,) * 4, (0.0,) * 4)
+
+    def attach(self, message: str) -> None:
+        """Stop the motors on a surface that carries the vehicle."""
+        normal = self._surface_normal() or axes_of(self.belief[6:10])[2]
+        self.motors_off(State.DISARMED, message)
+        self.attached_to = normal
+
+    def stop(self, message: str) -> None:
+        """Brake to a hover; out of a tilted attitude by way of a recovery."""
+        setpoint = self.setpoint()
+        _, _, b3 = axes_of(self.belief[6:10])
+        if b3[2] < 0.7 or reference_tilt_deg(self.belief, setpoint) > self.settings.tilt_margin_deg:
+            self.recover(message)
+            return
+        p, v, a = self._point_of_departure(setpoint)
+        self.enter(State.HOVERING, message)
+        self.run(brake(p, v, a, setpoint.h, deceleration=self.settings.brake_deceleration))
+
+    def stay(self, message: str) -> None:
+        """Hover where the vehicle now believes to be: what was followed no longer fits."""
+        self.run(Hold.at(self.belief[0:3], axes_of(self.belief[6:10])[1]))
+        self.stop(message)
+
+    def settle(self, message: str) -> None:
+        """Hover after a recovery, from the state as it is."""
+        self.enter(State.HOVERING, message)
+        self.run(brake(self.belief[0:3], self.belief[3:6], _ZERO, axes_of(self.belief[6:10])[1]))
+
+    def recover(self, message: str) -> None:
+        """Return to a hover from any attitude; from a surface, push off first."""
+        normal = self._surface_normal() or self.attached_to
+        self.attached_to = None
+        thrust_max = 4.0 * self.vehicle.thrust_max / self.vehicle.mass
+        self.enter(State.RECOVERING, f"recovering: {message}")
+        self.run(Recovery(self.settings.recovery, thrust_max, self.belief, normal))
+
+    def land(self, message: str) -> None:
+        """Descend until the ground is felt."""
+        setpoint = self.setpoint()
+        p, v, a = self._point_of_departure(setpoint)
+        self.enter(State.LANDING, message)
+        down = (0.0, 0.0, -self.settings.land_speed)
+        self.run(brake(p, v, a, setpoint.h, down, self.settings.brake_deceleration))
+
+    def descend(self, message: str) -> None:
+        """Descend without position: level, with a little less thrust than the weight."""
+        if self.blind is not None or not self.flying:
+            return
+        self.enter(State.LANDING, f"descent without position: {message}")
+        self.blind = BlindDescent(self.vehicle, self.gains, self.settings, self.belief[6:10], self.belief[10:13], self.now)
+
+    def _point_of_departure(self, setpoint: Setpoint) -> tuple:
+        """Position, velocity and acceleration from which a manoeuvre goes on: without a jump of the reference where the
+        vehicle follows it, from the state where it does not."""
+        near = norm(axpy(-1.0, setpoint.p, self.belief[0:3])) < _FOLLOWED
+        if near and self.state in (State.TRACKING, State.HOVERING):
+            return setpoint.p, setpoint.v, setpoint.a
+        return self.belief[0:3], self.belief[3:6], _ZERO
+
+    def _surface_normal(self) -> tuple[float, ...] | None:
+        """Outward normal of the surface that the trajectory is about to touch or has touched, None: in the open."""
+        order = self.order
+        if order is None or order.at_end is not AtEnd.CONTACT or self.elapsed < order.source.duration - _NEAR_CONTACT:
+            return None
+        a = order.source.setpoint(order.source.duration).a
+        f = (a[0], a[1], a[2] + GRAVITY)
+        return scale(1.0 / max(norm(f), 1e-6), f)
