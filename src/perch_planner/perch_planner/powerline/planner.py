@@ -10,6 +10,7 @@ from perch_core import rotor_model
 from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment
 from perch_core.rotor_model import P, Q, STATES, THRUST, V, W
+from perch_core.so3 import quat_from_matrix
 from perch_core.trajectory import SampledTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import guess
@@ -18,7 +19,7 @@ from perch_planner.powerline.flight import fly
 from perch_planner.powerline.nlp import Numbers, Solution, Structure
 from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import Margins, PowerlineSettings
-from perch_planner.powerline.solving import Solver, end_weights, run_weights, see_weights
+from perch_planner.powerline.solving import PHASES, Solver, end_weights, run_weights, see_weights
 from perch_planner.powerline.stage_functions import line_parameters
 from perch_planner.powerline.validation import check_request
 
@@ -102,7 +103,13 @@ class PowerlinePlanner:
     solver: Solver = field(init=False)
 
     def __post_init__(self) -> None:
-        self.solver = Solver(self.vehicle, self.gravity, self.settings.camera)
+        self.solver = Solver(self.vehicle, self.gravity, self.settings.camera, self.settings.correct_drift)
+
+    def warm_up(self, lines: int = 3) -> None:
+        """Build the solvers of the usual structures beforehand, so that the first plan is as fast as the others."""
+        for perception in (False, True):
+            for phase in PHASES:
+                self.solver.problem(Structure(self.settings.intervals, lines, perception, self.settings.solver), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
         """Plan a perch with its recovery, or a recovery alone.
@@ -126,7 +133,7 @@ class PowerlinePlanner:
         target = request.target()
         turn = 0.0
         if request.perception:
-            q_BC = np.array(self._q_BC())
+            q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)
             turn = guess.facing_turn(request.start[Q], q_BC, target.closest_point(pose.p_WB) - request.start[P])
         T0 = guess.perch_duration(request.start, pose.p_WB)
 
@@ -210,10 +217,6 @@ class PowerlinePlanner:
             if bound.quantity in ("height", "clearance", "thrust", "body_rate"):
                 raised[bound.quantity] = getattr(margins, bound.quantity) + 1.5 * abs(bound.margin) + 1e-3
         return replace(margins, **raised)
-
-    def _q_BC(self) -> np.ndarray:
-        from perch_core.so3 import quat_from_matrix
-        return quat_from_matrix(self.vehicle.mounts[self.settings.camera].R_BC)
 
     def _relevant(self, lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> list[Segment]:
         """The target first, then the others nearest to the straight way."""

@@ -80,6 +80,7 @@ class PowerlineSettings:
     thrust_share: float = quantity(0.95, above=0.0, high=1.0, doc="share of a rotor's greatest thrust that a plan may use")
     end_factor: float = quantity(300.0, low=1.0, high=1e5, doc="end weights of the second phase over those of the first")
     ramp: float = quantity(0.0, low=0.0, high=10.0, doc="input in the impulse of [P:eq15]; 0: as the equation says")
+    correct_drift: bool = quantity(True, doc="remove the integrator's error; false: the authors' discretisation as it is")
     perch: PerchWeights = part(PerchWeights)
     recovery: RecoveryWeights = part(RecoveryWeights)
     perception: PerceptionWeights = part(PerceptionWeights)

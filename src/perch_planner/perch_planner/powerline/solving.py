@@ -33,11 +33,13 @@ class Solver:
         vehicle: body, limits, cameras.
         gravity: [m/s^2].
         camera: name of the camera that the perception costs are about.
+        correct_drift: remove the integrator's error, see `Problem.defects_of`.
     """
 
     vehicle: Vehicle
     gravity: float = GRAVITY
     camera: str = "front"
+    correct_drift: bool = True
     model: RotorModel = field(init=False)
     compiled: bool = field(init=False)
     _stages: StageFunctions = field(init=False, repr=False)
@@ -76,7 +78,7 @@ class Solver:
                 return first
             numbers = replace(numbers, states=first.states, inputs=first.inputs)
         last = self.problem(structure, "polish" if start_phase == "polish" else "second")
-        defects = last.defects_of(numbers.states, numbers.inputs)
+        defects = last.defects_of(numbers.states, numbers.inputs) if self.correct_drift else numbers.defects
         found = last.solve(replace(numbers, end_weights=pinned_end, defects=defects))
         return replace(found, iterations=iterations + found.iterations, time=time + found.time)
 

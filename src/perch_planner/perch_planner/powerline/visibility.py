@@ -1,0 +1,68 @@
+"""How well a manoeuvre keeps its line in view: the measures of the paper's Fig. 7. [P:eq9, P:eq12, P:eq13]"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import lines, so3
+from perch_core.camera import CameraMount
+from perch_core.components import components
+from perch_core.rotor_model import P, Q
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """Line metrics along a trajectory.
+
+    Attributes:
+        reprojection: distance of the line from the image centre [px], shape (m,). [P:eq9]
+        cheirality: h_lc > 0: the line is in front, shape (m,). [P:eq12]
+        segment: h_sv > 0: the segment is at the centre, shape (m,). [P:eq13]
+        in_image: share of the segment's sample points that the camera really sees, shape (m,).
+    """
+
+    reprojection: np.ndarray
+    cheirality: np.ndarray
+    segment: np.ndarray
+    in_image: np.ndarray
+
+    def summary(self) -> dict[str, float]:
+        """Shares of the time and the mean reprojection error while the line is in front."""
+        front = self.cheirality
+        return {
+            "cheirality_share": float(front.mean()),
+            "segment_share": float((self.segment & front).mean()),
+            "mean_reprojection_px": float(self.reprojection[front].mean()) if front.any() else float("nan"),
+            "seen_share": float((self.in_image > 0).mean()),
+        }
+
+
+def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount, samples: int = 41) -> Visibility:
+    """Line metrics of the states of a trajectory.
+
+    Args:
+        states: shape (m, 17).
+        line: the target.
+        mount: camera and its place on the body.
+        samples: points along the segment for `in_image`.
+    """
+    fx, fy = float(mount.camera.K[0, 0]), float(mount.camera.K[1, 1])
+    p_WB, q_WB = components(states[:, P]), components(states[:, Q])
+    o_C, l_C = lines.line_in_camera(p_WB, q_WB, components(line.centre), components(line.direction),
+                                    components(mount.p_BC), components(so3.quat_from_matrix(mount.R_BC)))
+    n_I, l_I = lines.image_line(o_C, l_C, fx, fy)
+    e1_I, e2_I = lines.segment_ends(o_C, l_C, line.half_length, fx, fy)
+    points_W = line.centre + np.linspace(-line.half_length, line.half_length, samples)[:, None] * line.direction
+    seen = np.empty(len(states))
+    for k, state in enumerate(states):
+        R_WC = so3.quat_to_matrix(state[Q]) @ mount.R_BC
+        points_C = (points_W - state[P] - so3.quat_to_matrix(state[Q]) @ mount.p_BC) @ R_WC
+        pixels, valid = mount.camera.project(points_C)
+        inside = valid & (pixels >= 0).all(axis=1) & (pixels[:, 0] < mount.camera.width) & (pixels[:, 1] < mount.camera.height)
+        seen[k] = inside.mean()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.abs(lines.reprojection_error(n_I))
+        segment = lines.segment_visibility(n_I, l_I, e1_I, e2_I) > 0
+    return Visibility(error, lines.cheirality(n_I, l_I) > 0, segment, seen)
