@@ -33,7 +33,7 @@ class FilterConfig:
     clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
     landmarks_per_frame: int = quantity(5, low=1, high=50, doc="most new landmarks per frame")
-    pixel_noise: float = quantity(1.0, unit="px", above=0.0, doc="1 sigma of a track")
+    pixel_noise: float = quantity(2.0, unit="px", above=0.0, doc="1 sigma of a track; its error is not white, see docs/estimation.md")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
     tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
     least_parallax_deg: float = quantity(2.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
@@ -52,10 +52,8 @@ class CalibrationPriors:
 
 @dataclass(frozen=True)
 class StartConfig:
-    """How the filter starts: the pose in `map` that it is told, and how well it is known."""
+    """How the filter starts, and how well the pose is known that it is told."""
 
-    position: tuple[float, float, float] = quantity((0.0, 0.0, 0.0), unit="m", doc="of base_link in map at the start")
-    yaw: float = quantity(0.0, unit="rad", doc="in map at the start")
     position_sigma: float = quantity(0.001, unit="m", above=0.0)
     yaw_sigma: float = quantity(0.001, unit="rad", above=0.0)
     rest_time: float = quantity(0.25, unit="s", above=0.05, high=5.0, doc="IMU at rest needed for a start on the ground")

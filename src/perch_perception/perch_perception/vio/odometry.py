@@ -32,13 +32,20 @@ class VisualInertialOdometry:
     Call `add_imu` with every sample; call `add_image` once `covers(stamp)` says that the IMU has passed the exposure.
     """
 
-    def __init__(self, config: VioConfig, mount: CameraMount) -> None:
+    def __init__(self, config: VioConfig, mount: CameraMount, p_WB: np.ndarray = np.zeros(3), yaw: float = 0.0) -> None:
+        """
+        Args:
+            config: all settings.
+            mount: the camera as calibrated.
+            p_WB: position of the body in W at the start [m], shape (3,).
+            yaw: of the body in W at the start [rad].
+        """
         self.config, self.mount = config, mount
         self.tracker = Tracker(config.tracker, mount.camera)
         self.filter: Msckf | None = None
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, config.faults, 2.0 + config.start.motion_time)
-        self._known = start.told(config)
+        self._known = start.told(config, p_WB, yaw)
         self._gyro_bias = np.zeros(3)
         self._rest_accel: np.ndarray | None = None  # the force at rest, while the ground has not been left for good
         self._resting = self._seen = False

@@ -26,10 +26,10 @@ class KnownPose:
     covariance: np.ndarray
 
 
-def told(config: VioConfig) -> KnownPose:
-    """The pose that the configuration gives."""
+def told(config: VioConfig, p_WB: np.ndarray, yaw: float) -> KnownPose:
+    """The pose at the start as somebody gives it: position [m], shape (3,), and yaw [rad]."""
     s = config.start
-    return KnownPose(np.array(s.position), s.yaw, np.diag([s.position_sigma**2] * 3 + [s.yaw_sigma**2]))
+    return KnownPose(np.array(p_WB, float), yaw, np.diag([s.position_sigma**2] * 3 + [s.yaw_sigma**2]))
 
 
 def with_yaw(q_WB: np.ndarray, yaw: float) -> np.ndarray:
