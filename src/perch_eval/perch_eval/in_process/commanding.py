@@ -1,0 +1,95 @@
+"""Mirrors `perch_control.mission_node`: what is known at a tick to what shall be done."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perch_control.admission import AtEnd
+from perch_control.mission import (
+    Command, ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Outcome, PlanAnswer, State, Target)
+from perch_core.scenario import Scenario
+from perch_core.trajectory import FlatTrajectory
+from perch_eval.in_process.estimation import Odometry
+from perch_eval.in_process.piloting import FlownTrajectory, PilotStatus
+from perch_eval.in_process.planning import Planning
+from perch_eval.in_process.stamps import published, seconds
+from perch_perception.ukf import Health, ImuSample, Status
+
+TICK_STEPS = 10
+
+
+def goal_of(scenario: Scenario) -> Goal:
+    """The goal that a scenario's mission part describes; as `perch_eval.pilot.goal_of` sends it."""
+    mission = scenario.mission
+    return Goal(mission.takeoff_height, mission.search_timeout, replan=mission.replan, attempts=max(1, mission.attempts))
+
+
+class Commanding:
+    """Owns the mission's machine and its view of the world."""
+
+    def __init__(self, settings: MissionSettings, planning: Planning, goal: Goal) -> None:
+        self._settings, self._planning, self._goal = settings, planning, goal
+        self._machine = MissionMachine(settings)
+        self._target: Target | None = None
+        self._estimator: Status | None = None
+        self._imu: list[tuple[float, float, float]] = []
+        self._pending: tuple[float, PlanAnswer] | None = None
+        self._started = False
+        self.outcome: Outcome | None = None
+        self.phases: list[tuple[float, str, str]] = []  # (time [s], phase, message) whenever they change
+
+    def take(self, target: Target) -> None:
+        """A target that counts from this step on."""
+        self._target = target
+
+    def hear(self, estimator: Status) -> None:
+        """The estimator's health, at every 50th step."""
+        self._estimator = estimator
+
+    def feel(self, imu: ImuSample) -> None:
+        """The IMU sample of each step."""
+        self._imu.append(imu.f_B)
+
+    def tick(self, stamp: int, odometry: Odometry, status: PilotStatus, cancel: bool) -> list[tuple[Command, str] | FlownTrajectory]:
+        """What the mission publishes at a tick: commands, then trajectories."""
+        time = seconds(stamp)
+        if not self._started:
+            self._started = True
+            self._machine.start(self._goal, time)
+        answer = None
+        if self._pending is not None and time >= self._pending[0] - 1e-9:
+            answer, self._pending = self._pending[1], None
+        e, estimator = odometry.estimate, self._estimator
+        outputs = self._machine.tick(Inputs(
+            time=time, state=State(e.p_WB, e.q_WB, e.v_WB, e.w_WB_B),
+            estimator_ready=estimator is not None and estimator.health is Health.RUNNING,
+            controller=ControllerState(status.state), controller_message=status.message,
+            trajectory_id=status.trajectory_id, trajectory_time=status.trajectory_time, target=self._target,
+            specific_force_B=np.array(self._imu).reshape(-1, 3), plan=answer, cancel=cancel))
+        self._imu.clear()
+        published_items: list[tuple[Command, str] | FlownTrajectory] = list(outputs.commands)
+        if outputs.reference is not None:
+            flat = outputs.reference
+            flat = FlatTrajectory(flat.durations, flat.coefficients, published(flat.start_time))
+            published_items.append(FlownTrajectory(outputs.trajectory_id, flat, AtEnd.HOLD))
+        if outputs.perch is not None:
+            published_items.append(FlownTrajectory(outputs.trajectory_id, outputs.perch.trajectory, AtEnd.CONTACT,
+                                                   float(self._settings.contact_time)))
+        if outputs.query is not None:
+            self._pending = (time + self._settings.planner_latency, self._planning.answer(outputs.query))
+        if outputs.outcome is not None:
+            self.outcome = outputs.outcome
+        self._note(time)
+        return published_items
+
+    def _note(self, time: float) -> None:
+        now = (self._machine.phase.value, self._machine.message)
+        if not self.phases or self.phases[-1][1:] != now:
+            self.phases.append((time, *now))
+
+    @property
+    def end_of_plan(self) -> float:
+        """Time that is left to the planned contact [s]; nan without a plan."""
+        return self._machine.time_to_contact if math.isfinite(self._machine.time_to_contact) else math.nan

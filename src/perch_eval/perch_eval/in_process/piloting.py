@@ -1,0 +1,84 @@
+"""Mirrors `perch_control.controller_node`: orders and odometry in, motor commands and status out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perch_control.admission import AtEnd, Order
+from perch_control.flight import FlightController
+from perch_control.geometric import GeometricController
+from perch_control.modes import Command, StepResult
+from perch_control.parameters import ControllerParameters
+from perch_control.reference import FlatReference
+from perch_core.errors import PerchError
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import Vehicle
+from perch_eval.in_process.estimation import Odometry
+from perch_perception.ukf import ImuSample, Status
+
+STATUS_STEPS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class FlownTrajectory:
+    """A trajectory as published: `perch_msgs/Trajectory` without ROS."""
+
+    id: int
+    trajectory: FlatTrajectory
+    at_end: AtEnd
+    contact_time: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class PilotStatus:
+    """What `controller/status` tells the mission."""
+
+    state: int
+    message: str
+    trajectory_id: int
+    trajectory_time: float
+
+
+class Piloting:
+    """Owns the flight controller."""
+
+    def __init__(self, params: ControllerParameters, vehicle: Vehicle) -> None:
+        """
+        Raises:
+            PerchError: a control law that this engine does not fly.
+        """
+        if params.controller.type != "geometric" or params.controller.adaptive:
+            raise PerchError(f"controller {params.controller.type!r}{' with L1' if params.controller.adaptive else ''}: "
+                             "the in-process engine flies 'geometric' without L1; use --engine stack")
+        gains = params.gain_set(vehicle.name)
+        self._flight = FlightController(vehicle, GeometricController(vehicle, gains), gains, params.flight)
+
+    def command(self, command: Command, reason: str) -> None:
+        """A command that counts from this step on."""
+        try:
+            self._flight.command(command, reason)
+        except ValueError as error:
+            self._flight.maneuvers.message = str(error)
+
+    def follow(self, order: FlownTrajectory) -> None:
+        """A trajectory that counts from this step on."""
+        try:
+            self._flight.follow(Order(order.id, FlatReference(order.trajectory), order.trajectory.start_time, order.at_end,
+                                      order.contact_time, -1.0))
+        except PerchError as error:
+            self._flight.maneuvers.message = f"trajectory {order.id} refused: {error}"
+
+    def step(self, time: float, imu: ImuSample, odometry: Odometry) -> StepResult:
+        """The motor command of a step."""
+        self._flight.imu(time, imu.w_B, imu.f_B)
+        return self._flight.step(time, odometry.sample)
+
+    def hear(self, estimator: Status) -> None:
+        """The estimator's health, at every 50th step."""
+        self._flight.estimator(estimator.health.value, float(estimator.vio_age), estimator.message)
+
+    @property
+    def status(self) -> PilotStatus:
+        """As published at every 10th step."""
+        flight, maneuvers = self._flight, self._flight.maneuvers
+        return PilotStatus(int(flight.state), maneuvers.message, maneuvers.trajectory_id, float(flight.trajectory_time))
