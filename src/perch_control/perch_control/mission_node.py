@@ -9,22 +9,21 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from perch_msgs.action import Perch
-from perch_msgs.msg import ControllerCommand, ControllerStatus, EstimatorStatus, Step, Trajectory
-from perch_msgs.srv import PlanPerch
+from perch_msgs.msg import ControllerCommand, ControllerStatus, EstimatorStatus, PowerlineArray, Step, Trajectory
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 from sensor_msgs.msg import Imu
 
 from perch_core import so3
-from perch_core.ros.conversions import (
-    odometry_arrays, pose_arrays, to_array, to_point, to_pose, to_seconds, to_stamp, to_vector)
+from perch_core.ros.conversions import odometry_arrays, pose_arrays, to_array, to_seconds, to_stamp
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import flat_message
 from perch_control.mission import (
-    ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Outcome, Outputs, PlanAnswer, PlanQuery, Result,
-    State, Target)
+    ControllerState, Goal, Inputs, MissionMachine, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters
+from perch_control.mission.powerline import MappedLine, powerline_target
+from perch_control.ros.planner_clients import PlannerClients
 
 TICK_STEPS = 10  # the mission decides at 50 Hz
 
@@ -36,6 +35,8 @@ class MissionNode(PerchNode[MissionParameters]):
         super().__init__("mission", MissionParameters, self._change, **kwargs)
         self._machine = MissionMachine(self.params.mission)
         self._target: Target | None = None
+        self._map: PowerlineArray | None = None
+        self._goal: Goal | None = None
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorStatus | None = None
         self._odometry: Odometry | None = None
@@ -52,12 +53,13 @@ class MissionNode(PerchNode[MissionParameters]):
         self._trajectories = self._participant.publisher(Trajectory, "trajectory")
         self._commands = self._participant.publisher(ControllerCommand, "controller/command")
         self._participant.subscribe(PoseWithCovarianceStamped, "target/pose", self._receive_target)
+        self._participant.subscribe(PowerlineArray, "powerlines", self._keep("_map"))
         self._participant.chain(ControllerStatus, "controller/status", self._keep("_status"), TICK_STEPS)
         self._participant.chain(EstimatorStatus, "estimator/status", self._keep("_estimator"), 5 * TICK_STEPS)
         self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
         self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS)
         self._participant.greet()
-        self._planner = self.create_client(PlanPerch, "plan_perch")
+        self._planners = PlannerClients(self)
         self._server = ActionServer(self, Perch, "perch", self._execute, goal_callback=self._accept,
                                     cancel_callback=lambda _: CancelResponse.ACCEPT)
 
@@ -107,7 +109,7 @@ class MissionNode(PerchNode[MissionParameters]):
                 if not future.done():
                     self._deferred = step
                     return
-                self._pending, answer = None, self._answer(future)
+                self._pending, answer = None, self._planners.answer(future)
         outputs = self._machine.tick(self._inputs(to_seconds(step.stamp), answer))
         self._imu.clear()
         self._act(to_seconds(step.stamp), outputs)
@@ -127,8 +129,19 @@ class MissionNode(PerchNode[MissionParameters]):
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0,
             trajectory_time=status.trajectory_time if status else 0.0,
-            target=self._target, specific_force_B=np.array(self._imu).reshape(-1, 3), plan=answer,
+            target=self._present_target(), specific_force_B=np.array(self._imu).reshape(-1, 3), plan=answer,
             cancel=self._goal_handle is not None and self._goal_handle.is_cancel_requested)
+
+    def _present_target(self) -> Target | None:
+        """The pad, or the place on the mapped line that the goal means."""
+        if self._goal is None or self._goal.mode is Mode.SURFACE or self._map is None:
+            return self._target if self._goal is None or self._goal.mode is Mode.SURFACE else None
+        lines = [MappedLine(m.id, to_array(m.start), to_array(m.end),
+                            math.sqrt(max(0.0, np.linalg.eigvalsh(np.reshape(m.covariance, (3, 3)))[-1])), m.direction_sigma)
+                 for m in self._map.lines]
+        return powerline_target(
+            to_seconds(self._map.header.stamp), lines, self._map.degenerate, self._map.message, self._goal.perch_point,
+            self._goal.perch_pitch, to_array(self._odometry.pose.pose.position), self._map.lines)
 
     def _act(self, now: float, outputs: Outputs) -> None:
         stamp = to_stamp(float(now))
@@ -142,7 +155,7 @@ class MissionNode(PerchNode[MissionParameters]):
             self._trajectories.publish(msg)
         if outputs.perch is not None:
             msg = outputs.perch.trajectory
-            msg.id, msg.at_end = outputs.trajectory_id, Trajectory.AT_END_CONTACT
+            msg.id = outputs.trajectory_id
             msg.contact_time = float(self.params.mission.contact_time)
             self._trajectories.publish(msg)
         if outputs.query is not None:
@@ -158,32 +171,11 @@ class MissionNode(PerchNode[MissionParameters]):
     # -- planner -----------------------------------------------------------------------------------------------------
 
     def _ask(self, now: float, query: PlanQuery) -> None:
-        request = PlanPerch.Request(
-            start_time=to_stamp(float(query.start_time)), start_position=to_point(query.p),
-            start_velocity=to_vector(query.v), start_acceleration=to_vector(query.a), start_jerk=to_vector(query.j),
-            start_yaw=float(query.yaw), target=to_pose(query.target.p_WS, query.target.q_WS))
-        nan = float("nan")
-        request.impact_acceleration = request.impact_speed_min = request.impact_speed_max = nan
-        request.thrust_max = request.thrust_min = nan
-        if query.current is not None:
-            request.from_trajectory, request.current = True, query.current
-        if not self._planner.service_is_ready():
-            failed = Future()
-            failed.set_result(PlanPerch.Response(success=False, message="service plan_perch is not there"))
-            self._pending = (now, failed)
-            return
-        future = self._planner.call_async(request)
+        future = self._planners.ask(query)
         future.add_done_callback(self._resume)
-        self._pending = (now + self.params.mission.planner_latency, future)
-
-    @staticmethod
-    def _answer(future: Future) -> PlanAnswer:
-        response = future.result()
-        if response is None:
-            return PlanAnswer(False, f"plan_perch failed: {future.exception()}")
-        trajectory = response.trajectory
-        return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp),
-                          sum(segment.duration for segment in trajectory.segments))
+        powerline = query.goal.mode is Mode.POWERLINE
+        settings = self.params.mission
+        self._pending = (now + (settings.powerline_latency if powerline else settings.planner_latency), future)
 
     # -- action ------------------------------------------------------------------------------------------------------
 
@@ -200,7 +192,8 @@ class MissionNode(PerchNode[MissionParameters]):
             return Perch.Result(success=False, error_code=Perch.Result.BAD_GOAL, message=problem)
         self._goal_handle, self._done = handle, Future()
         start = self._odometry.header.stamp if self._odometry else to_stamp(0)
-        self._machine.start(self._goal(handle.request), to_seconds(start))
+        self._goal = self._goal_of(handle.request)
+        self._machine.start(self._goal, to_seconds(start))
         if self._held is not None:
             held, self._held = self._held, None
             self._tick(held)
@@ -223,7 +216,7 @@ class MissionNode(PerchNode[MissionParameters]):
         if self._done is not None:
             self._done.set_result(outcome)
 
-    def _goal(self, request: Perch.Goal) -> Goal:
+    def _goal_of(self, request: Perch.Goal) -> Goal:
         settings = self.params.mission
 
         def given(value: float, default: float) -> float:
@@ -235,16 +228,22 @@ class MissionNode(PerchNode[MissionParameters]):
             yaw = float(so3.yaw_of(so3.quat_to_matrix(pose_arrays(request.search_pose.pose)[1])))
         return Goal(
             takeoff_height=given(request.takeoff_height, settings.takeoff_height),
-            search_timeout=given(request.search_timeout, settings.search_timeout),
-            search_position=position, search_yaw=yaw,
+            search_timeout=given(request.search_timeout, settings.search_timeout), mode=Mode(request.mode),
+            perch_point=to_array(request.perch_point), perch_pitch=request.perch_pitch,
+            perception_aware=request.perception_aware, search_position=position, search_yaw=yaw,
             inclination_hint=None if math.isnan(request.inclination_hint) else request.inclination_hint,
             replan=request.replan, attempts=max(1, request.attempts))
 
     @staticmethod
     def _problem(request: Perch.Goal) -> str:
         """Why a goal cannot be flown, or nothing."""
-        if request.mode != Perch.Goal.MODE_SURFACE:
-            return f"mode {request.mode} is not MODE_SURFACE ({Perch.Goal.MODE_SURFACE})"
+        if request.mode not in (Perch.Goal.MODE_SURFACE, Perch.Goal.MODE_POWERLINE):
+            return f"mode {request.mode} is neither MODE_SURFACE (0) nor MODE_POWERLINE (1)"
+        if request.mode == Perch.Goal.MODE_POWERLINE:
+            if not np.isfinite(to_array(request.perch_point)).all():
+                return "perch_point is not finite"
+            if not 0.0 <= request.perch_pitch <= math.pi + 1e-6:
+                return f"perch_pitch {request.perch_pitch:g} rad is outside [0, pi]"
         if not math.isnan(request.takeoff_height) and not 0.3 <= request.takeoff_height <= 10.0:
             return f"takeoff_height {request.takeoff_height:g} m is outside [0.3, 10]"
         if not math.isnan(request.search_timeout) and not 0.0 < request.search_timeout <= 300.0:

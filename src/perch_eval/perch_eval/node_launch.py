@@ -178,7 +178,8 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         "perching_planner": vehicle, "powerline_planner": vehicle,
         # In lockstep a busy machine stops time for everybody: only much longer silence means that odometry is gone.
         "controller": vehicle | ({"blind_after": 8.0} if lockstep else {}),
-        "mission": {"mission.planner_latency": scenario.latency.perching_planner},
+        "mission": {"mission.planner_latency": scenario.latency.perching_planner,
+                    "mission.powerline_latency": scenario.latency.powerline_planner},
     }
 
 

@@ -4,7 +4,7 @@ from perch_control.mission.adhesion import AdhesionMonitor, AdhesionLimits
 from perch_control.mission.machine import MissionMachine
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import (
-    Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
+    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
 
 __all__ = ["AdhesionLimits", "AdhesionMonitor", "Command", "ControllerState", "Goal", "Inputs", "MissionMachine",
-           "MissionSettings", "Outcome", "Outputs", "Phase", "PlanAnswer", "PlanQuery", "Result", "State", "Target"]
+           "MissionSettings", "Mode", "Outcome", "Outputs", "Phase", "PlanAnswer", "PlanQuery", "Result", "State", "Target"]

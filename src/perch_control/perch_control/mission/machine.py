@@ -11,7 +11,7 @@ from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import (
-    Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
+    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
 
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
@@ -112,10 +112,10 @@ class MissionMachine:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
             return
         if self._arrived(inputs) and inputs.time - self._moved_at > self._travel + self.settings.search_dwell:
-            rise, turn = self._pattern[self._place % len(self._pattern)]
+            offset, turn = self._pattern[self._place % len(self._pattern)]
             self._place += 1
             p, yaw = self._search_place(inputs.state)
-            self._go(inputs, outputs, p + np.array([0.0, 0.0, rise]), yaw + turn)
+            self._go(inputs, outputs, p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn)
             self.message = f"looking for the target ({why})"
 
     def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -135,7 +135,7 @@ class MissionMachine:
         if inputs.trajectory_id == self._perch_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"perch given up: {inputs.controller_message}")
             return
-        if self._goal.replan:
+        if self._goal.replan and self._goal.mode is Mode.SURFACE:
             self._replan(inputs, outputs, end)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
@@ -152,7 +152,8 @@ class MissionMachine:
         elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"no adhesion: {inputs.controller_message}")
         elif inputs.time > end + self.settings.contact_time + 0.2:
-            outputs.commands.append((Command.HOVER, "no adhesion"))
+            if self._goal.mode is Mode.SURFACE:  # a powerline plan goes on into its recovery by itself
+                outputs.commands.append((Command.HOVER, "no adhesion"))
             self._missed(inputs, "no adhesion")
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -187,12 +188,18 @@ class MissionMachine:
         self.target = target
         zero = np.zeros(3)
         p, yaw = self._hover
-        outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target)
+        outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target, self._goal)
         self._enter(Phase.PLANNING, inputs.time, "planning")
 
     @property
+    def _latency(self) -> float:
+        """How long the planner of this goal is given [s]."""
+        powerline = self._goal.mode is Mode.POWERLINE
+        return self.settings.powerline_latency if powerline else self.settings.planner_latency
+
+    @property
     def _lead(self) -> float:
-        return max(self.settings.plan_lead, self.settings.planner_latency + 0.02)
+        return max(self.settings.plan_lead, self._latency + 0.04)
 
     def _replan(self, inputs: Inputs, outputs: Outputs, end: float) -> None:
         """Refine the target in flight and continue from the running plan's future (M's future work)."""
@@ -207,7 +214,8 @@ class MissionMachine:
                 and start > self._perch.start_time and inputs.time - self._replanned_at >= self.settings.replan_period):
             self._replanned_at, self._asked_target = inputs.time, inputs.target
             zero = np.zeros(3)
-            outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, current=self._perch.trajectory)
+            outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, self._goal,
+                                      current=self._perch.trajectory)
 
     def _fly(self, plan: PlanAnswer, outputs: Outputs) -> None:
         self._perch, self._perch_id = plan, self._new_id()
@@ -219,7 +227,9 @@ class MissionMachine:
         """Whether a target is fresh and certain enough to plan on, and why not."""
         settings = self.settings
         if target is None or target.time < self._entered_search:
-            return False, "no tags seen"
+            return False, "no tags seen" if self._goal.mode is Mode.SURFACE else "no lines mapped"
+        if target.weakness:
+            return False, target.weakness
         if target.position_sigma > settings.target_position_sigma:
             return False, f"position uncertain by {target.position_sigma:.3f} m"
         if target.attitude_sigma > math.radians(settings.target_attitude_sigma_deg):
@@ -243,9 +253,18 @@ class MissionMachine:
             return goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
         return p + np.array([0.0, 0.0, goal.takeoff_height]), yaw
 
-    def _search_pattern(self) -> list[tuple[float, float]]:
+    def _search_pattern(self) -> list[tuple[np.ndarray, float]]:
+        """Places around the search hover (forward, left, up [m], turn [rad]).
+
+        A pad may be out of view: the vehicle turns and rises. Lines have to be seen from different places: it moves
+        up and down, and a little to the sides.
+        """
         rise, turn = self.settings.search_rise, math.radians(self.settings.search_yaw_deg)
-        return [(rise, 0.0), (0.0, turn), (0.0, -turn), (-rise, 0.0), (0.0, 0.0)]
+        if self._goal.mode is Mode.POWERLINE:
+            reach = self.settings.mapping_reach
+            return [(np.array(v), 0.0) for v in ((0, 0, reach), (0, reach / 2, 0), (0, -reach / 2, reach), (0, 0, 0))]
+        return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
+                (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
 
     def _go(self, inputs: Inputs, outputs: Outputs, p: np.ndarray, yaw: float) -> None:
         """Fly from the present hover to another, at rest at both ends."""

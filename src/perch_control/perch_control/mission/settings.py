@@ -25,6 +25,8 @@ class MissionSettings:
     target_attitude_sigma_deg: float = quantity(5.0, unit="deg", above=0.0, high=45.0)
     inclination_tolerance_deg: float = quantity(15.0, unit="deg", above=0.0, high=90.0, doc="allowed difference from the hint")
     planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")
+    powerline_latency: float = quantity(1.0, unit="s", low=0.0, high=10.0, doc="the same for a powerline plan")
+    mapping_reach: float = quantity(0.8, unit="m", above=0.0, high=3.0, doc="how far the vehicle moves to see lines from other places")
     plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
     replan_period: float = quantity(0.1, unit="s", above=0.0, high=5.0)
     replan_until: float = quantity(0.7, unit="s", low=0.0, high=5.0, doc="no new plan closer than this to the contact")

@@ -63,6 +63,13 @@ class Result(IntEnum):
     CRASHED = 8
 
 
+class Mode(IntEnum):
+    """What is perched on: MODE_* of the Perch action."""
+
+    SURFACE = 0
+    POWERLINE = 1
+
+
 @dataclass(frozen=True)
 class State:
     """Estimated state of the vehicle.
@@ -82,7 +89,7 @@ class State:
 
 @dataclass(frozen=True)
 class Target:
-    """The pad as localised.
+    """The place to perch on, as localised: the pad, or the point of a cable with b3 as the perch wants it.
 
     Attributes:
         time: stamp of the image [s].
@@ -90,6 +97,9 @@ class Target:
         q_WS: attitude xyzw, shape (4,).
         position_sigma: largest 1-sigma of the position [m].
         attitude_sigma: largest 1-sigma of the attitude [rad].
+        lines: the map of powerlines that the target belongs to (opaque to the mission); None for a pad.
+        line: id of the target's line in that map.
+        weakness: why the target is not to be planned on yet, or nothing.
     """
 
     time: float
@@ -97,6 +107,9 @@ class Target:
     q_WS: np.ndarray
     position_sigma: float
     attitude_sigma: float
+    lines: Any = None
+    line: int = 0
+    weakness: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,6 +118,10 @@ class Goal:
 
     takeoff_height: float
     search_timeout: float
+    mode: Mode = Mode.SURFACE
+    perch_point: np.ndarray | None = None
+    perch_pitch: float = 0.0
+    perception_aware: bool = False
     search_position: np.ndarray | None = None
     search_yaw: float | None = None
     inclination_hint: float | None = None
@@ -120,7 +137,8 @@ class PlanQuery:
         start_time: when the trajectory shall start [s].
         p, v, a, j: start state in W, shapes (3,).
         yaw: start yaw [rad].
-        target: the pad.
+        target: where to perch.
+        goal: what was asked for.
         current: the trajectory being flown, to be continued from `start_time`; None: start from p, v, a, j.
     """
 
@@ -131,12 +149,21 @@ class PlanQuery:
     j: np.ndarray
     yaw: float
     target: Target
+    goal: Goal
     current: Any = None
 
 
 @dataclass(frozen=True)
 class PlanAnswer:
-    """The planner's answer; `trajectory` is the message to pass on, `duration` its length [s]."""
+    """The planner's answer.
+
+    Attributes:
+        success: there is a plan.
+        message: the planner's words.
+        trajectory: the message to pass on (opaque to the mission).
+        start_time: when it starts [s].
+        duration: from its start to the contact [s].
+    """
 
     success: bool
     message: str

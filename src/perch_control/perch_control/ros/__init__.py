@@ -1,0 +1,1 @@
+"""ROS parts that more than one file of the nodes needs."""
