@@ -58,9 +58,9 @@ def _sightings(scenario_name, hovers, frames, acquired):
         for k in range(frames):
             p_WB, R_WB = start + rng.normal(0, 0.01, 3), so3.exp(rng.normal(0, 0.05, 3))
             image = renderer.render([(p_WB, R_WB)], rng)
-            state = BodyState(0.1 * k, p_WB, so3.quat_from_matrix(R_WB), np.zeros(3), np.zeros(3))
+            state = BodyState(k / 30, p_WB, so3.quat_from_matrix(R_WB), np.zeros(3), np.zeros(3))
             begin = time.perf_counter()
-            result = localizer.process(image, 0.1 * k, state)
+            result = localizer.process(image, k / 30, state)
             seconds = time.perf_counter() - begin
             error = None
             if result.board is not None:

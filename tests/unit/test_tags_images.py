@@ -83,6 +83,26 @@ def test_tracks_through_fast_motion_with_the_vehicles_own_state(places):
         assert place.errors(p, R, result.board)[0] < 0.01
 
 
+def test_following_without_reading_the_numbers_is_as_accurate_and_notices_a_covered_tag(places):
+    """Expected corners are measured at once; a hand over one tag is seen in the same image."""
+    place = places("surface_90")
+    followed, looked = (BoardLocalizer(BOARD, MOUNT, LocalizerConfig(follow_images=n)) for n in (4, 0))
+    for k in range(8):
+        p, R = np.array([0.03 * k, 0.02 * k, 1.2]), so3.exp(np.array([0.0, 0.02 * k, 0.01 * k]))
+        image = place.image(p, R)
+        a, b = (localizer.process(image, k / 30, body(k / 30, p, R)).board for localizer in (followed, looked))
+        assert a.ids == b.ids == (0, 1, 2, 3)
+        assert place.errors(p, R, a)[0] < 0.003
+        np.testing.assert_allclose(a.p_CS, b.p_CS, atol=2e-3)
+    p_WC, R_WC = MOUNT.pose(p, R)
+    centre = BOARD.corners_S[1].mean(axis=0) @ place.surface.R_WS.T + place.surface.p_WS
+    u, v = np.round(MOUNT.camera.project((centre - p_WC) @ R_WC)[0]).astype(int)
+    image[v - 12:v + 40, u - 12:u + 12] = 70
+    result = followed.process(image, 8 / 30, body(8 / 30, p, R))
+    assert result.board.ids == (0, 2, 3)
+    assert place.errors(p, R, result.board)[0] < 0.003
+
+
 def test_uses_what_is_left_of_the_board(places):
     """The vehicle turns until two tags have left the image: the rest still gives a pose, with a larger covariance."""
     place = places("surface_90")

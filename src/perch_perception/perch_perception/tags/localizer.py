@@ -1,7 +1,8 @@
 """From one image after another to poses of the board: search, then track. [M:sec. IV-B]
 
-Searching the whole enlarged frame costs 10 ms and is done at 10 Hz. Once the board is known it is followed in a
-virtual view aimed at where it must be, given the vehicle's motion: 3 ms, and it finds small and slanted tags.
+Searching the whole enlarged frame costs 10 ms and is done at 10 Hz. Once the board is known it is looked at in a virtual
+view aimed at where it must be, given the vehicle's motion: 3 ms, and that finds small and slanted tags. Between such
+looks, which read the tags' numbers anew, the expected corners are good enough to measure the edges at once.
 """
 
 from __future__ import annotations
@@ -30,7 +31,15 @@ class LocalizerConfig:
     max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
                                        doc="a board further away than this is taken for one of another size")
     min_range: float = config.quantity(0.15, unit="m", above=0.0, high=10.0, doc="and so is a nearer one")
+    follow_images: int = config.quantity(4, low=0, high=30, doc="images in a row in which the expected corners are "
+                                         "measured without reading the tags' numbers")
     view_margin: float = config.quantity(1.2, low=1.0, high=3.0, doc="what is looked at around the pad, in pad sizes")
+
+
+FOLLOW_GAP = 0.1      # time since the last sighting over which corners are expected well enough [s]
+FOLLOW_TAGS = 3       # so many tags must be expected: their agreement shows that nothing else was measured
+EXPECTED_MARGIN = 6.0  # an expected corner this near to the border may be outside [px]
+CLEAR = 50.0          # chi^2 to the second-best pose of a sighting that can be followed
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,7 @@ class BoardLocalizer:
         self._last_time = -np.inf                 # ... and when
         self._search_time = -np.inf
         self._searches = 0
+        self._followed = 0                        # images since the numbers were read
 
     def process(self, image: np.ndarray, time: float, body: BodyState | None = None) -> Localization:
         """Look for the board.
@@ -87,22 +97,47 @@ class BoardLocalizer:
         Returns:
             The sighting; `board` is None where there is none, and `message` says why.
         """
-        tracking = self._last is not None and time - self._last_time <= self.settings.lost_after
-        if tracking:
+        if self._last is not None and time - self._last_time <= self.settings.lost_after:
             p_CS, R_CS = self._predict(body)
-            detection, searched = self._look(image, p_CS, self._radius), False
+            result = self._follow(image, time, body, p_CS, R_CS)
+            if result is None:
+                self._followed = 0
+                result = self._attempt(image, self._look(image, p_CS, self._radius), R_CS, False)
+        elif time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
+            return Localization(None, message="waiting for the next search")
         else:
-            R_CS = None
-            if time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
-                return Localization(None, message="waiting for the next search")
-            self._search_time = time
-            detection, searched = self._search(image), True
+            self._search_time, self._followed = time, 0
+            result = self._attempt(image, self._search(image), None, True)
+        if result.board is not None:
+            self._last, self._last_body, self._last_time = result.board, body, time
+        return result
+
+    def _attempt(self, image: np.ndarray, detection: Detection, prior_R_CS: np.ndarray | None,
+                 searched: bool) -> Localization:
+        """Solve for a detection; a refusal becomes the message."""
         try:
-            result = self._solve(image, detection, R_CS, searched)
+            return self._solve(image, detection, prior_R_CS, searched)
         except LocalizationRefusal as refusal:
-            reasons = [str(refusal), *detection.rejected]
-            return Localization(None, searched=searched, message="; ".join(reasons))
-        self._last, self._last_body, self._last_time = result.board, body, time
+            return Localization(None, searched=searched, message="; ".join([str(refusal), *detection.rejected]))
+
+    def _follow(self, image: np.ndarray, time: float, body: BodyState | None, p_CS: np.ndarray,
+                R_CS: np.ndarray) -> Localization | None:
+        """Measure the corners where they are expected; None where that is not safe, or where one is not found."""
+        if (self._followed >= self.settings.follow_images or body is None or self._last_body is None
+                or time - self._last_time > FOLLOW_GAP or self._last.branch_gap < CLEAR):
+            return None
+        pixels, valid = self.mount.camera.project(self.board.corners_S @ R_CS.T + p_CS)
+        inside = np.all(valid & self.mount.camera.contains(pixels, margin=EXPECTED_MARGIN), axis=1)
+        ids = tuple(number for number, seen in zip(self.board.ids, inside) if seen)
+        if len(ids) < FOLLOW_TAGS:
+            return None
+        try:
+            result = self._solve(image, Detection(ids, pixels[inside]), R_CS, False, start=(p_CS, R_CS))
+        except LocalizationRefusal:
+            return None
+        if result.message:
+            return None  # an edge was not found, or tags disagree: look properly
+        self._followed += 1
         return result
 
     def _search(self, image: np.ndarray) -> Detection:
@@ -140,9 +175,9 @@ class BoardLocalizer:
         p_WC_now, R_WC_now = self.mount.pose(now.p_WB, now.R_WB)
         return R_WC_now.T @ (p_WC + R_WC @ p - p_WC_now), R_WC_now.T @ R_WC @ R
 
-    def _solve(self, image: np.ndarray, detection: Detection, prior_R_CS: np.ndarray | None,
-               searched: bool) -> Localization:
-        """Refine the corners and solve for the pose.
+    def _solve(self, image: np.ndarray, detection: Detection, prior_R_CS: np.ndarray | None, searched: bool,
+               start: tuple[np.ndarray, np.ndarray] | None = None) -> Localization:
+        """Refine the corners and solve for the pose, from `start` (p_CS, R_CS) where that is known.
 
         Raises:
             LocalizationRefusal: no usable tag, or no plausible pose.
@@ -156,7 +191,7 @@ class BoardLocalizer:
         ids = tuple(i for i, valid in zip(detection.ids, refined.valid) if valid)
         corners_S = self.board.corners_S[[self.board.ids.index(i) for i in ids]]
         rays, sigma = refined.rays_C[refined.valid], refined.sigma[refined.valid]
-        pose = solve_board(self.mount.camera, corners_S, rays, sigma, ids, prior_R_CS)
+        pose = solve_board(self.mount.camera, corners_S, rays, sigma, ids, prior_R_CS, start)
         distance = float(np.linalg.norm(pose.p_CS))
         if not self.settings.min_range <= distance <= self.settings.max_range:
             raise LocalizationRefusal(

@@ -56,7 +56,8 @@ class BoardPose:
 
 
 def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
-                prior_R_CS: np.ndarray | None = None) -> BoardPose:
+                prior_R_CS: np.ndarray | None = None,
+                start: tuple[np.ndarray, np.ndarray] | None = None) -> BoardPose:
     """Joint pose over all corners; a tag that contradicts the others is left out.
 
     Args:
@@ -66,11 +67,12 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         sigma: 1-sigma of the corners [px], shape (n, 4).
         ids: numbers of the tags, n of them.
         prior_R_CS: predicted attitude; only helps to choose between two minima.
+        start: predicted (p_CS, R_CS) of a board whose pose was unique: spares looking for a second minimum.
 
     Raises:
         LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
     """
-    best = _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS)
+    best = _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start)
     if not _contradicts(best, sigma):
         return best
     if len(ids) >= 3:  # of two tags that disagree, either may be the wrong one
@@ -90,14 +92,14 @@ def _contradicts(pose: BoardPose, sigma: np.ndarray) -> bool:
     return pose.rms > max(MAX_RESIDUAL, MAX_OUTLIER_RATIO * float(np.sqrt(np.mean(sigma**2))))
 
 
-def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS) -> BoardPose:
-    """Best of the two IPPE branches after refinement of both."""
+def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start=None) -> BoardPose:
+    """Best of the two IPPE branches, or of the start alone, after refinement."""
     points, rays, noise = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3), sigma.reshape(-1)
     pixels, seen = camera.project(rays)
     if not np.all(seen):
         raise LocalizationRefusal("a corner lies beyond the lens's field of view")
     branches = []
-    for p, R in planar_branches(points, rays):
+    for p, R in [start] if start is not None else planar_branches(points, rays):
         refined = _refine(camera, points, pixels, noise, p, R)
         if refined is None or refined[0][2] <= 0.0 and camera.max_angle <= np.pi / 2:
             continue
