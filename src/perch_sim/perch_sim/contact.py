@@ -82,6 +82,11 @@ class ContactMonitor:
         """Whether the velcro holds."""
         return self.hold.active
 
+    @property
+    def free(self) -> bool:
+        """Whether nothing was touched lately."""
+        return not (self._touched or self.hold.active)
+
     def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
         """What changed at this instant.
 

@@ -40,5 +40,5 @@ class Imu:
         """
         draw = self._rng.standard_normal(12)
         self.bias = self.bias + self._walk * draw[:6]
-        reading = np.clip(inertial + self.bias + self._noise * draw[6:], -self._range, self._range)
+        reading = np.minimum(np.maximum(inertial + self.bias + self._noise * draw[6:], -self._range), self._range)
         return ImuSample(reading[:3], reading[3:])

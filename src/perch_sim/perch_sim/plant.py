@@ -109,6 +109,8 @@ class Plant:
 
     def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
-        clearances(self._x, self.body, self.obstacles.surfaces, elapsed, self._distances)
+        least = clearances(self._x, self.body, self.obstacles.surfaces, elapsed, self._distances)
+        if least > 0.0 and self.contact.free:
+            return []
         events = self.contact.update(elapsed, before, self._x, self._distances)
         return [event._replace(time=time * 1e-9) for event in events]
