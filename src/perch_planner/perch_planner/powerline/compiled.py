@@ -2,7 +2,8 @@
 
 The cache is `$PERCH_CACHE` or `~/.cache/perch`. A library's name is the hash of its C source, the compiler and its flags,
 so that a change of the model, of CasADi or of the compiler makes a new one. It is written under a temporary name and
-renamed, so that two processes may do it at once. Without a compiler the functions stay interpreted: slower, same results.
+renamed, so that two processes may do it at once. Without a compiler, or with PERCH_COMPILE=0, the functions stay
+interpreted: about five times slower, the same results.
 """
 
 from __future__ import annotations
@@ -55,12 +56,12 @@ def build(functions: dict[str, ca.Function]) -> Path | None:
     """Compile functions, or find them compiled.
 
     Returns:
-        The shared library, or None where there is no compiler.
+        The shared library, or None where there is no compiler or it is not wanted.
 
     Raises:
         RuntimeError: the compiler failed; its first lines are in the message.
     """
-    found = compiler()
+    found = None if os.environ.get("PERCH_COMPILE") == "0" else compiler()
     if found is None:
         return None
     source = _source(functions)

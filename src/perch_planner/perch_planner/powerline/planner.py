@@ -82,12 +82,23 @@ class PowerlinePlan:
                         time_of_maximum=b.time_of_maximum + shift) for b in self.recovery.bounds)
         return (*self.perch.bounds, *late)
 
-    def trajectory(self, model: rotor_model.RotorModel, start_time: float = 0.0) -> SampledTrajectory:
-        """Perch and recovery as one trajectory for the controller."""
-        times, states = self.parts[0].times, self.parts[0].states
-        for part in self.parts[1:]:
-            times = np.concatenate([times, times[-1] + part.times[1:]])
-            states = np.concatenate([states, part.states[1:]])
+    def trajectory(self, model: rotor_model.RotorModel, start_time: float = 0.0, step: float = 0.0) -> SampledTrajectory:
+        """Perch and recovery as one trajectory for the controller.
+
+        Args:
+            model: constants.
+            start_time: stamp of the start [s].
+            step: wanted spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always there.
+        """
+        times, states = [], []
+        begin = 0.0
+        for part in self.parts:
+            stride = max(1, round(step * (len(part.times) - 1) / part.duration))
+            rows = np.append(np.arange(0, len(part.times) - 1, stride), len(part.times) - 1)[1 if times else 0:]
+            times.append(begin + part.times[rows])
+            states.append(part.states[rows])
+            begin += part.duration
+        times, states = np.concatenate(times), np.concatenate(states)
         a_W, dw_B = rotor_model.accelerations(model, states)
         return SampledTrajectory(times=times, p=states[:, P], q=states[:, Q], v=states[:, V], w=states[:, W], a=a_W,
                                  dw=dw_B, rotor_thrust=states[:, THRUST], start_time=start_time)

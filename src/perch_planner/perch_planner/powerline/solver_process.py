@@ -11,6 +11,7 @@ import os
 import select
 import signal
 import sys
+from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
@@ -59,10 +60,16 @@ def _fork(planner: PowerlinePlanner, upstream: Connection) -> tuple[int, Connect
     return pid, mine
 
 
-def _supervise(upstream: Connection) -> None:
+def supervise(upstream: Connection, make: Callable[..., PowerlinePlanner] = PowerlinePlanner) -> None:
+    """Answer the jobs that come down a pipe until it closes.
+
+    Args:
+        upstream: the caller's pipe: a `Setup`, then `Job`s.
+        make: planner of vehicle, settings and gravity.
+    """
     setup: Setup = upstream.recv()
     try:
-        planner = PowerlinePlanner(setup.vehicle, setup.settings, setup.gravity)
+        planner = make(setup.vehicle, setup.settings, setup.gravity)
         planner.warm_up()
     except Exception as error:  # reported to the caller, who raises it
         upstream.send(f"{type(error).__name__}: {error}")
@@ -95,7 +102,12 @@ def _supervise(upstream: Connection) -> None:
         pid, child = _fork(planner, upstream)
 
 
-if __name__ == "__main__":
+def main(make: Callable[..., PowerlinePlanner] = PowerlinePlanner) -> None:
+    """Serve the pipe whose number is the last argument of the command line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
     _die_with_parent()
-    _supervise(Connection(int(sys.argv[1])))
+    supervise(Connection(int(sys.argv[-1])), make)
+
+
+if __name__ == "__main__":
+    main()

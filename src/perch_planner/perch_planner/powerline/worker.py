@@ -22,6 +22,7 @@ from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 
 FALLBACK_SHARE = 0.6  # of the deadline: when the first solver has not answered by then, ipopt gets the rest
+COMMAND = (sys.executable, "-m", "perch_planner.powerline.solver_process")
 START_TIMEOUT = 120.0  # a first start compiles the stage functions [s]
 
 
@@ -62,11 +63,21 @@ class Job:
 class PowerlineWorker:
     """Plans in another process, each plan within a deadline.
 
-    Building one returns at once; the first plan waits for the supervisor to be ready. `close` ends the processes, and so
+    Building one returns at once; call `wait_ready` before the first plan, which otherwise is likely to be refused, as the
+    start counts towards its deadline. `close` ends the processes, and so
     does the end of the caller.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: PowerlineSettings | None = None, gravity: float = GRAVITY) -> None:
+    def __init__(self, vehicle: Vehicle, settings: PowerlineSettings | None = None, gravity: float = GRAVITY,
+                 command: tuple[str, ...] = COMMAND) -> None:
+        """
+        Args:
+            vehicle: plans are for it.
+            settings: of every plan.
+            gravity: [m/s^2].
+            command: starts the planning process; the number of its end of the pipe is appended.
+        """
+        self._command = command
         self._settings = settings or PowerlineSettings()
         self._setup = Setup(vehicle, self._settings, gravity)
         self._lock = threading.Lock()
@@ -76,7 +87,7 @@ class PowerlineWorker:
     def _start(self) -> None:
         self._ready = False
         mine, theirs = Pipe()
-        command = [sys.executable, "-m", "perch_planner.powerline.solver_process", str(theirs.fileno())]
+        command = [*self._command, str(theirs.fileno())]
         self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)
         theirs.close()
         self._pipe: Connection = mine
@@ -94,6 +105,11 @@ class PowerlineWorker:
                 raise PerchError(f"powerline worker: {answer}")
             self._ready = True
         return self._ready
+
+    @property
+    def pid(self) -> int:
+        """Process id of the supervisor, which leads its own session."""
+        return self._process.pid
 
     def _receive(self) -> Any:
         try:
@@ -117,9 +133,10 @@ class PowerlineWorker:
         begin = time.monotonic()
         with self._lock:
             if self._process.poll() is not None:
+                self.close()
                 self._start()
-            if not self.wait_ready():
-                raise PlanningRefusal("deadline", "start", -START_TIMEOUT, f"the planner was not ready after {START_TIMEOUT:g} s")
+            if not self.wait_ready(limit):
+                raise PlanningRefusal("deadline", "start", -limit, f"the planner was not ready after {limit:g} s; ask again")
             first = request.solver or self._settings.solver
             share = FALLBACK_SHARE if first != "ipopt" else 1.0
             answer = self._ask(Job(request, share * limit))
