@@ -24,12 +24,26 @@ class Disturbances:
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Vector product; numpy's own takes most of a step's time."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def turn(phi: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a small rotation vector (Rodrigues)."""
+    angle = float(np.sqrt(phi @ phi))
+    K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
+    if angle < 1e-9:
+        return np.eye(3) + K
+    return np.eye(3) + np.sin(angle) / angle * K + (1 - np.cos(angle)) / angle**2 * (K @ K)
+
+
 @dataclass
 class Plant:
     """State of the vehicle; `advance` integrates it by one control period in sub-steps.
 
-    The floor is a stiff, damped support under the body; `wall` is a plane (point, outward normal) that the body's
-    underside cannot enter: an inelastic stop with a little friction.
+    The floor supports the vehicle and levels it; `wall` is a plane (point, outward normal) that the vehicle's underside cannot
+    enter: an inelastic stop with a little friction.
     """
 
     vehicle: Vehicle
@@ -49,26 +63,24 @@ class Plant:
         if self.speed is None:
             self.speed = np.full(4, np.sqrt(vehicle.mass * 9.81 / 4 / vehicle.thrust_coefficient))
         self.p = np.array(self.p, float)
+        # Torque of a unit thrust at each rotor: its lever, and its drag torque about b3.
+        self._levers = np.array([[y, -x, s * vehicle.torque_ratio]
+                                 for (x, y), s in zip(vehicle.rotor_xy, vehicle.rotor_yaw_sign)]).T
 
     def advance(self, command: np.ndarray, period: float = 0.002, substeps: int = 2) -> None:
         """Follow rotor speed commands [rad/s] for a control period [s]."""
         vehicle, dist = self.vehicle, self.disturbances
         dt = period / substeps
-        tau = vehicle.motor_time_constant * dist.lag_factor
+        share = 1 - np.exp(-dt / (vehicle.motor_time_constant * dist.lag_factor))
         mass = vehicle.mass * dist.mass_factor
         J = np.array(vehicle.inertia) * dist.inertia_factor
-        arms = [np.array([x, y, 0.0]) for x, y in vehicle.rotor_xy]
         for _ in range(substeps):
-            self.speed = self.speed + (np.asarray(command) - self.speed) * (1 - np.exp(-dt / tau))
+            self.speed = self.speed + (np.asarray(command) - self.speed) * share
             thrust = vehicle.thrust_coefficient * self.speed**2 * np.array(dist.rotor_factor)
-            force, torque = np.zeros(3), np.zeros(3)
-            for arm, f, sign in zip(arms, thrust, vehicle.rotor_yaw_sign):
-                force += (0.0, 0.0, f)
-                torque += np.cross(arm, (0.0, 0.0, f)) + (0.0, 0.0, sign * vehicle.torque_ratio * f)
-            airspeed_B = self.R.T @ (self.v - np.array(dist.wind))
-            force -= np.array(vehicle.drag) * airspeed_B
+            force = -np.array(vehicle.drag) * (self.R.T @ (self.v - np.array(dist.wind)))
+            force[2] += thrust.sum()
             a = self.R @ force / mass + G
-            dw = (torque - np.cross(self.w, J * self.w)) / J
+            dw = (self._levers @ thrust - cross(self.w, J * self.w)) / J
             if self.p[2] <= self.floor + 1e-3 and a[2] < 0 and self.v[2] <= 0.3:
                 self.impact_speed = max(self.impact_speed, -self.v[2])
                 a = np.array([0.0, 0.0, -self.v[2] / dt])
@@ -79,7 +91,7 @@ class Plant:
             self.w = self.w + dw * dt
             self.p = self.p + self.v * dt + 0.5 * a * dt**2
             self.v = self.v + a * dt
-            self.R = self.R @ Rotation.from_rotvec(self.w * dt).as_matrix()
+            self.R = self.R @ turn(self.w * dt)
             if self.wall is not None:
                 point, normal = self.wall
                 depth = float((self.p - point) @ normal)
@@ -92,12 +104,27 @@ class Plant:
         """What an accelerometer at the centre of mass reads [m/s^2], shape (3,)."""
         return self.R.T @ (self.acceleration - G)
 
-    def state(self, rng: np.random.Generator | None = None, sigma=(0.0, 0.0, 0.0, 0.0)) -> tuple[float, ...]:
-        """p, v, q (xyzw), w as the controller takes them, 13 floats, with white noise of p, v, angle and rate."""
-        p, v, R, w = self.p, self.v, self.R, self.w
-        if rng is not None:
-            p = p + sigma[0] * rng.normal(size=3)
-            v = v + sigma[1] * rng.normal(size=3)
-            R = R @ Rotation.from_rotvec(sigma[2] * rng.normal(size=3)).as_matrix()
-            w = w + sigma[3] * rng.normal(size=3)
-        return tuple(float(x) for x in (*p, *v, *Rotation.from_matrix(R).as_quat(), *w))
+    @property
+    def state(self) -> tuple[float, ...]:
+        """p, v, q (xyzw), w as the controller takes them, 13 floats."""
+        return tuple(float(x) for x in (*self.p, *self.v, *Rotation.from_matrix(self.R).as_quat(), *self.w))
+
+
+class EstimationError:
+    """What odometry adds to the truth: slow errors of about 1.2 cm, 3 cm/s and 0.35 deg, and a little white noise."""
+
+    def __init__(self, seed: int, scale: float = 1.0) -> None:
+        self._rng, self._scale = np.random.default_rng(seed), scale
+        self._slow = np.concatenate([self._rng.normal(size=3) * s for s in (0.012, 0.0, 0.006)]) * scale
+
+    def __call__(self, plant: Plant) -> tuple[float, ...]:
+        """Odometry of the plant's state, 13 floats."""
+        rng, k = self._rng, self._scale
+        for i, (sigma, tau) in enumerate(((0.012, 0.5), (0.03, 0.1), (0.006, 0.5))):
+            part = slice(3 * i, 3 * i + 3)
+            self._slow[part] = self._slow[part] * np.exp(-0.002 / tau) + rng.normal(size=3) * sigma * k * np.sqrt(
+                1 - np.exp(-0.004 / tau))
+        R = plant.R @ turn(self._slow[6:] + rng.normal(size=3) * 0.0009 * k)
+        return tuple(float(x) for x in (*(plant.p + self._slow[:3] + rng.normal(size=3) * 0.002 * k),
+                                        *(plant.v + self._slow[3:6] + rng.normal(size=3) * 0.005 * k),
+                                        *Rotation.from_matrix(R).as_quat(), *(plant.w + rng.normal(size=3) * 0.01 * k)))

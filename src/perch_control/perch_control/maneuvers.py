@@ -19,6 +19,8 @@ from perch_core.vehicle import GRAVITY, Vehicle
 
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
+_LEVEL = 0.8          # cosine of the tilt up to which a brake starts from the attitude as it is
+_TURNING = 4.0        # the same for the body rate [rad/s]
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -103,7 +105,8 @@ class Maneuvers:
         """Brake to a hover; out of a tilted attitude by way of a recovery."""
         setpoint = self.setpoint()
         _, _, b3 = axes_of(self.belief[6:10])
-        if b3[2] < 0.7 or reference_tilt_deg(self.belief, setpoint) > self.settings.tilt_margin_deg:
+        turning = b3[2] < _LEVEL or norm(self.belief[10:13]) > _TURNING
+        if turning or self._surface_normal() or reference_tilt_deg(self.belief, setpoint) > self.settings.tilt_margin_deg:
             self.recover(message)
             return
         p, v, a = self._point_of_departure(setpoint)

@@ -1,0 +1,154 @@
+"""The controller in closed loop with the plant, without ROS: what the unit tests and the benchmark fly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from closed_loop.plant import Disturbances, EstimationError, Plant
+from perch_control.admission import AtEnd, Order
+from perch_control.flight import FlightController
+from perch_control.flight_settings import FlightSettings
+from perch_control.geometric import GeometricController
+from perch_control.guidance import Hold
+from perch_control.modes import Command, State
+from perch_control.reference import FlatReference
+from perch_control.rotor_lag import RotorEstimate
+from perch_control.settings import GeometricGains
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_core.vehicle import Vehicle, load_vehicle
+
+PERIOD = 0.002
+_PLANS = Path(__file__).with_name("perches.json")
+
+
+@dataclass(frozen=True)
+class Perch:
+    """A perch of `perches.json`: plans of perch_planner for the snapdragon, from a hover at (0, 0, 1.2) m."""
+
+    trajectory: FlatTrajectory
+    normal: np.ndarray
+    contact: np.ndarray
+
+
+def perch(name: str) -> Perch:
+    """A stored plan: surface_90_1.7m, surface_90_3m, surface_60_1.7m, surface_60_3m."""
+    plan = json.loads(_PLANS.read_text())[name]
+    return Perch(FlatTrajectory(np.array(plan["durations"]), np.array(plan["coefficients"])),
+                 np.array(plan["normal"]), np.array(plan["contact"]))
+
+
+@dataclass
+class Loop:
+    """A flight: plant, controller, clock; records what happens.
+
+    Attributes:
+        odometry: what the controller is told, from the plant; by default the truth.
+        events: (time, state, text).
+        states, references: true state and reference position at each step in flight.
+    """
+
+    controller: FlightController
+    plant: Plant
+    odometry: Callable[[Plant], tuple[float, ...]] = lambda plant: plant.state
+    time: float = 0.0
+    events: list[tuple[float, str, str]] = field(default_factory=list)
+    states: list[np.ndarray] = field(default_factory=list)
+    references: list[np.ndarray] = field(default_factory=list)
+
+    def run(self, duration: float, until: Callable[[Loop], bool] | None = None) -> bool:
+        """Fly on; True when `until` became true before the time was over."""
+        for _ in range(round(duration / PERIOD)):
+            self.controller.imu(self.time, tuple(self.plant.w.tolist()), tuple(self.plant.specific_force_B.tolist()))
+            result = self.controller.step(self.time, self.odometry(self.plant))
+            if result.event:
+                self.events.append((self.time, self.controller.state.name, result.event))
+            if result.setpoint is not None:
+                self.states.append(np.array(self.plant.state))
+                self.references.append(np.array(result.setpoint.p))
+            self.plant.advance(np.array(result.rotor_speed) if result.armed else np.zeros(4))
+            self.time += PERIOD
+            if until is not None and until(self):
+                return True
+        return False
+
+    def follow(self, trajectory: FlatTrajectory, at_end: AtEnd = AtEnd.HOLD, contact_time: float = 0.25, id: int = 1,
+               delay: float = 0.04) -> None:
+        """Give the controller a trajectory that starts `delay` seconds from now."""
+        self.controller.follow(Order(id, FlatReference(trajectory), self.time + delay, at_end, contact_time))
+
+    def begin_in_hover(self, p=(0.0, 0.0, 1.2)) -> None:
+        """Put the vehicle into a hover at `p` without flying there."""
+        plant, maneuvers = self.plant, self.controller.maneuvers
+        plant.p, hover = np.array(p, float), plant.vehicle.mass * 9.81 / 4 / plant.vehicle.thrust_coefficient
+        plant.speed = np.full(4, np.sqrt(hover))
+        self.controller.step(self.time, self.odometry(plant))
+        maneuvers.enter(State.HOVERING, "in the air")
+        maneuvers.rotors = RotorEstimate(tuple(plant.speed.tolist()), tuple(plant.speed.tolist()))
+        maneuvers.run(Hold.at(plant.p, (0.0, 1.0, 0.0)))
+        self.time += PERIOD
+        self.run(0.3)
+
+    def take_off(self, height: float = 1.2) -> None:
+        """From the ground to a hover."""
+        self.run(0.1)
+        self.controller.command(Command.ARM)
+        p = self.plant.p.copy()
+        self.follow(rest_to_rest(p, p + [0, 0, height], 0.0, 0.0, max(1.0, height / 0.8)))
+        self.run(max(1.0, height / 0.8) + 0.5)
+
+    @property
+    def rmse(self) -> np.ndarray:
+        """RMS of the distance to the reference per axis over the recorded steps [m], shape (3,)."""
+        return np.sqrt(np.mean((np.array(self.states)[:, :3] - np.array(self.references)) ** 2, axis=0))
+
+
+def make_loop(vehicle: Vehicle | None = None, p=(0.0, 0.0, 0.0), disturbances: Disturbances | None = None,
+              noise_seed: int | None = None, settings: FlightSettings | None = None, law=None, **plant) -> Loop:
+    """A vehicle at rest on the ground with its controller."""
+    vehicle = vehicle or load_vehicle("snapdragon")
+    gains = GeometricGains()
+    flight = FlightController(vehicle, law or GeometricController(vehicle, gains), gains, settings or FlightSettings())
+    body = Plant(vehicle, p, speed=np.zeros(4), disturbances=disturbances or Disturbances(), **plant)
+    loop = Loop(flight, body)
+    if noise_seed is not None:
+        loop.odometry = EstimationError(noise_seed)
+    return loop
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """How a vehicle meets the surface: speeds [m/s], tilt [deg], distance from the wanted point [m], time late [s]."""
+
+    normal_speed: float
+    tangential_speed: float
+    tilt_deg: float
+    offset: float
+    late: float
+    rmse: np.ndarray
+
+    @property
+    def holds(self) -> bool:
+        """Within the velcro's limits (scenario `Adhesion`)."""
+        return 0.2 <= self.normal_speed <= 1.0 and self.tangential_speed <= 0.6 and self.tilt_deg <= 15.0
+
+
+def fly_to_contact(plan: Perch, **options) -> tuple[Arrival, Loop]:
+    """From a hover, fly a stored perch, and measure the arrival at the plane of the pad."""
+    loop = make_loop(**options)
+    loop.begin_in_hover()
+    loop.states.clear(), loop.references.clear()
+    loop.plant.floor = -10.0  # the plan's lowest point is 15 cm above the ground: the test is about the wall
+    start = loop.time + 0.04
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(plan.trajectory.duration + 0.4, until=lambda x: (x.plant.p - plan.contact) @ plan.normal <= 0)
+    plant, n = loop.plant, plan.normal
+    along = plant.v - (plant.v @ n) * n
+    gap = plant.p - plan.contact
+    tilt = np.degrees(np.arccos(np.clip(plant.R[:, 2] @ n, -1, 1)))
+    return Arrival(float(-plant.v @ n), float(np.linalg.norm(along)), float(tilt),
+                   float(np.linalg.norm(gap - (gap @ n) * n)), loop.time - start - plan.trajectory.duration, loop.rmse), loop

@@ -1,0 +1,174 @@
+"""The controller flown on a plant of its own: perches arrive within the velcro's limits, and every fault has a way out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from closed_loop.loop import fly_to_contact, make_loop, perch
+from closed_loop.plant import EstimationError
+from perch_control.admission import AtEnd
+from perch_control.modes import Command, State
+from perch_core.trajectory import rest_to_rest
+
+PERCHES = ("surface_90_1.7m", "surface_90_3m", "surface_60_1.7m")
+
+
+@pytest.mark.parametrize("name", PERCHES)
+def test_perch_with_true_state_arrives_as_planned(name):
+    """Issue 6: tracking of the perch with true state <= 5 cm per axis RMSE."""
+    arrival, _ = fly_to_contact(perch(name))
+    assert arrival.holds, arrival
+    assert arrival.tilt_deg < 8 and arrival.offset < 0.05
+    assert np.all(arrival.rmse < 0.05)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_perch_at_90_deg_holds_with_estimation_errors(seed):
+    arrival, _ = fly_to_contact(perch("surface_90_1.7m"), noise_seed=seed)
+    assert arrival.holds, arrival
+    assert np.all(arrival.rmse < 0.11)
+
+
+def test_without_rehearsal_the_vehicle_pushes_itself_off_the_wall():
+    """Why the rehearsal is there: stopping the rotation takes thrust that points away from the wall."""
+    from perch_control.geometric import GeometricController
+    from perch_control.settings import GeometricGains
+    from perch_core.vehicle import load_vehicle
+
+    vehicle = load_vehicle("snapdragon")
+    plain = GeometricController(vehicle, GeometricGains(rehearse=False))
+    plan = perch("surface_90_1.7m")
+    without, _ = fly_to_contact(plan, law=plain)
+    rehearsed, _ = fly_to_contact(plan)
+    assert without.normal_speed < 0.2 < 0.4 < rehearsed.normal_speed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_missed_perch_recovers_to_a_hover(seed):
+    plan = perch("surface_90_1.7m")
+    loop = make_loop(noise_seed=seed)
+    loop.begin_in_hover()
+    loop.plant.wall, loop.plant.floor = (plan.contact, plan.normal), -10.0
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    assert loop.run(plan.trajectory.duration + 0.5, until=lambda x: x.controller.state is State.RECOVERING)
+    lowest = [loop.plant.p[2]]
+    edge = []
+
+    def watch(x):
+        lowest.append(x.plant.p[2])
+        sine = np.sqrt(max(1 - (x.plant.R[:, 2] @ plan.normal) ** 2, 0.0))
+        edge.append((x.plant.p - plan.contact) @ plan.normal + x.plant.vehicle.perch_offset - max(x.plant.vehicle.body_radii) * sine)
+        return x.controller.state is State.HOVERING
+
+    assert loop.run(3.0, until=watch), loop.events
+    loop.run(2.0)
+    assert loop.controller.state is State.HOVERING and np.linalg.norm(loop.plant.v) < 0.15
+    assert min(lowest) > 0.15, "the pad is 1.2 m above the ground: the fall must end before it"
+    assert min(edge) > 0.0, "turning upright, the rim must not strike the wall"
+
+
+def test_abort_in_mid_perch_recovers(seed=1):
+    plan = perch("surface_90_1.7m")
+    loop = make_loop(noise_seed=seed, floor=-10.0)
+    loop.begin_in_hover()
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(0.04 + plan.trajectory.duration - 0.2)
+    assert "recovering" in loop.controller.abort()
+    assert loop.run(3.0, until=lambda x: x.controller.state is State.HOVERING)
+
+
+def test_hover_command_brakes_smoothly():
+    loop = make_loop()
+    loop.begin_in_hover()
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [3, 0, 0], 0, 0, 2.5), id=3)
+    loop.run(1.2)
+    before = np.linalg.norm(loop.plant.v)
+    loop.controller.command(Command.HOVER, "test")
+    references = len(loop.references)
+    loop.run(2.0)
+    steps = np.diff(np.array(loop.references[references - 1:]), axis=0) / 0.002
+    assert np.abs(np.diff(steps, axis=0) / 0.002).max() < 10.0, "the reference brakes with bounded acceleration"
+    assert before > 1.5 and np.linalg.norm(loop.plant.v) < 0.03 and loop.controller.state is State.HOVERING
+
+
+def test_landing_ends_with_motors_off_on_the_ground():
+    loop = make_loop(noise_seed=0)
+    loop.take_off(0.6)
+    loop.controller.command(Command.LAND)
+    assert loop.run(10.0, until=lambda x: x.controller.state is State.DISARMED), loop.events
+    assert loop.plant.p[2] < 0.02 and loop.plant.impact_speed < 0.5
+
+
+@pytest.mark.parametrize("bad", ["nan", "quaternion"])
+def test_bad_odometry_is_said_once_and_ends_in_a_descent(bad):
+    loop = make_loop()
+    loop.begin_in_hover()
+
+    def broken(plant):
+        state = list(plant.state)
+        if bad == "nan":
+            state[4] = float("nan")
+        else:
+            state[6:10] = [0.0, 0.0, 0.0, 0.5]
+        return tuple(state)
+
+    loop.events.clear()
+    loop.odometry = broken
+    assert loop.run(6.0, until=lambda x: x.controller.state is State.DISARMED), loop.events
+    texts = [text for _, _, text in loop.events]
+    assert sum("refused" in t for t in texts) == 1
+    assert any("descent without position" in t for t in texts)
+    assert loop.plant.p[2] < 0.02 and loop.plant.impact_speed < 2.0
+
+
+def test_a_single_bad_sample_is_bridged():
+    loop = make_loop()
+    loop.begin_in_hover()
+    count = [0]
+
+    def hiccup(plant):
+        count[0] += 1
+        return (float("nan"),) * 13 if count[0] % 50 == 0 else plant.state
+
+    loop.odometry = hiccup
+    loop.run(1.0)
+    assert loop.controller.state is State.HOVERING and np.linalg.norm(loop.plant.v) < 0.02
+
+
+def test_jumped_odometry_hovers_at_the_new_place_without_chasing_it():
+    loop = make_loop()
+    loop.begin_in_hover()
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [2, 0, 0], 0, 0, 4.0), id=3)
+    loop.run(1.0)
+    loop.odometry = lambda plant: (plant.state[0] + 1.0, *plant.state[1:])
+    loop.run(0.5)
+    assert loop.controller.state is State.HOVERING
+    loop.run(1.5)
+    assert np.linalg.norm(loop.plant.v) < 0.05 and abs(loop.plant.p[0] - p[0]) < 1.0
+
+
+def test_missing_odometry_descends_on_the_imu_alone():
+    loop = make_loop()
+    loop.begin_in_hover()
+    x, rng = loop, np.random.default_rng(0)
+    for _ in range(3000):
+        gyro = x.plant.w + 0.01 * rng.normal(size=3)
+        force = x.plant.specific_force_B + 0.316 * rng.normal(size=3)
+        x.controller.imu(x.time, tuple(gyro.tolist()), tuple(force.tolist()))
+        result = x.controller.step_blind(x.time)
+        x.plant.advance(np.array(result.rotor_speed) if result.armed else np.zeros(4))
+        x.time += 0.002
+    assert x.controller.state is State.DISARMED
+    assert x.plant.p[2] < 0.02 and x.plant.impact_speed < 2.0
+
+
+def test_estimation_errors_do_not_shake_the_hover():
+    loop = make_loop(noise_seed=3)
+    loop.begin_in_hover()
+    loop.states.clear(), loop.references.clear()
+    loop.run(2.0)
+    assert np.all(loop.rmse < 0.04)
+    assert isinstance(loop.odometry, EstimationError)

@@ -1,0 +1,199 @@
+"""The geometric law against flatness, finite differences and its own singular cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perch_control.geometric import GeometricController, packed_vehicle
+from perch_control.geometric.law import attitude_error, geometric_step
+from perch_control.geometric.step import predicted
+from perch_control.reference import FlatReference, SampledReference, Setpoint, heading, packed_many
+from perch_control.rotor_lag import RotorEstimate, leading_command, reachable, thrusts
+from perch_control.settings import GeometricGains
+from perch_core import rigid_body
+from perch_core.flatness import flat_to_state
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.vehicle import load_vehicle
+
+VEHICLE = load_vehicle("snapdragon")
+J = tuple(VEHICLE.inertia)
+GAINS = (7.0, 7.0, 9.0, 4.5, 4.5, 5.5, 400.0, 400.0, 60.0, 30.0, 30.0, 10.0)
+FREE = (1e9, 1e9, 0.1, 1e9, 1e9, 1.0)  # limits that never act; the feedback's own rate counts fully
+NONE = (0.0,) * 6
+
+
+def flat(rng, yaw_rate=True):
+    p, v, a, j, s = (rng.normal(size=3) * k for k in (1, 1, 4, 10, 50))
+    yaw = rng.normal(size=3) * (1, 1, 2) if yaw_rate else np.array([0.3, 0, 0])
+    return p, v, a, j, s, *yaw
+
+
+def setpoint(x):
+    return Setpoint(*(tuple(map(float, v)) for v in x[:5]), *heading(*map(float, x[5:])))
+
+
+def body(R, w):
+    return (*Rotation.from_matrix(R).as_quat(), *w)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_on_the_reference_the_law_is_flatness(seed):
+    """[M:eq2] without errors is feed-forward: thrust, attitude, rates and moment of [M:eq9-13] and [M:eq1]."""
+    x = flat(np.random.default_rng(seed))
+    expected = flat_to_state(*x, mass=VEHICLE.mass)
+    R, w, dw = expected.R_WB, expected.w_WB_B, expected.dw_WB_B
+    state = tuple(float(v) for v in (*x[0], *x[1], *body(R, w)))
+    specific = expected.thrust / VEHICLE.mass
+    # Equal gains on all axes: what the unmeasured rate of the thrust leaves out is then along b3 and turns nothing.
+    gains = (7.0,) * 3 + (4.5,) * 3 + GAINS[6:]
+    thrust, M, q_C, w_C, dw_C = geometric_step(state, setpoint(x).packed, specific, NONE, gains, FREE, J)
+    assert thrust * VEHICLE.mass == pytest.approx(expected.thrust)
+    np.testing.assert_allclose(Rotation.from_quat(q_C).as_matrix(), R, atol=1e-9)
+    np.testing.assert_allclose(w_C, w, atol=1e-8 * (1 + np.abs(w).max()))
+    np.testing.assert_allclose(dw_C[:2], dw[:2], rtol=1e-6, atol=1e-6 * (1 + np.abs(dw).max()))
+    moment = np.array(J) * np.array(dw_C) + np.cross(w, np.array(J) * w)
+    np.testing.assert_allclose(M, moment, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_commanded_rates_are_the_derivative_of_the_commanded_attitude(seed):
+    """[M:eq13] with feedback: fly exactly under constant thrust and rates, and differentiate q_C numerically."""
+    rng = np.random.default_rng(seed)
+    x = flat(rng, yaw_rate=False)
+    p, v, w = x[0] + rng.normal(size=3) * 0.3, x[1] + rng.normal(size=3) * 0.3, rng.normal(size=3)
+    R0 = Rotation.random(random_state=seed)
+    thrust = 9.0
+
+    def at(t):
+        reference = [x[0] + x[1] * t + x[2] * t**2 / 2 + x[3] * t**3 / 6 + x[4] * t**4 / 24,
+                     x[1] + x[2] * t + x[3] * t**2 / 2 + x[4] * t**3 / 6, x[2] + x[3] * t + x[4] * t**2 / 2,
+                     x[3] + x[4] * t, x[4], *x[5:]]
+        R = R0 * Rotation.from_rotvec(w * t)
+        # Position to third order from the thrust's motion: enough for a second derivative of the command.
+        b3, db3 = R0.as_matrix()[:, 2], R0.as_matrix() @ np.cross(w, (0, 0, 1))
+        a, j = thrust * b3 - (0, 0, 9.81), thrust * db3
+        state = (*(p + v * t + a * t**2 / 2 + j * t**3 / 6), *(v + a * t + j * t**2 / 2), *body(R.as_matrix(), w))
+        out = geometric_step(tuple(map(float, state)), setpoint(reference).packed, thrust, NONE, GAINS, FREE, J)
+        return Rotation.from_quat(out[2]), R, out[3]
+
+    h = 1e-5
+    (before, _, _), (now, R, w_C), (after, _, _) = at(-h), at(0.0), at(h)
+    rate_C = (before.inv() * after).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(w_C, (R.inv() * now).apply(rate_C), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [10, 60, 120, 179, 180])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (1, 1, 0)])
+def test_attitude_error_turns_back_from_any_angle(angle, axis):
+    axis = np.array(axis) / np.linalg.norm(axis)
+    q = Rotation.from_rotvec(np.radians(angle) * axis).as_quat()
+    e, _ = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
+    assert abs(np.dot(e, axis)) == pytest.approx(2 * np.sin(np.radians(angle) / 2), abs=1e-9)
+    if angle == 10:  # the paper's e_R agrees to second order
+        R = Rotation.from_quat(q).as_matrix()
+        paper = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        np.testing.assert_allclose(e, paper, rtol=0.005, atol=1e-12)
+
+
+@pytest.mark.parametrize("a, h, b3", [
+    ((0, 0, -9.81), (0, 1, 0), (0, 0, 1)),       # free fall: no direction
+    ((0, 0, -9.81), (0, 1, 0), (0, 1, 0)),       # free fall with the body along b2_des
+    ((0, 9.0, -9.81), (0, 1, 0), (0, 0, 1)),     # thrust along b2_des: no heading
+    ((0, 0, -25.0), (0, 1, 0), (0, 0, 1)),       # inverted reference
+    ((0, 0, -9.81 + 1e-9), (0, 1, 0), (0, 0, -1)),
+])
+def test_singular_cases_stay_finite(a, h, b3):
+    q = Rotation.align_vectors([b3], [(0, 0, 1)])[0].as_quat()
+    x = Setpoint((0.0, 0.0, 1.0), a=tuple(map(float, a)), j=(1.0, 2.0, 3.0), s=(5.0, 5.0, 5.0), h=tuple(map(float, h)))
+    state = tuple(map(float, (0.1, -0.2, 1.1, 0.3, 0, -0.2, *q, 0.1, 0.2, 0.3)))
+    out = GeometricController(VEHICLE, GeometricGains()).step(state, x.packed, RotorEstimate((1000.0,) * 4, (1000.0,) * 4))
+    for value in (out.rotor_speed, out.wrench, out.q_C, out.w_C, out.dw_C):
+        assert np.isfinite(value).all()
+    assert all(VEHICLE.speed_min <= s <= VEHICLE.speed_max for s in out.rotor_speed)
+
+
+def test_feedback_never_turns_the_thrust_out_of_its_cone():
+    gains = GeometricGains(cone_deg=30.0)
+    controller = GeometricController(VEHICLE, gains)
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        state = tuple(float(v) for v in (*rng.normal(size=6) * 5, 0, 0, 0, 1, 0, 0, 0))
+        out = controller.step(state, Setpoint((0.0, 0.0, 1.0)).packed, RotorEstimate((1260.0,) * 4, (1260.0,) * 4))
+        tilt = np.degrees(np.arccos(Rotation.from_quat(out.q_C).as_matrix()[2, 2]))
+        assert tilt <= 30.0 + 1e-6
+
+
+def test_prediction_agrees_with_the_rigid_body_model():
+    """Second implementation: perch_core.rigid_body, integrated in small steps."""
+    rng = np.random.default_rng(3)
+    R = Rotation.random(random_state=1)
+    p, v, w, f = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3) * 3, np.array([0.5, 0.7, 0.6, 0.65])
+    packed = packed_vehicle(VEHICLE)
+    state = tuple(float(x) for x in (*p, *v, *R.as_quat(), *w))
+    got = predicted(state, tuple(f), NONE, 0.02, VEHICLE.mass, J, packed[2])
+    n = 2000
+    for _ in range(n):
+        a, dw = rigid_body.accelerations(VEHICLE, R.as_matrix(), w, f)
+        h = 0.02 / n
+        p, v, R, w = p + v * h + a * h * h / 2, v + a * h, R * Rotation.from_rotvec(w * h), w + dw * h
+    # Exact to second order in the duration: |jerk| h^3 / 6 is 0.1 mm here.
+    np.testing.assert_allclose(got[0:3], p, atol=1e-4)
+    np.testing.assert_allclose(got[3:6], v, atol=2e-3)
+    assert (Rotation.from_quat(got[6:10]).inv() * R).magnitude() < 2e-3
+    np.testing.assert_allclose(got[10:13], w, atol=5e-2)
+
+
+def test_leading_command_reaches_the_thrust_in_time_and_reachable_says_when_it_cannot():
+    k, tau, lead = VEHICLE.thrust_coefficient, VEHICLE.motor_time_constant, 0.02
+    share = 1 - np.exp(-lead / tau)
+    speed = (1200.0, 1250.0, 1300.0, 1260.0)
+    low, high = reachable(speed, share, VEHICLE.speed_min, VEHICLE.speed_max)
+    wanted = tuple(k * (0.7 * a + 0.3 * b) ** 2 for a, b in zip(low, high))
+    command = leading_command(speed, wanted, k, share, VEHICLE.speed_min, VEHICLE.speed_max)
+    after = np.array(speed)
+    for _ in range(1000):  # the plant's own integration of the lag
+        after = after + (np.array(command) - after) * (1 - np.exp(-lead / 1000 / tau))
+    np.testing.assert_allclose(thrusts(tuple(after), k), wanted, rtol=1e-9)
+    fastest = leading_command(speed, (10.0,) * 4, k, share, VEHICLE.speed_min, VEHICLE.speed_max)
+    assert fastest == (VEHICLE.speed_max,) * 4
+    np.testing.assert_allclose(high, np.array(speed) + (VEHICLE.speed_max - np.array(speed)) * share)
+
+
+def test_compiled_and_plain_code_agree():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        x = flat(rng)
+        state = tuple(float(v) for v in (*rng.normal(size=6), *Rotation.random(random_state=rng.integers(1000)).as_quat(), *rng.normal(size=3)))
+        args = state, setpoint(x).packed, 9.0, NONE, GAINS, (8.0, 0.8, 0.8, 18.0, 250.0, 0.3), J
+        for a, b in zip(geometric_step(*args), geometric_step.py_func(*args)):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_sampled_reference_gives_the_flat_references_setpoints():
+    """A flat trajectory turned into full states and back: position to snap, and an equivalent b2_des."""
+    rng = np.random.default_rng(5)
+    trajectory = FlatTrajectory(np.array([2.0]), np.cumsum(rng.normal(size=(1, 4, 9)) * 0.3, axis=-1))
+    times = np.linspace(0, 2, 401)
+    states = [flat_to_state(x.p, x.v, x.a, x.j, x.s, x.yaw, x.yaw_rate, x.yaw_acc, VEHICLE.mass)
+              for x in map(trajectory.sample, times)]
+    sampled = SampledTrajectory(
+        times, np.array([s.p_WB for s in states]), Rotation.from_matrix([s.R_WB for s in states]).as_quat(),
+        np.array([s.v_WB for s in states]), np.array([s.w_WB_B for s in states]),
+        trajectory.sample_many(times).a, np.array([s.dw_WB_B for s in states]),
+        np.array([np.full(4, s.thrust / 4) for s in states]))
+    a, b = FlatReference(trajectory), SampledReference(sampled, VEHICLE.mass)
+    for t in (0.4, 1.0, 1.55):
+        x, y = a.setpoint(t), b.setpoint(t)
+        for key, tolerance in (("p", 1e-6), ("v", 1e-6), ("a", 1e-4), ("j", 2e-2)):
+            np.testing.assert_allclose(getattr(y, key), getattr(x, key), atol=tolerance, err_msg=key)
+        f = np.array(x.a) + (0, 0, 9.81)
+        np.testing.assert_allclose(np.cross(np.cross(x.h, f), np.cross(y.h, f)), 0.0, atol=1e-2)
+
+
+def test_many_setpoints_are_the_single_ones():
+    rng = np.random.default_rng(1)
+    source = FlatReference(FlatTrajectory(np.array([0.6, 0.9]), rng.normal(size=(2, 4, 8))))
+    times = np.array([0.0, 0.3, 0.59, 0.7, 1.2, 1.5, 1.6])
+    np.testing.assert_allclose(packed_many(source, times), [source.setpoint(t).packed for t in times], atol=1e-9)
