@@ -7,6 +7,7 @@ normal to d. kappa is w/H, weight per length over tension; a taut wire has kappa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class WireCurve:
     direction: np.ndarray
     curvature: float = 0.0
 
-    @property
+    @cached_property
     def axes(self) -> np.ndarray:
         """Columns e1 (horizontal), e2 = u (upward normal) and d, right-handed up to sign, shape (3, 3)."""
         side = np.cross(UP, self.direction)

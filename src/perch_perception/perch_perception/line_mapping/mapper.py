@@ -159,20 +159,19 @@ class LineMapper:
 
     def _extent(self, track: _Track) -> tuple[float, float] | None:
         """Range of s that was seen at least twice."""
-        curve, ends = track.estimate.curve, []
-        for one, used in zip(track.observations, track.estimate.used):
-            if not used:
-                continue
-            centres = np.tile(one.p_WC, (2, 1))
-            s = curve.nearest(centres, one.ends_W)
-            point, tangent = curve.at(s), curve.tangent(s)
-            steep = np.abs(np.sum(one.ends_W * tangent, axis=1)) / np.linalg.norm(tangent, axis=1) < np.cos(np.radians(8))
-            near = np.linalg.norm(point - centres, axis=1) < self.settings.max_range
-            if np.all(steep & near):
-                ends.append(sorted(s.tolist()))
-        if len(ends) < 2:
+        curve = track.estimate.curve
+        used = [one for one, good in zip(track.observations, track.estimate.used) if good]
+        centres = np.repeat([one.p_WC for one in used], 2, axis=0)
+        rays = np.concatenate([one.ends_W for one in used])
+        against = curve.offsets(centres, rays)
+        tangent = curve.tangent(against.s)
+        glancing = np.abs(np.sum(rays * tangent, axis=1)) / np.linalg.norm(tangent, axis=1)
+        good = (glancing < np.cos(np.radians(8.0))) & (np.abs(against.ahead) < self.settings.max_range)
+        both = good.reshape(-1, 2).all(axis=1)
+        if both.sum() < 2:
             return None
-        low, high = sorted(e[0] for e in ends)[1], sorted(e[1] for e in ends)[-2]
+        ends = np.sort(against.s.reshape(-1, 2)[both], axis=1)
+        low, high = float(np.sort(ends[:, 0])[1]), float(np.sort(ends[:, 1])[-2])
         return (low, high) if high - low > 0.1 else None
 
     def _measure_radius(self, track: _Track) -> None:
