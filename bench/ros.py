@@ -1,0 +1,143 @@
+"""The graph's speed: how fast the whole stack passes simulation time, and whether 500 Hz holds by the wall clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from harness import Figure, figure
+from nav_msgs.msg import Odometry
+from perch_core.ros import qos
+from perch_core.ros.conversions import to_seconds
+from perch_core.scenario import Scenario, load_scenario
+from perch_eval.demo import fly
+from perch_eval.domain import reserved_domain
+from perch_eval.nodes import programs
+from perch_eval.stack import Stack
+from perch_msgs.msg import MotorCommand, Step
+from rclpy.experimental import EventsExecutor
+from sensor_msgs.msg import Imu
+
+CHAIN = ("vehicle", "vio_model", "estimator", "controller")  # the stand-in VIO: nothing here is about estimation
+RATES = {"imu/data_raw": Imu, "odometry": Odometry, "motor_command": MotorCommand}
+WINDOW = 1.0  # s
+
+
+class Probe:
+    """Listens to a running stack."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("probe", context=self._context)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.counts = dict.fromkeys(RATES, 0)
+        self.time, self.misses = 0.0, {}
+        for topic, kind in RATES.items():
+            self.node.create_subscription(kind, topic, lambda _, topic=topic: self._count(topic), qos.CHAIN, raw=True)
+        self.node.create_subscription(Step, "step", self._step, qos.STEP)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, qos.STATUS)
+
+    def _count(self, topic: str) -> None:
+        self.counts[topic] += 1
+
+    def _step(self, msg: Step) -> None:
+        self.time = to_seconds(msg.stamp)
+
+    def _diagnose(self, msg: DiagnosticArray) -> None:
+        for status in msg.status:
+            if status.name == "/vehicle":
+                values = {item.key: item.value for item in status.values}
+                self.misses = {k: int(values[k]) for k in ("steps", "deadlines_missed", "commands_missed") if k in values}
+
+    def visible(self) -> set[str]:
+        """Fully qualified names of the nodes in the graph."""
+        self.listen(0.05)
+        return {f"{ns.rstrip('/')}/{name}" for name, ns in self.node.get_node_names_and_namespaces()}
+
+    def listen(self, seconds: float) -> float:
+        """Take what comes for some wall-clock time; returns how long it really was [s]."""
+        begin = time.perf_counter()
+        while time.perf_counter() - begin < seconds:
+            self._executor.spin_once(timeout_sec=min(0.05, seconds))
+        return time.perf_counter() - begin
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+@contextmanager
+def running(scenario: Scenario, folder: Path, **options) -> Iterator[Probe]:
+    """A probe beside a stack that is up and stepping."""
+    with reserved_domain() as domain:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        with Stack(programs(scenario, folder=folder, **options), folder) as stack:
+            probe = Probe(domain)
+            try:
+                stack.wait_until_ready(probe.visible)
+                for _ in range(600):
+                    if probe.time > 2.0:  # one second of flight
+                        break
+                    probe.listen(0.1)
+                    stack.raise_if_ended()
+                yield probe
+            finally:
+                probe.close()
+
+
+def real_time(scenario: Scenario, folder: Path, windows: int) -> list[Figure]:
+    """Rates of the 500 Hz chain by the wall clock, without cameras, and what was missed."""
+    with running(scenario, folder, lockstep=False, overrides={"vehicle": {"cameras": "none"}}) as probe:
+        probe.listen(2.0)
+        before, rates = dict(probe.misses), {topic: [] for topic in RATES}
+        for _ in range(windows):
+            counts = dict(probe.counts)
+            span = probe.listen(WINDOW)
+            for topic in RATES:
+                rates[topic].append((probe.counts[topic] - counts[topic]) / span)
+        after = probe.misses
+    steps = max(1, after["steps"] - before["steps"])
+    missed = {key: 100.0 * (after[key] - before[key]) / steps for key in ("deadlines_missed", "commands_missed")}
+    return ([figure(f"real time: rate of {topic}", "Hz", samples, bar=499.0, comparison="median >=")
+             for topic, samples in rates.items()]
+            + [figure(f"real time: {key.replace('_', ' ')}", "% of steps", [value]) for key, value in missed.items()])
+
+
+def lockstep(scenario: Scenario, folder: Path, windows: int, composed: bool) -> Figure:
+    """Simulation time per wall-clock time of the 500 Hz chain, without cameras."""
+    with running(scenario, folder, composed=composed, overrides={"vehicle": {"cameras": "none"}}) as probe:
+        factors = [_factor(probe) for _ in range(windows)]
+    where = "one process" if composed else "one process per node"
+    return figure(f"lockstep without cameras, {where}", "x real time", factors)
+
+
+def _factor(probe: Probe) -> float:
+    begin = probe.time
+    span = probe.listen(WINDOW)
+    return (probe.time - begin) / span
+
+
+def figures(quick: bool) -> list[Figure]:
+    """Whole flights with both cameras; the 500 Hz chain in lockstep and in real time."""
+    scenario = dataclasses.replace(load_scenario("surface_90"), nodes=CHAIN)
+    windows = 3 if quick else 10
+    with tempfile.TemporaryDirectory(prefix="perch-bench-") as name:
+        folder = Path(name)
+        flights = [fly("surface_90", seed, folder / f"flight_{seed}")["real_time_factor"]
+                   for seed in range(1, 2 if quick else 4)]
+        return [figure("whole stack, both cameras, lockstep", "x real time", flights, bar=0.7, comparison="median >="),
+                lockstep(scenario, folder / "processes", windows, composed=False),
+                lockstep(scenario, folder / "composed", windows, composed=True),
+                *real_time(scenario, folder / "real_time", windows)]
+
