@@ -17,6 +17,7 @@ from perch_eval.pilot import FlightResult, Pilot
 from perch_eval.report import build_report
 from perch_eval.stack import Stack, StackError
 
+READY_TIMEOUT = 180.0  # [s] compiled functions that a changed source invalidated are built while nodes start
 EXAMPLES = """examples:
   python3 scripts/demo.py                                    perch on the wall of paper M, 1.7 m away
   python3 scripts/demo.py --scenario surface_60_far --seed 4 --out /tmp/flight
@@ -63,7 +64,7 @@ def _pilot(scenario: Scenario, stack: Stack) -> FlightResult:
     """Send the goal to a started stack; a flight that breaks off is a result too, its recording is kept."""
     pilot = Pilot()
     try:
-        stack.wait_until_ready(pilot.visible_nodes)
+        stack.wait_until_ready(pilot.visible_nodes, timeout=READY_TIMEOUT)
         result = pilot.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
                            stack.raise_if_ended)
         pilot.linger(0.5)
