@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -58,7 +59,6 @@ class FlatTrajectory:
     coefficients: np.ndarray
     start_time: float = 0.0
     _edges: list[float] = field(init=False, repr=False, compare=False)
-    _tables: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         durations = np.array(self.durations, float)
@@ -67,16 +67,22 @@ class FlatTrajectory:
             raise ValueError(f"durations {durations.shape} and coefficients {coefficients.shape}: need (n,) and (n, 4, degree + 1)")
         if not (np.isfinite(coefficients).all() and np.isfinite(durations).all() and (durations > 0.0).all()):
             raise ValueError("coefficients must be finite and durations finite and > 0 s")
-        degree = coefficients.shape[-1] - 1
-        # All derivatives in the basis of one degree: a sample is then one basis and one matrix product.
-        tables = np.empty((len(durations), _DERIVATIVES + 1, 4, degree + 1))
-        for order in range(_DERIVATIVES + 1):
-            raised = bernstein.elevate(bernstein.derivative(coefficients, order), degree)
-            tables[:, order] = raised / durations[:, None, None] ** order
-        for name, value in (("durations", durations), ("coefficients", coefficients), ("_tables", tables)):
+        for name, value in (("durations", durations), ("coefficients", coefficients)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         object.__setattr__(self, "_edges", [0.0, *np.cumsum(durations).tolist()])
+
+    @cached_property
+    def _tables(self) -> np.ndarray:
+        """All derivatives in the basis of one degree, so that a sample is one basis and one matrix product.
+
+        Made by the first sample: a planner that only publishes its coefficients does not pay for it.
+        """
+        tables = np.empty((len(self.durations), _DERIVATIVES + 1, 4, self.degree + 1))
+        for order in range(_DERIVATIVES + 1):
+            raised = bernstein.elevate(bernstein.derivative(self.coefficients, order), self.degree)
+            tables[:, order] = raised / self.durations[:, None, None] ** order
+        return tables
 
     @property
     def duration(self) -> float:

@@ -16,13 +16,14 @@ from math import cos, sin, sqrt
 
 import numpy as np
 
-from perch_planner.bounds import BELOW, UNDECIDED, VIOLATED, _split, cross, derivative, dot, product
+from perch_planner.bounds import BELOW, UNDECIDED, VIOLATED, bernstein_row, cross, derivative, dot, product, split
 from perch_planner.compilation import compiled
 
-_DEPTH = 24
+_DEPTH = 20
 _NODES = 3000
 _TILT = 49          # coefficients of degree 48
-_PARTS = 12         # rows of a node: |f|^4, |x|^2, |f|^2, f (3), x (3), psi, psi', spare
+_LAYOUT = ((0, 49), (1, 49), (2, 25), (3, 13), (4, 13), (5, 13), (6, 24), (7, 24), (8, 24), (9, 15), (10, 14))
+_PARTS = 11         # rows of a node: |f|^4, |x|^2, |f|^2, f (3), x (3), psi, psi'
 
 
 @compiled
@@ -102,15 +103,24 @@ def _spin_bound(parts):
 @compiled
 def _split_parts(parts, left, right):
     """Halve the interval of all parts."""
-    _split(parts[0].copy(), left[0], right[0])
-    _split(parts[1].copy(), left[1], right[1])
-    _split(parts[2, :25].copy(), left[2, :25], right[2, :25])
+    split(parts[0].copy(), left[0], right[0])
+    split(parts[1].copy(), left[1], right[1])
+    split(parts[2, :25].copy(), left[2, :25], right[2, :25])
     for k in range(3, 6):
-        _split(parts[k, :13].copy(), left[k, :13], right[k, :13])
+        split(parts[k, :13].copy(), left[k, :13], right[k, :13])
     for k in range(6, 9):
-        _split(parts[k, :24].copy(), left[k, :24], right[k, :24])
-    _split(parts[9, :15].copy(), left[9, :15], right[9, :15])
-    _split(parts[10, :14].copy(), left[10, :14], right[10, :14])
+        split(parts[k, :24].copy(), left[k, :24], right[k, :24])
+    split(parts[9, :15].copy(), left[9, :15], right[9, :15])
+    split(parts[10, :14].copy(), left[10, :14], right[10, :14])
+
+
+@compiled
+def _positive(room, parts):
+    """Whether room |f|^4 - |x|^2 has only positive coefficients."""
+    for k in range(_TILT):
+        if room * parts[0, k] <= parts[1, k]:
+            return False
+    return True
 
 
 @compiled
@@ -125,14 +135,18 @@ def rate_stays_below(parts, limit):
         (verdict, place) as `bounds.stays_below`.
     """
     squared = limit * limit
-    stack = np.zeros((_DEPTH + 2, _PARTS, _TILT))
-    start = np.zeros(_DEPTH + 2)
-    depth = np.zeros(_DEPTH + 2, np.int64)
-    left = np.zeros((_PARTS, _TILT))
-    right = np.zeros((_PARTS, _TILT))
-    stack[0] = parts
     if _squared_rate(parts) >= squared:
         return VIOLATED, 0.0
+    spin = _spin_bound(parts)
+    room = squared - spin * spin
+    if room > 0.0 and _positive(room, parts):
+        return BELOW, 0.0
+    stack = np.empty((_DEPTH + 2, _PARTS, _TILT))
+    start = np.zeros(_DEPTH + 2)
+    depth = np.zeros(_DEPTH + 2, np.int64)
+    left = np.empty((_PARTS, _TILT))
+    right = np.empty((_PARTS, _TILT))
+    stack[0] = parts
     top, nodes = 1, 0
     doubtful = -1.0
     while top > 0:
@@ -140,7 +154,7 @@ def rate_stays_below(parts, limit):
         nodes += 1
         spin = _spin_bound(stack[top])
         room = squared - spin * spin
-        if room > 0.0 and (room * stack[top, 0] - stack[top, 1]).min() > 0.0:
+        if room > 0.0 and _positive(room, stack[top]):
             continue
         if depth[top] >= _DEPTH or nodes >= _NODES:
             doubtful = start[top]
@@ -159,24 +173,10 @@ def rate_stays_below(parts, limit):
 
 
 @compiled
-def sampled_rate(parts, count):
-    """Largest |omega| at `count` + 1 even places of a segment, and its place."""
-    best, place = 0.0, 0.0
+def rate_at(parts, s):
+    """|omega| at one place of a segment."""
     at = np.zeros((_PARTS, 1))
-    basis = np.empty(_TILT)
-    for k in range(count + 1):
-        s = k / count
-        for row, size in ((0, 49), (2, 25), (3, 13), (6, 24), (9, 15), (10, 14)):
-            basis[:size] = 0.0
-            basis[0] = 1.0
-            for n in range(1, size):
-                for i in range(n, 0, -1):
-                    basis[i] = basis[i] * (1.0 - s) + basis[i - 1] * s
-                basis[0] *= 1.0 - s
-            rows = 2 if row == 0 else (3 if row in (3, 6) else 1)
-            for r in range(row, row + rows):
-                at[r, 0] = (basis[:size] * parts[r, :size]).sum()
-        rate = _squared_rate(at)
-        if rate > best:
-            best, place = rate, s
-    return sqrt(best), place
+    for row, size in _LAYOUT:
+        weights = bernstein_row(size - 1, s)
+        at[row, 0] = (weights * parts[row, :size]).sum()
+    return sqrt(_squared_rate(at))

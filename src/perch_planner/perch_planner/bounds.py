@@ -6,6 +6,8 @@ the square of its width. Subdivision takes means only, so that rounding stays ne
 
 from __future__ import annotations
 
+from math import comb
+
 import numpy as np
 
 from perch_planner.compilation import compiled
@@ -13,6 +15,7 @@ from perch_planner.compilation import compiled
 ROUNDING = 1e-13
 """Enclosures are widened by this share of the largest coefficient."""
 
+_BINOMIALS = np.array([[comb(n, k) for k in range(64)] for n in range(64)], float)
 _DEPTH = 48
 _NODES = 4000
 
@@ -20,7 +23,7 @@ BELOW, VIOLATED, UNDECIDED = 1, 0, -1
 
 
 @compiled
-def _split(work, left, right):
+def split(work, left, right):
     """De Casteljau at 1/2; `work` is used up, and its first entry is the value at the middle."""
     last = len(work) - 1
     for k in range(last + 1):
@@ -53,20 +56,20 @@ def stays_below(coefficients, bound):
         return VIOLATED, 0.0
     if stack[0, n - 1] >= 0.0:
         return VIOLATED, 1.0
-    top = 1
+    top, nodes = 1, 0
     left = np.empty(n)
     right = np.empty(n)
     doubtful = -1.0
     while top > 0:
         top -= 1
+        nodes += 1
         if stack[top].max() < -margin:
             continue
-        if depth[top] >= _DEPTH:
-            doubtful = start[top]
-            continue
+        if depth[top] >= _DEPTH or nodes >= _NODES:
+            return UNDECIDED, start[top]
         level, begin = depth[top] + 1, start[top]
         middle = begin + 0.5**level
-        _split(stack[top].copy(), left, right)
+        split(stack[top].copy(), left, right)
         if right[0] >= 0.0:
             if right[0] > margin:
                 return VIOLATED, middle
@@ -115,7 +118,7 @@ def maximum(coefficients, tolerance):
             continue
         level, begin = depth[top] + 1, start[top]
         middle = begin + 0.5**level
-        _split(stack[top].copy(), left, right)
+        split(stack[top].copy(), left, right)
         if right[0] > attained:
             attained, place = right[0], middle
         # The half with the larger coefficients is looked at first: it raises `attained` sooner.
@@ -131,22 +134,26 @@ def maximum(coefficients, tolerance):
 
 
 @compiled
-def product(a, b):
-    """Bernstein coefficients of the product of two polynomials, shapes (n + 1,), (m + 1,) -> (n + m + 1,)."""
-    n, m = len(a) - 1, len(b) - 1
-    scaled_a, scaled_b = a * _binomials(n), b * _binomials(m)
-    out = np.zeros(n + m + 1)
-    for i in range(n + 1):
-        out[i:i + m + 1] += scaled_a[i] * scaled_b
-    return out / _binomials(n + m)
+def bernstein_row(degree, s):
+    """Values of the Bernstein basis at s, shape (degree + 1,)."""
+    row = np.zeros(degree + 1)
+    row[0] = 1.0
+    for k in range(1, degree + 1):
+        for i in range(k, 0, -1):
+            row[i] = row[i] * (1.0 - s) + row[i - 1] * s
+        row[0] *= 1.0 - s
+    return row
 
 
 @compiled
-def _binomials(n):
-    row = np.ones(n + 1)
-    for i in range(1, n + 1):
-        row[i] = row[i - 1] * (n - i + 1) / i
-    return row
+def product(a, b):
+    """Bernstein coefficients of the product of two polynomials, shapes (n + 1,), (m + 1,) -> (n + m + 1,)."""
+    n, m = len(a), len(b)
+    scaled = b * _BINOMIALS[m - 1, :m]
+    out = np.zeros(n + m - 1)
+    for i in range(n):
+        out[i:i + m] += a[i] * _BINOMIALS[n - 1, i] * scaled
+    return out / _BINOMIALS[n + m - 2, :n + m - 1]
 
 
 @compiled

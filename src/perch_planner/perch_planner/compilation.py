@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 Kernel = TypeVar("Kernel", bound=Callable)
@@ -20,6 +21,25 @@ except ImportError:
     numba = None
 
 COMPILED = numba is not None
+
+
+def _drop_stale_kernels(folder: Path) -> None:
+    """Delete cached kernels that are older than any kernel's source.
+
+    numba looks at the file of a kernel alone; a kernel that calls one in another file would keep its old copy of it.
+    """
+    sources = [path for path in folder.glob("*.py") if "@compiled" in path.read_text()]
+    newest = max(path.stat().st_mtime for path in sources)
+    for index in (folder / "__pycache__").glob("*.nbi"):
+        if index.stat().st_mtime < newest:
+            index.unlink(missing_ok=True)
+
+
+if COMPILED:
+    try:
+        _drop_stale_kernels(Path(__file__).parent)
+    except OSError:  # an installation that cannot be written to does not change either
+        pass
 
 
 def compiled(kernel: Kernel) -> Kernel:

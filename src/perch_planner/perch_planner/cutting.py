@@ -12,10 +12,11 @@ import numpy as np
 from perch_core import bernstein
 from perch_core.vehicle import GRAVITY
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
-from perch_planner.problem import Limits, PerchProblem
+from perch_planner.problem import Limits, PerchProblem, contact_heading
 from perch_planner.segment_program import Cut
 
-_G = np.array([0.0, 0.0, GRAVITY])
+_UP = np.array([0.0, 0.0, 1.0])
+_G = GRAVITY * _UP
 _INF = float("inf")
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
 _RAISE = 1.02       # cuts of the thrust from below
@@ -43,18 +44,18 @@ def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.nda
         if most > high:
             f = _at(coefficients, durations, i, most_at, 2) + _G
             n = f / np.sqrt(f @ f)
-            cuts.append(Cut(i, most_at, 2, n, -_INF, _KEEP * high - float(n @ _G)))
+            cuts.append(Cut(i, most_at, ((2, n),), -_INF, _KEEP * high - float(n @ _G)))
         if least < low:
             f = _at(coefficients, durations, i, least_at, 2) + _G
             norm = np.sqrt(f @ f)
             n = f / norm if norm > 0.5 * low else side
-            cuts.append(Cut(i, least_at, 2, n, _RAISE * low - float(n @ _G), _INF))
+            cuts.append(Cut(i, least_at, ((2, n),), _RAISE * low - float(n @ _G), _INF))
     return cuts
 
 
 def turning_side(problem: PerchProblem) -> np.ndarray:
     """Direction over which the thrust turns from up to s3: against the heading of the approach, shape (3,)."""
-    heading = problem.surface.heading
+    heading = contact_heading(problem.surface)
     return np.array([-np.cos(heading), -np.sin(heading), 0.0])
 
 
@@ -68,29 +69,44 @@ def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarra
         problem, limits: what was asked.
     """
     cuts = []
-    segment, place = int(where[SPEED, 0]), float(where[SPEED, 1])
-    if segment >= 0:
-        v = _at(coefficients, durations, segment, place, 1)
-        cuts.append(Cut(segment, place, 1, v / np.sqrt(v @ v), -_INF, _KEEP * limits.speed))
-    segment, place = int(where[HEIGHT, 0]), float(where[HEIGHT, 1])
-    if segment >= 0:
-        low, high = limits.height
-        cuts.append(Cut(segment, place, 0, np.array([0.0, 0.0, 1.0]), low + _HEIGHT_ROOM, high - _HEIGHT_ROOM))
-    segment, place = int(where[CLEARANCE, 0]), float(where[CLEARANCE, 1])
-    if segment >= 0:
-        s3 = problem.surface.normal
-        f = _at(coefficients, durations, segment, place, 2) + _G
-        tilt = np.linalg.norm(np.cross(f, s3)) / max(np.sqrt(f @ f), 1e-9)
-        t = durations[:segment].sum() + place * durations[segment]
-        plane = float(s3 @ (problem.surface.p_WS + problem.target_velocity * t))
-        cuts.append(Cut(segment, place, 0, s3, plane + 1.1 * limits.extension * min(tilt, 1.0) + _HEIGHT_ROOM, _INF))
-    segment, place = int(where[BODY_RATE, 0]), float(where[BODY_RATE, 1])
-    if segment >= 0:
-        f = _at(coefficients, durations, segment, place, 2) + _G
-        norm = np.sqrt(f @ f)
-        j = _at(coefficients, durations, segment, place, 3)
-        across = j - f * (f @ j) / max(norm, 1e-9) ** 2
-        size = np.sqrt(across @ across)
-        if size > 1e-6:
-            cuts.append(Cut(segment, place, 3, across / size, -_INF, 0.95 * limits.body_rate * norm))
+    for row, (i, s) in enumerate(where.tolist()):
+        if i < 0.0 or row not in _LIMIT_CUTS:
+            continue
+        segment = int(i)
+        derivatives = [_at(coefficients, durations, segment, s, order) for order in range(4)]
+        t = float(durations[:segment].sum() + s * durations[segment])
+        cuts += [Cut(segment, s, *bound) for bound in _LIMIT_CUTS[row](derivatives, t, problem, limits)]
     return cuts
+
+
+def _speed_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
+    v = derivatives[1]
+    yield ((1, v / np.sqrt(v @ v)),), -_INF, _KEEP * limits.speed
+
+
+def _height_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
+    low, high = limits.height
+    yield ((0, _UP),), low + _HEIGHT_ROOM, high - _HEIGHT_ROOM
+
+
+def _clearance_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
+    """The rim's distance at the present tilt: right to first order where the tilt does not change."""
+    s3, f = problem.surface.normal, derivatives[2] + _G
+    tilt = np.linalg.norm(np.cross(f, s3)) / max(np.sqrt(f @ f), 1e-9)
+    plane = float(s3 @ (problem.surface.p_WS + problem.target_velocity * t))
+    yield ((0, s3),), plane + 1.1 * limits.extension * tilt + _HEIGHT_ROOM, _INF
+
+
+def _rate_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
+    """|j across f| <= W |f|, linear in both at the present directions."""
+    f, j = derivatives[2] + _G, derivatives[3]
+    norm = max(np.sqrt(f @ f), 1e-9)
+    n = f / norm
+    across = j - n * (n @ j)
+    size = np.sqrt(across @ across)
+    if size > 1e-6:
+        share = 0.95 * limits.body_rate
+        yield ((3, across / size), (2, -share * n)), -_INF, share * float(n @ _G)
+
+
+_LIMIT_CUTS = {SPEED: _speed_cut, HEIGHT: _height_cut, CLEARANCE: _clearance_cut, BODY_RATE: _rate_cut}

@@ -80,14 +80,13 @@ class FullProgram:
         row[segment * _SIZE:(segment + 1) * _SIZE] = _row(order, s, self._durations[segment])
         return row
 
-    def bound(self, segments, places, orders, direction, lower, upper) -> None:
-        """Add rows `lower <= direction . derivative <= upper`, scaled to unit length."""
-        for segment, s, order, d, low, high in zip(segments, places, orders, direction, lower, upper):
-            row = np.kron(d, self._place(int(segment), float(s), int(order)))
-            norm = np.linalg.norm(row)
-            self._rows.append(row / norm)
-            self._lower.append(low / norm)
-            self._upper.append(high / norm)
+    def bound(self, segment: int, place: float, terms, lower: float, upper: float) -> None:
+        """Add `lower <= sum of direction . derivative <= upper`, scaled to unit length; terms as in `Cut`."""
+        row = sum(np.kron(direction, self._place(int(segment), float(place), int(order))) for order, direction in terms)
+        norm = np.linalg.norm(row)
+        self._rows.append(row / norm)
+        self._lower.append(lower / norm)
+        self._upper.append(upper / norm)
 
     def solve(self, solver: str) -> tuple[np.ndarray, Solution]:
         """Coefficients, shape (f, 3, 15), and the answer; solved only where every row holds to 1e-6."""

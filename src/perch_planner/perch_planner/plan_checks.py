@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import cos, sin, sqrt
 
 import numpy as np
 
+from perch_core import bernstein
 from perch_core.vehicle import GRAVITY
-from perch_planner.body_rate_bound import rate_parts, rate_stays_below, sampled_rate
-from perch_planner.bounds import BELOW, cross, derivative, dot, maximum, product, stays_below
+from perch_planner.body_rate_bound import rate_at, rate_parts, rate_stays_below
+from perch_planner.bounds import BELOW, VIOLATED, cross, derivative, dot, maximum, product, stays_below
 from perch_planner.compilation import compiled
 
 THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE = range(5)
@@ -19,7 +20,11 @@ NAMES = ("thrust", "speed", "height", "clearance", "body_rate")
 MINIMUM, MINIMUM_AT, MAXIMUM, MAXIMUM_AT, HOLDS = range(5)
 """Columns of the results: proved bounds, the times of the samples nearest to them, and whether the limits hold."""
 
+_PLACES = np.linspace(0.0, 1.0, 13)
+_AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES) for n in (11, 12, 13, 14))  # where clearance and rate are sampled
+
 _RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
+_RATE_ROUNDS = 8
 _FINE = 1e-10      # where a limit falls inside the enclosure
 _CLEARANCE_SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself
 
@@ -79,64 +84,50 @@ def surface_distance(coefficients, duration, begin, p_S, v_S, s3):
 
 
 @compiled
-def _rim_polynomial(distance, force, s3, extension, gap):
-    """Positive where the rim of a disc around the centre of mass is farther than `gap` from the surface.
+def _rim_clears(distance, force, s3, extension, gap):
+    """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful.
 
-    The rim's lowest point is at distance - extension sin(tilt), sin(tilt) = |f x s3| / |f|, so that the condition is
-    (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
+    The rim of a disc around the centre of mass reaches extension sin(tilt) towards the surface, and
+    sin(tilt) = |f x s3| / |f|: so (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
     """
+    reduced = distance - gap
+    if reduced.min() > extension:
+        return True, 0.0
+    verdict, place = stays_below(-reduced, _CLEARANCE_SLACK)
+    if verdict != BELOW:
+        return False, place
     normal = np.empty((3, 1))
     normal[:, 0] = s3
     tilt = cross(force, normal)
-    reduced = distance - gap
-    return product(product(reduced, reduced), dot(force, force)), extension**2 * dot(tilt, tilt)
-
-
-@compiled
-def _rim_clears(distance, force, s3, extension, gap):
-    """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful."""
-    verdict, place = stays_below(gap - distance, _CLEARANCE_SLACK)
-    if verdict != BELOW:
-        return False, place
-    far, near = _rim_polynomial(distance, force, s3, extension, gap)
-    raised = product(near, np.ones(len(far) - len(near) + 1))
-    verdict, place = stays_below(raised - far, _CLEARANCE_SLACK)
+    far = product(product(reduced, reduced), dot(force, force))
+    near = product(extension**2 * dot(tilt, tilt), np.ones(len(far) - 24))
+    verdict, place = stays_below(near - far, _CLEARANCE_SLACK)
     return verdict == BELOW, place
 
 
 @compiled
-def _sampled_clearance(distance, force, s3, extension, count):
-    """Least distance - extension sin(tilt) at even places of a segment, and its place."""
-    best, place = np.inf, 0.0
-    for k in range(count + 1):
-        s = k / count
-        f = np.empty(3)
-        for d in range(3):
-            f[d] = _value(force[d], s)
-        norm = sqrt((f**2).sum())
-        along = (f * s3).sum() / max(norm, 1e-12)
-        gap = _value(distance, s) - extension * sqrt(max(1.0 - along * along, 0.0))
-        if gap < best:
-            best, place = gap, s
-    return best, place
-
-
-@compiled
-def _value(coefficients, s):
-    """Value of a polynomial at s."""
-    total, weight = 0.0, 1.0
-    n = len(coefficients) - 1
-    if s > 0.5:  # Horner in the smaller of s and 1 - s
-        t = (1.0 - s) / s
-        for i in range(n + 1):
-            total += weight * coefficients[n - i]
-            weight *= t * (n - i) / (i + 1)
-        return total * s**n
-    t = s / (1.0 - s)
-    for i in range(n + 1):
-        total += weight * coefficients[i]
-        weight *= t * (n - i) / (i + 1)
-    return total * (1.0 - s) ** n
+def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
+    """Least clearance and greatest body rate over fixed places of a segment: (gap, place, rate, place)."""
+    gap, gap_at, rate, rate_at_ = np.inf, 0.0, 0.0, 0.0
+    count = _AT14.shape[0]
+    for k in range(count):
+        f_x, f_y, f_z = (force[0] * _AT12[k]).sum(), (force[1] * _AT12[k]).sum(), (force[2] * _AT12[k]).sum()
+        j_x, j_y, j_z = (jerk[0] * _AT11[k]).sum(), (jerk[1] * _AT11[k]).sum(), (jerk[2] * _AT11[k]).sum()
+        heading, turn = (yaw * _AT14[k]).sum(), (yaw_rate * _AT13[k]).sum()
+        f2 = max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12)
+        along = f_x * s3[0] + f_y * s3[1] + f_z * s3[2]
+        here = (distance * _AT14[k]).sum() - extension * sqrt(max(1.0 - along * along / f2, 0.0))
+        if here < gap:
+            gap, gap_at = here, k / (count - 1)
+        x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
+        d_x, d_y = -sin(heading), cos(heading)
+        lean = d_x * f_x + d_y * f_y
+        across = max(f2 - lean * lean, 1e-12)
+        spin = (turn * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
+        here = (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
+        if here > rate:
+            rate, rate_at_ = here, k / (count - 1)
+    return gap, gap_at, sqrt(rate), rate_at_
 
 
 @compiled
@@ -172,10 +163,10 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
     out[:, 0], out[:, 2] = np.inf, -np.inf
     out[:, 4] = 1.0
     where = np.full((5, 2), -1.0)
-    gap_wanted, rate_wanted = np.inf, 0.0
+    gap_wanted, rate_wanted = np.inf, 1e-3
     begin = 0.0
     thrust = thrust_extrema(coefficients, durations, low_thrust, high_thrust)
-    parts = np.empty((f, 12, 49))
+    parts = np.empty((f, 11, 49))
     for i in range(f):
         T, c = durations[i], coefficients[i]
         _widen(out, 0, thrust[i, 1], begin + T * thrust[i, 2], thrust[i, 4], begin + T * thrust[i, 5])
@@ -195,57 +186,73 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
         _widen(out, 2, -proved, begin + T * place, proved2, begin + T * place2)
         force = specific_force(c, T)
         distance = surface_distance(c, T, begin, p_S, v_S, s3)
-        gap, place = _sampled_clearance(distance, force, s3, extension, 12)
-        if gap < gap_wanted:
-            gap_wanted, out[3, 1] = gap, begin + T * place
         jerk = np.empty((3, 12))
         for d in range(3):
             jerk[d] = derivative(c[d], 3) / T**3
+        gap, gap_at, sampled, rate_at_ = _sample(distance, force, jerk, yaw[i], derivative(yaw[i], 1) / T, s3, extension)
+        if gap < gap_wanted:
+            gap_wanted, out[3, 1] = gap, begin + T * gap_at
         parts[i] = rate_parts(force, jerk, yaw[i], T)
-        sampled, place = sampled_rate(parts[i], 10)
         if sampled > rate_wanted:
-            rate_wanted, out[4, 3] = sampled, begin + T * place
-        begin += T
-
-    # Clearance and rate are proved against a number: first a tight one near the samples, then the limit itself.
-    out[3, 0], out[3, 2] = -np.inf, np.inf
-    for gap in (0.98 * gap_wanted - 1e-3, 0.9 * gap_wanted - 5e-3, 0.0):
-        if gap < 0.0:
-            continue
-        proved_all, begin = True, 0.0
-        for i in range(f):
-            distance = surface_distance(coefficients[i], durations[i], begin, p_S, v_S, s3)
-            clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
-            if not clears:
-                proved_all = False
-                if gap == 0.0 and where[3, 0] < 0.0:
-                    where[3, 0], where[3, 1] = i, place
-                break
-            begin += durations[i]
-        if proved_all:
-            out[3, 0] = gap
-            break
-    out[4, 0], out[4, 2] = 0.0, np.inf
-    for bound in (1.02 * rate_wanted, 1.08 * rate_wanted, 1.25 * rate_wanted, rate):
-        if bound > rate:
-            continue
-        proved_all = True
-        for i in range(f):
-            verdict, place = rate_stays_below(parts[i], bound)
-            if verdict != BELOW:
-                proved_all = False
-                if bound == rate and where[4, 0] < 0.0:
-                    where[4, 0], where[4, 1] = i, place
-                break
-        if proved_all:
-            out[4, 2] = bound
-            break
-    for i in range(f):
+            rate_wanted, out[4, 3] = sampled, begin + T * rate_at_
         if thrust[i, 1] < low_thrust and where[0, 0] < 0.0:
             where[0, 0], where[0, 1] = i, thrust[i, 2]
         if thrust[i, 4] > high_thrust and where[0, 0] < 0.0:
             where[0, 0], where[0, 1] = i, thrust[i, 5]
+        begin += T
+    _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, gap_wanted)
+    _prove_rate(out, where, parts, durations, rate, rate_wanted)
     for k in range(5):
         if where[k, 0] >= 0.0:
             out[k, 4] = 0.0
     return out, where
+
+
+@compiled
+def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, sampled):
+    """Prove a clearance near the sampled one, or else that the limit 0 holds, or else find where it fails."""
+    out[3, 0], out[3, 2] = -np.inf, np.inf
+    for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, 0.0):
+        if gap < 0.0:
+            continue
+        begin, failed, place = 0.0, -1, 0.0
+        for i in range(len(durations)):
+            distance = surface_distance(coefficients[i], durations[i], begin, p_S, v_S, s3)
+            clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
+            if not clears:
+                failed = i
+                break
+            begin += durations[i]
+        if failed < 0:
+            out[3, 0] = gap
+            return
+        if gap == 0.0:
+            where[3, 0], where[3, 1] = failed, place
+
+
+@compiled
+def _prove_rate(out, where, parts, durations, limit, sampled):
+    """Prove a body rate near the greatest that is attained, or else that the limit holds, or else where it fails."""
+    out[4, 0], out[4, 2] = 0.0, np.inf
+    attained, slack = sampled, 1.02
+    for k in range(_RATE_ROUNDS):
+        bound = slack * attained
+        if not bound < limit or k == _RATE_ROUNDS - 1:
+            bound = limit
+        failed, verdict, place = -1, BELOW, 0.0
+        for i in range(len(durations)):
+            verdict, place = rate_stays_below(parts[i], bound)
+            if verdict != BELOW:
+                failed = i
+                break
+        if failed < 0:
+            out[4, 2] = bound
+            return
+        if bound == limit:
+            where[4, 0], where[4, 1] = failed, place
+            return
+        if verdict == VIOLATED:
+            attained = max(attained, rate_at(parts[failed], place))
+            out[4, 3] = durations[:failed].sum() + place * durations[failed]
+        else:
+            slack *= 1.1

@@ -24,8 +24,9 @@ from perch_planner.segment_program import COST_ORDER, FORMULATIONS
 from perch_planner.time_allocation import allocate, split_last, stretch_factor, with_last_segment
 from perch_planner.yaw_profile import yaw_coefficients
 
-_CUT_ROUNDS = 10
-_CUT_REACH = 1.7      # peaks beyond this multiple of the limit are stretched first
+_CUT_ROUNDS = 24
+_CUT_REACH = 1.7      # peaks beyond this multiple of the limit are stretched first,
+_PATIENCE = 5         # and so are peaks before the last waypoint, where a longer time helps most; so many times
 _PLAIN_STRETCH = 1.15
 _SEGMENT_STRETCH = 1.1  # of the paper's per-segment stretching
 _BISECTIONS = 12
@@ -83,6 +84,11 @@ class _Outcome:
     stretch: float = _PLAIN_STRETCH
     segments: np.ndarray | None = None
 
+    @property
+    def proved(self) -> bool:
+        """All limits hold."""
+        return not self.failure and self.results is not None
+
 
 _CODES = {"": refusals.INFEASIBLE_WINDOW, "thrust": refusals.THRUST_FLOOR, "speed": refusals.BOX, "height": refusals.BOX,
           "clearance": refusals.BOX, "body_rate": refusals.BODY_RATE, "solver": refusals.SOLVER}
@@ -114,52 +120,69 @@ class _Search:
     def iterations(self) -> int:
         return len(self.attempts)
 
-    def try_durations(self, durations: np.ndarray) -> _Outcome:
-        """Solve and cut for fixed durations until every limit is proved or nothing helps."""
+    def try_durations(self, durations: np.ndarray, patient: bool = False) -> _Outcome:
+        """Solve and cut for fixed durations until every limit is proved or nothing helps.
+
+        Args:
+            durations: [s], shape (f,).
+            patient: give up early where longer durations promise more than cuts.
+        """
         settings, start = self.settings, self.problem.start
         try:
             program = FORMULATIONS[settings.formulation](self.contact, durations, settings)
         except np.linalg.LinAlgError:
             return _Outcome(None, None, None, "solver")
-        yaw, side, cut_by, cuts_in_use = None, None, "", 0
-        margin, best = 0.0, None
-        for _ in range(_CUT_ROUNDS + 1):
-            if self.iterations >= settings.iterations_max:
+        yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
+                               COST_ORDER[settings.objective])
+        best, count = None, 0
+        for rounds in range(_CUT_ROUNDS + 1):
+            if rounds and self.iterations >= settings.iterations_max:
                 break
             coefficients, solution = program.solve()
             if not solution.solved:
-                self._note(durations, None, cuts_in_use)
-                return replace(best, stretch=_PLAIN_STRETCH) if best else _Outcome(None, None, None, cut_by)
+                self._note(durations, None, count)
+                break
             extrema = plan_checks.thrust_extrema(coefficients, durations, self.low, self.high)
-            self._note(durations, extrema, cuts_in_use)
-            peak, least = float(extrema[:, 4].max()), float(extrema[:, 1].min())
-            if peak > self.high or least < self.low:
-                cut_by = "thrust"
-                margin = min(self.high - peak, least - self.low) * self.vehicle.mass
-                best = _Outcome(coefficients, None, None, cut_by, margin, stretch_factor(peak, self.high),
-                                (extrema[:, 4] > self.high) | (extrema[:, 1] < self.low))
-                if not settings.cuts or peak > _CUT_REACH * self.high:
-                    return best
-                side = turning_side(self.problem) if side is None else side
-                cuts = thrust_cuts(coefficients, durations, extrema, self.low, self.high, side)
-            else:
-                if yaw is None:
-                    yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
-                                           COST_ORDER[settings.objective])
+            self._note(durations, extrema, count)
+            outcome, cuts = self._thrust(coefficients, durations, extrema)
+            if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
+                return outcome
+            if not outcome or rounds:
                 results, where = self._check(coefficients, yaw, durations)
-                failed = [plan_checks.NAMES[k] for k in range(5) if not results[k, plan_checks.HOLDS]]
-                if not failed:
+                if results[:, plan_checks.HOLDS].all():
                     return _Outcome(coefficients, yaw, results)
-                cut_by, margin = failed[-1], self._margin(results, failed[-1])
-                best = _Outcome(coefficients, yaw, results, cut_by, margin)
-                if not settings.cuts:
-                    return best
-                cuts = limit_cuts(where, coefficients, durations, self.problem, self.limits)
-            if not cuts:
-                return best
+                cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits)
+                outcome = outcome or self._limit(coefficients, yaw, results)
+            best = outcome
+            if not cuts or not settings.cuts:
+                break
             program.add(cuts)
-            cuts_in_use += len(cuts)
-        return best or _Outcome(None, None, None, cut_by, margin)
+            count += len(cuts)
+        # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
+        return replace(best, stretch=_PLAIN_STRETCH) if best and count else best or _Outcome(None, None, None)
+
+    def _thrust(self, coefficients: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
+        """The failure of the thrust range, or None, and cuts against it."""
+        peak, least = float(extrema[:, 4].max()), float(extrema[:, 1].min())
+        if peak <= self.high and least >= self.low:
+            return None, []
+        margin = min(self.high - peak, least - self.low) * self.vehicle.mass
+        outside = (extrema[:, 4] > self.high) | (extrema[:, 1] < self.low)
+        outcome = _Outcome(coefficients, None, None, "thrust", margin, stretch_factor(peak, self.high), outside)
+        if not self.settings.cuts:
+            return outcome, []
+        return outcome, thrust_cuts(coefficients, durations, extrema, self.low, self.high, turning_side(self.problem))
+
+    def _better_stretched(self, extrema: np.ndarray) -> bool:
+        """Whether the peak lies where a longer time lowers it."""
+        segment = int(extrema[:, 4].argmax())
+        peak = extrema[segment, 4]
+        return bool(peak > self.high and (segment < len(self.problem.waypoints) or peak > _CUT_REACH * self.high))
+
+    def _limit(self, coefficients: np.ndarray, yaw: np.ndarray, results: np.ndarray) -> _Outcome:
+        """The failure of another limit than the thrust range."""
+        name = [n for n, row in zip(plan_checks.NAMES, results) if not row[plan_checks.HOLDS]][-1]
+        return _Outcome(coefficients, yaw, results, name, self._margin(results, name))
 
     def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray):
         surface, limits = self.problem.surface, self.limits
@@ -197,10 +220,10 @@ class _Search:
                 break
             middle = 0.5 * (low + high)
             tried = self.try_durations(middle * durations)
-            if tried.failure or tried.results is None:
-                low = middle
-            else:
+            if tried.proved:
                 high, outcome = middle, tried
+            else:
+                low = middle
         return high * durations, outcome
 
 
@@ -221,11 +244,12 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     begin = perf_counter()
     search = _Search(problem, settings, vehicle)
     durations = search.first
-    best: _Outcome | None = None
+    best, stretched = None, 0
     while True:
-        outcome = search.try_durations(durations)
-        if not outcome.failure and outcome.results is not None:
+        outcome = search.try_durations(durations, patient=stretched < _PATIENCE)
+        if outcome.proved:
             break
+        stretched += 1
         if best is None or best.coefficients is None or (outcome.coefficients is not None and outcome.margin > best.margin):
             best = outcome
         grown = search.longer(durations, outcome)

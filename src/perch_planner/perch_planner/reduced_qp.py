@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_planner.bounds import bernstein_row
 from perch_planner.compilation import compiled
 from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, GRAMS, HERMITE, TABLES
 
@@ -43,18 +44,6 @@ class ReducedProgram(NamedTuple):
 
 
 @compiled
-def _bernstein_row(degree, s):
-    """Values of the Bernstein basis at s, shape (degree + 1,)."""
-    row = np.zeros(degree + 1)
-    row[0] = 1.0
-    for k in range(1, degree + 1):
-        for i in range(k, 0, -1):
-            row[i] = row[i] * (1.0 - s) + row[i - 1] * s
-        row[0] *= 1.0 - s
-    return row
-
-
-@compiled
 def _local_scale(ratio):
     """Factors that turn knot unknowns (in time units) into derivatives on the segment's own [0, 1]."""
     scale = np.ones(FUNCTIONS)
@@ -79,7 +68,7 @@ def _place(bubbles, segment, knots):
 def _functional(durations, bubbles, unit, size, segment, s, order, tables):
     """Row that gives the order-th time derivative at place s of a segment from all unknowns, shape (size,)."""
     row = np.zeros(size)
-    local = _bernstein_row(DEGREE - order, s) @ tables[order, :DEGREE + 1 - order]
+    local = bernstein_row(DEGREE - order, s) @ tables[order, :DEGREE + 1 - order]
     local = local * _local_scale(durations[segment] / unit) / durations[segment] ** order
     row[4 * segment:4 * segment + HERMITE] = local[:HERMITE]
     start = _place(bubbles, segment, len(durations) + 1)
@@ -170,19 +159,29 @@ def _assemble(durations, given, values, bubbles, segments, places, orders, gram,
 
 
 @compiled
-def _extend(durations, bubbles, unit, factor, offset, basis, particular, segments, places, orders, tables):
-    """Whitened columns and constants of further functionals."""
+def _further(durations, bubbles, unit, factor, offset, basis, particular, owner, segments, places, orders, direction,
+             lower, upper, tables):
+    """Rows of further bounds; term q adds to row owner[q]."""
     m = factor.shape[0]
-    columns = np.empty((m, len(segments)))
-    constants = np.empty((len(segments), 3))
-    for q in range(len(segments)):
-        row = _functional(durations, bubbles, unit, basis.shape[0], segments[q], places[q], orders[q], tables)
-        column = row @ basis
+    rows = np.zeros((len(lower), 3 * m))
+    low, high = lower.copy(), upper.copy()
+    for q in range(len(owner)):
+        functional = _functional(durations, bubbles, unit, basis.shape[0], segments[q], places[q], orders[q], tables)
+        column = functional @ basis
         for i in range(m):
             column[i] = (column[i] - (factor[i, :i] * column[:i]).sum()) / factor[i, i]
-        columns[:, q] = column
-        constants[q] = row @ particular + column @ offset
-    return columns, constants
+        constant = functional @ particular + column @ offset
+        r = owner[q]
+        for d in range(3):
+            rows[r, d * m:(d + 1) * m] += direction[q, d] * column
+            low[r] -= direction[q, d] * constant[d]
+            high[r] -= direction[q, d] * constant[d]
+    for r in range(len(lower)):
+        norm = max(np.sqrt((rows[r] ** 2).sum()), 1e-300)
+        rows[r] /= norm
+        low[r] /= norm
+        high[r] /= norm
+    return rows, low, high
 
 
 @compiled
@@ -255,12 +254,22 @@ def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbl
                                      cost_order, TABLES))
 
 
-def extend(program: ReducedProgram, durations: np.ndarray, bubbles: np.ndarray, segments: np.ndarray, places: np.ndarray,
-           orders: np.ndarray) -> ReducedProgram:
-    """The program with these functionals instead of its own; elimination and whitening are kept."""
-    columns, constants = _extend(durations, bubbles, program.time_unit, program.factor, program.offset, program.basis,
-                                 program.particular, segments, places, orders, TABLES)
-    return program._replace(whitened=columns, constant=constants)
+def further_rows(program: ReducedProgram, durations: np.ndarray, bubbles: np.ndarray, owner: np.ndarray,
+                 segments: np.ndarray, places: np.ndarray, orders: np.ndarray, direction: np.ndarray, lower: np.ndarray,
+                 upper: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of bounds on sums of derivatives, for a program that is assembled already.
+
+    Args:
+        program, durations, bubbles: as assembled.
+        owner: row to which each term adds, shape (t,).
+        segments, places, orders, direction: the terms, direction of shape (t, 3).
+        lower, upper: bounds, shape (r,).
+
+    Returns:
+        rows (r, 3 size), lower (r,), upper (r,), scaled to unit length.
+    """
+    return _further(durations, bubbles, program.time_unit, program.factor, program.offset, program.basis,
+                    program.particular, owner, segments, places, orders, direction, lower, upper, TABLES)
 
 
 def constraint_rows(program: ReducedProgram, functional: np.ndarray, direction: np.ndarray, lower: np.ndarray,

@@ -15,19 +15,17 @@ COST_ORDER = {"snap": 4, "jerk": 3}
 
 
 class Cut(NamedTuple):
-    """A linear bound at one place of the plan: lower <= direction . (order-th derivative) <= upper.
+    """A linear bound at one place of the plan: lower <= sum of direction . (order-th derivative) <= upper.
 
     Attributes:
         segment, place: where, place in [0, 1] of the segment.
-        order: time derivative, 0 position to 3 jerk.
-        direction: unit vector in W, shape (3,).
-        lower, upper: bounds in the derivative's SI unit.
+        terms: pairs (order, direction): time derivative, 0 position to 3 jerk, and a vector in W, shape (3,).
+        lower, upper: bounds of the sum.
     """
 
     segment: int
     place: float
-    order: int
-    direction: np.ndarray
+    terms: tuple[tuple[int, np.ndarray], ...]
     lower: float
     upper: float
 
@@ -40,12 +38,6 @@ class SegmentProgram(Protocol):
 
     def solve(self) -> tuple[np.ndarray, Solution]:
         """Bernstein coefficients, shape (f, 3, 15) [m], and the solver's answer; valid where it is `solved`."""
-
-
-def _arrays(cuts: list[Cut]):
-    return (np.array([c.segment for c in cuts], np.int64), np.array([c.place for c in cuts]),
-            np.array([c.order for c in cuts], np.int64), np.array([c.direction for c in cuts]),
-            np.array([c.lower for c in cuts]), np.array([c.upper for c in cuts]))
 
 
 class ReducedSegments:
@@ -61,9 +53,12 @@ class ReducedSegments:
 
     def add(self, cuts: list[Cut]) -> None:
         """Add linear bounds; only their own rows are computed."""
-        segments, places, orders, direction, lower, upper = _arrays(cuts)
-        more = reduced_qp.extend(self._program, self._durations, self._bubbles, segments, places, orders)
-        rows = reduced_qp.constraint_rows(more, np.arange(len(cuts)), direction, lower, upper)
+        terms = [(k, cut, *term) for k, cut in enumerate(cuts) for term in cut.terms]
+        rows = reduced_qp.further_rows(
+            self._program, self._durations, self._bubbles, np.array([k for k, *_ in terms]),
+            np.array([cut.segment for _, cut, *_ in terms]), np.array([cut.place for _, cut, *_ in terms]),
+            np.array([order for *_, order, _ in terms]), np.array([direction for *_, direction in terms]),
+            np.array([cut.lower for cut in cuts]), np.array([cut.upper for cut in cuts]))
         self._rows = tuple(np.concatenate(pair) for pair in zip(self._rows, rows))
 
     def solve(self) -> tuple[np.ndarray, Solution]:
@@ -79,13 +74,13 @@ class FullSegments:
         self._program = full_qp.FullProgram(durations, *contact.knots(durations), COST_ORDER[settings.objective])
         self._solver = settings.solver
         linear = contact.constraints(durations)
-        pick = linear.functional
-        self._program.bound(linear.segments[pick], linear.places[pick], linear.orders[pick], linear.direction,
-                            linear.lower, linear.upper)
+        for q, direction, lower, upper in zip(linear.functional, linear.direction, linear.lower, linear.upper):
+            self._program.bound(linear.segments[q], linear.places[q], ((linear.orders[q], direction),), lower, upper)
 
     def add(self, cuts: list[Cut]) -> None:
         """Add linear bounds."""
-        self._program.bound(*_arrays(cuts))
+        for cut in cuts:
+            self._program.bound(*cut)
 
     def solve(self) -> tuple[np.ndarray, Solution]:
         """Coefficients and the solver's answer."""

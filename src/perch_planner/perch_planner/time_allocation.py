@@ -11,7 +11,8 @@ from perch_planner.problem import PerchProblem, PerchSettings
 
 CRUISE_SPEED = 2.5        # [m/s] of the speed profile that spaces the waypoints
 CRUISE_ACCELERATION = 3.0  # [m/s^2]
-MANOEUVRE_TIME = 0.6      # [s] for the rotation before contact, on top of the way
+TURN_ACCELERATION = 2.0    # [m/s^2]
+MANOEUVRE_TIME = 0.45     # [s] for the rotation before contact, on top of the way
 FINAL_TIME = 0.5          # [s] of the last segment, where the rotation happens
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
@@ -24,6 +25,18 @@ def _profile_time(distance: np.ndarray, length: float) -> np.ndarray:
     d = np.minimum(distance, length - distance)
     near = np.where(d <= ramp, np.sqrt(2.0 * d / CRUISE_ACCELERATION), peak / CRUISE_ACCELERATION + (d - ramp) / peak)
     return np.where(distance <= length / 2.0, near, total - near)
+
+
+def _turning_times(points: np.ndarray) -> np.ndarray:
+    """Least segment durations for the turns at the waypoints, shape (n - 1,): the speed there is v^2 = A l / turn."""
+    steps = np.diff(points, axis=0)
+    lengths = np.maximum(np.sqrt((steps**2).sum(axis=1)), 1e-6)
+    units = steps / lengths[:, None]
+    turns = np.sqrt(((units[1:] - units[:-1]) ** 2).sum(axis=1))
+    speeds = np.full(len(points), CRUISE_SPEED)
+    speeds[1:-1] = np.minimum(np.sqrt(TURN_ACCELERATION * np.minimum(lengths[1:], lengths[:-1]) / np.maximum(turns, 1e-6)),
+                              CRUISE_SPEED)
+    return 2.0 * lengths / (speeds[1:] + speeds[:-1])
 
 
 def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) -> np.ndarray:
@@ -46,8 +59,8 @@ def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) 
         closing = problem.target_velocity - problem.start.v
         extra = MANOEUVRE_TIME + sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
         times = _profile_time(reached, length)
-        durations = np.diff(times * (1.0 + extra / times[-1]))
-        durations = np.maximum(durations, SEGMENT_MIN)
+        durations = np.maximum(np.diff(times), _turning_times(points))
+        durations = np.maximum(durations * (1.0 + extra / durations.sum()), SEGMENT_MIN)
     return with_last_segment(durations, settings)
 
 

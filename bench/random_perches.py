@@ -1,0 +1,54 @@
+"""Random perching problems and the requirements that the independent verifier checks them against."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import Vehicle
+from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint
+from perch_planner.verifier import Requirements
+
+
+def random_problem(rng: np.random.Generator, waypoints: int | None = None, moving_start: bool = True) -> PerchProblem:
+    """A problem: any inclination and heading, 1-5 m away, a start in motion, 0-10 waypoints (a quarter has a moving pad).
+
+    Args:
+        rng: source of randomness.
+        waypoints: their number; None: random, 0 to 10.
+        moving_start: start with velocity, acceleration and jerk.
+    """
+    count = int(rng.integers(0, 11)) if waypoints is None else waypoints
+    heading, inclination = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, np.pi)
+    distance = rng.uniform(1.0, 5.0)
+    p_WS = np.array([0.0, 0.0, rng.uniform(1.5, 3.0)])
+    surface = PerchSurface.from_inclination(p_WS, inclination, heading)
+    # In front of the surface, within 60 degrees of a mix of its normal and the way back along the heading.
+    back = np.array([-np.cos(heading), -np.sin(heading), 0.0])
+    direction = surface.normal + 0.7 * back + 0.35 * rng.normal(size=3)
+    p0 = p_WS + distance * direction / np.linalg.norm(direction)
+    p0[2] = max(p0[2], 0.6)
+    motion = {}
+    if moving_start:
+        motion = {"v": rng.normal(0.0, 0.5, 3), "a": rng.normal(0.0, 0.7, 3), "j": rng.normal(0.0, 2.0, 3),
+                  "yaw_rate": rng.normal(0.0, 0.2)}
+    start = StartState(p0, yaw=heading + rng.uniform(-1.0, 1.0), **motion)
+    share = np.linspace(0.0, 1.0, count + 2)[1:-1]
+    points = [p0 + s * (p_WS + 0.2 * surface.normal - p0) + rng.normal(0.0, 0.04 * distance / (1 + 0.3 * count), 3) for s in share]
+    velocity = rng.normal(0.0, 0.6, 3) * (1.0, 1.0, 0.2) if rng.random() < 0.25 and not count else np.zeros(3)
+    return PerchProblem(start, surface, tuple(Waypoint(p) for p in points), velocity)
+
+
+def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
+    """What was asked, in the plain numbers of the verifier."""
+    limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
+    return Requirements(
+        start=np.array([start.p, start.v, start.a, start.j]), start_yaw=(start.yaw, start.yaw_rate),
+        waypoints=np.array([w.p for w in problem.waypoints]).reshape(-1, 3), p_S=surface.p_WS, s1=surface.R_WS[:, 0],
+        s2=surface.R_WS[:, 1], s3=surface.normal, v_S=problem.target_velocity, perch_offset=vehicle.perch_offset,
+        mass=vehicle.mass, impact_acceleration=settings.impact_acceleration,
+        impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
+        tube=(settings.tube_time, settings.tube_step, settings.tube_tolerance, settings.tube_floor), thrust=limits.thrust,
+        body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension)
+
+

@@ -1,0 +1,215 @@
+"""An independent check of a perching plan, from its published coefficients alone.
+
+Nothing here comes from the planner: the trajectory is re-made as power series in exact rationals from the coefficients
+of the message, sampled densely for attitude and body rate by finite differences of rotations, and its extrema are
+taken from the roots of derivatives (numpy's eigenvalue method), where the planner subdivides Bernstein coefficients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from math import comb
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.polynomial import polynomial as power
+
+_G = 9.81
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """What a plan must keep, in plain numbers.
+
+    Attributes:
+        start: position, velocity, acceleration, jerk at time 0, shape (4, 3).
+        start_yaw: yaw and its rate at time 0.
+        waypoints: positions to pass, shape (k, 3).
+        p_S, s3, v_S: point of the surface at time 0 [m], outward normal, velocity [m/s], shape (3,).
+        s1, s2: directions in the surface, shape (3,).
+        perch_offset: distance of the centre of mass from the surface at contact [m].
+        mass: [kg].
+        impact_acceleration: alpha [m/s^2].
+        impact_speed: least and greatest speed along -s3 [m/s].
+        tangential_speed: greatest speed over the surface at contact [m/s].
+        tube: t_k [s], dt [s], q, least half width [m/s^2].
+        thrust: least and greatest [N].
+        body_rate: greatest [rad/s].
+        speed: greatest [m/s].
+        height: least and greatest [m].
+        extension: radius of the rim [m].
+    """
+
+    start: np.ndarray
+    start_yaw: tuple[float, float]
+    waypoints: np.ndarray
+    p_S: np.ndarray
+    s1: np.ndarray
+    s2: np.ndarray
+    s3: np.ndarray
+    v_S: np.ndarray
+    perch_offset: float
+    mass: float
+    impact_acceleration: float
+    impact_speed: tuple[float, float]
+    tangential_speed: float
+    tube: tuple[float, float, float, float]
+    thrust: tuple[float, float]
+    body_rate: float
+    speed: float
+    height: tuple[float, float]
+    extension: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A requirement that a plan breaks: its name, by how much, and when [s]."""
+
+    requirement: str
+    excess: float
+    time: float
+
+
+def _powers(bernstein_row) -> np.ndarray:
+    """Ascending powers of s, through exact rationals."""
+    n = len(bernstein_row) - 1
+    exact = [Fraction(float(c)) for c in bernstein_row]
+    return np.array([float(sum(Fraction((-1) ** (k - i) * comb(n, k) * comb(k, i)) * exact[i] for i in range(k + 1)))
+                     for k in range(n + 1)])
+
+
+def _extrema(square, degree: int) -> tuple[float, float]:
+    """Smallest and largest value of a smooth function on [0, 1], from the roots of its Chebyshev interpolant's derivative."""
+    nodes = 0.5 * (1.0 + np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)))
+    series = chebyshev.chebfit(2.0 * nodes - 1.0, square(nodes), degree)
+    roots = chebyshev.chebroots(chebyshev.chebder(series))
+    real = roots.real[(np.abs(roots.imag) < 1e-3) & (np.abs(roots.real) <= 1.0)]
+    values = square(np.concatenate([[0.0, 1.0], 0.5 * (1.0 + real)]))
+    return float(values.min()), float(values.max())
+
+
+class _Segment:
+    def __init__(self, duration: float, rows) -> None:
+        self.duration = float(duration)
+        self._powers = np.array([_powers(row) for row in rows])
+
+    def at(self, s: np.ndarray, order: int) -> np.ndarray:
+        """Derivatives of x, y, z, yaw at s, shape (len(s), 4)."""
+        s = np.asarray(s, float)
+        out = []
+        for row in self._powers:
+            # From the nearer end, so that powers of s do not cancel.
+            near = power.polyval(s, power.polyder(row, order) if order else row)
+            out.append(near)
+        return np.array(out).T / self.duration**order
+
+
+def _rotations(f: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    b3 = f / np.linalg.norm(f, axis=1, keepdims=True)
+    b1 = np.cross(np.stack([-np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=1), b3)
+    b1 /= np.linalg.norm(b1, axis=1, keepdims=True)
+    return np.stack([b1, np.cross(b3, b1), b3], axis=2)
+
+
+def verify(durations, segments, need: Requirements, step: float = 1e-4, tolerance: float = 1e-9) -> list[Finding]:
+    """Check a plan against everything that was asked.
+
+    Args:
+        durations: segment durations [s].
+        segments: Bernstein coefficients of x, y, z, yaw of each segment, shape (f, 4, n + 1).
+        need: the requirements.
+        step: sampling of the dense check [s].
+        tolerance: of the end conditions, relative to 1 + their size.
+
+    Returns:
+        What is broken; empty for a good plan.
+    """
+    found: list[Finding] = []
+    pieces = [_Segment(d, rows) for d, rows in zip(durations, segments)]
+    begins = np.concatenate([[0.0], np.cumsum([piece.duration for piece in pieces])])
+    end = float(begins[-1])
+
+    def equal(name: str, value, wanted, t: float, slack: float = 1.0) -> None:
+        excess = float(np.abs(np.asarray(value) - wanted).max())
+        if not excess <= tolerance * slack * (1.0 + float(np.abs(wanted).max())):
+            found.append(Finding(name, excess, t))
+
+    def at_most(name: str, value: float, limit: float, t: float, slack: float) -> None:
+        if not value <= limit + slack:
+            found.append(Finding(name, value - limit, t))
+
+    _check_knots(pieces, begins, need, equal)
+    last = pieces[-1]
+    equal("position at contact", last.at([1.0], 0)[0, :3], need.p_S + need.v_S * end + need.perch_offset * need.s3, end)
+    contact = need.impact_acceleration * need.s3 - np.array([0.0, 0.0, _G])
+    equal("acceleration at contact [M:eq11]", last.at([1.0], 2)[0, :3], contact, end, slack=10.0)
+    v = last.at([1.0], 1)[0, :3] - need.v_S
+    at_most("impact speed, least [M:eq14]", need.impact_speed[0], float(-v @ need.s3), end, 1e-9)
+    at_most("impact speed, greatest [M:eq14]", float(-v @ need.s3), need.impact_speed[1], end, 1e-9)
+    at_most("tangential speed", float(np.hypot(v @ need.s1, v @ need.s2)), need.tangential_speed, end, 1e-9)
+    _check_tube(pieces, begins, need, contact, at_most)
+    for piece, begin in zip(pieces, begins):
+        _check_exact(piece, float(begin), need, at_most)
+        _check_dense(piece, float(begin), need, step, at_most)
+    return found
+
+
+def _check_knots(pieces, begins, need: Requirements, equal) -> None:
+    for order, wanted in enumerate(need.start):
+        equal(f"start, derivative {order} [M:eq6]", pieces[0].at([0.0], order)[0, :3], wanted, 0.0, slack=10.0**order)
+    equal("start yaw", pieces[0].at([0.0], 0)[0, 3], np.array(need.start_yaw[0]), 0.0)
+    equal("start yaw rate", pieces[0].at([0.0], 1)[0, 3], np.array(need.start_yaw[1]), 0.0, slack=10.0)
+    for k in range(len(pieces) - 1):
+        for order in range(5):
+            left, right = pieces[k].at([1.0], order)[0], pieces[k + 1].at([0.0], order)[0]
+            equal(f"continuity of derivative {order} [M:eq7]", left, right, float(begins[k + 1]), slack=30.0**order)
+    for k, waypoint in enumerate(need.waypoints):
+        equal(f"waypoint {k} [M:eq6]", pieces[k].at([1.0], 0)[0, :3], waypoint, float(begins[k + 1]))
+
+
+def _check_tube(pieces, begins, need: Requirements, contact: np.ndarray, at_most) -> None:
+    length, step, q, floor = need.tube
+    half = np.maximum(np.abs(q * contact), floor)
+    for j in range(round(length / step)):
+        t = float(begins[-1]) - length + j * step
+        if t < 0.0:
+            continue
+        k = min(int(np.searchsorted(begins, t, side="right")) - 1, len(pieces) - 1)
+        a = pieces[k].at([min((t - begins[k]) / pieces[k].duration, 1.0)], 2)[0, :3]
+        at_most("tube [M:eq15]", float((np.abs(a - contact) - half).max()), 0.0, t, 1e-8)
+
+
+def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most) -> None:
+    """Extrema of polynomials, from roots."""
+    def force(s):
+        return np.linalg.norm(piece.at(s, 2)[:, :3] + (0.0, 0.0, _G), axis=1) ** 2
+
+    low, high = _extrema(force, 26)
+    at_most("thrust, greatest [M:eq16]", need.mass * max(high, 0.0) ** 0.5, need.thrust[1], begin, 1e-9)
+    at_most("thrust, least [M:eq16]", need.thrust[0], need.mass * max(low, 0.0) ** 0.5, begin, 1e-9)
+    _, high = _extrema(lambda s: np.linalg.norm(piece.at(s, 1)[:, :3], axis=1) ** 2, 28)
+    at_most("speed", max(high, 0.0) ** 0.5, need.speed, begin, 1e-9)
+    low, high = _extrema(lambda s: piece.at(s, 0)[:, 2], 16)
+    at_most("height, least", need.height[0], low, begin, 1e-9)
+    at_most("height, greatest", high, need.height[1], begin, 1e-9)
+
+
+def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float, at_most) -> None:
+    """Body rate and clearance on samples; the body rate from rotations half a step apart."""
+    count = max(int(np.ceil(piece.duration / step)), 2)
+    s = (np.arange(count) + 0.5) / count
+    h = 0.25 / count
+    before, after = (piece.at(s + sign * h, 2)[:, :3] + (0.0, 0.0, _G) for sign in (-1.0, 1.0))
+    turn = np.einsum("nji,njk->nik", _rotations(before, piece.at(s - h, 0)[:, 3]), _rotations(after, piece.at(s + h, 0)[:, 3]))
+    sine = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+    rate = np.arcsin(np.clip(np.linalg.norm(sine, axis=1), 0.0, 1.0)) / (2.0 * h * piece.duration)
+    worst = int(rate.argmax())
+    at_most("body rate [M:eq13]", float(rate[worst]), need.body_rate, begin + s[worst] * piece.duration, 1e-4 * need.body_rate)
+    f = piece.at(s, 2)[:, :3] + (0.0, 0.0, _G)
+    times = begin + s * piece.duration
+    distance = (piece.at(s, 0)[:, :3] - need.p_S - times[:, None] * need.v_S) @ need.s3
+    sine = np.linalg.norm(np.cross(f, need.s3), axis=1) / np.linalg.norm(f, axis=1)
+    gap = distance - need.extension * sine
+    worst = int(gap.argmin())
+    at_most("clearance", 0.0, float(gap[worst]), float(times[worst]), 1e-9)
