@@ -1,4 +1,4 @@
-"""Node `powerline_mapper`: colour images of the front camera in, the map of powerlines out. [P:sec. VI]"""
+"""Node `powerline_mapper`: images of the front camera in, the map of powerlines out. [P:sec. VI]"""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from perch_core.vehicle import load_vehicle
 from perch_msgs.msg import Powerline, PowerlineArray
 from sensor_msgs.msg import Image
 
-from perch_perception.images import ImageError, rgb_image
+from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.pending_images import PendingImages
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
@@ -33,7 +33,7 @@ class PowerlineMapperConfig:
     """Parameters of the node."""
 
     vehicle: str = config.text("rpg", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
-    camera: str = config.text("front", doc="colour camera of the vehicle; its images are on camera_<name>/image_raw")
+    camera: str = config.text("front", doc="camera of the vehicle, colour for red wires; its images are on camera_<name>/image_raw")
     rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
     max_pose_sigma: float = config.quantity(0.3, unit="m", above=0.0, high=10.0,
                                             doc="odometry less certain than this maps nothing")
@@ -49,11 +49,12 @@ class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
         cv2.setNumThreads(1)
         vehicle = load_vehicle(self.params.vehicle)
         mount = vehicle.mounts.get(self.params.camera)
-        if mount is None or not mount.colour:
-            colour = [name for name, m in vehicle.mounts.items() if m.colour]
+        self._red = self.params.detection.appearance == "red"
+        if mount is None or (self._red and not mount.colour):
+            usable = [name for name, m in vehicle.mounts.items() if m.colour or not self._red]
             self.destroy_node()
-            raise ConfigError("powerline_mapper", "camera", f"{self.params.camera!r} is no colour camera of "
-                              f"{self.params.vehicle}; there are: {', '.join(colour) or 'none'}")
+            raise ConfigError("powerline_mapper", "camera", f"{self.params.camera!r} is no {'colour ' * self._red}camera "
+                              f"of {self.params.vehicle}; there are: {', '.join(usable) or 'none'}")
         self._mount = mount
         self._mapper = LineMapper(self.params.mapper)
         self._buffer = PoseBuffer(reach=0.0)
@@ -95,7 +96,8 @@ class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
         self._participant.report(msg.header.stamp)
 
     def _map(self, msg: Image, exposed: float) -> LineMap:
-        image, body = rgb_image(msg, self._mount.camera), self._buffer.at(exposed)
+        image = (rgb_image if self._red else mono_image)(msg, self._mount.camera)
+        body = self._buffer.at(exposed)
         sigma = float(np.sqrt(np.linalg.eigvalsh(body.covariance[:3, :3])[-1]))
         if sigma > self.params.max_pose_sigma:
             raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")

@@ -1,9 +1,9 @@
-"""Red cables in a colour image: arcs on the sphere of rays.
+"""Wires in an image: arcs on the sphere of rays.
 
 A straight wire is seen as a plane through the optical centre, under any lens; one that sags, as an arc near a plane. So
 pixels of redness R - max(G, B) become ridge points across each blob, these become rays, and parabolas about the blob's
 plane are fitted to them. The threshold on redness gives no false segments on a textured background, where a line
-detector on the red channel gave thousands.
+detector on the red channel gave thousands. Wires without a colour are found as dark ridges instead (see `ridge`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.camera import Camera
+from perch_perception.line_mapping.ridge import dark_ridges
 
 SAMPLES = 7          # rays that stand for a sighting
 HYPOTHESES = 64      # arcs tried per blob and round
@@ -24,13 +25,24 @@ MAX_LINES = 6        # lines in one blob: cables that cross in the image share o
 
 @dataclass(frozen=True)
 class LineDetectionConfig:
-    """What counts as a cable in the image."""
+    """What counts as a wire in the image."""
 
-    redness: float = config.quantity(20.0, low=1.0, high=255.0, doc="least R - max(G, B) of a cable [grey values]")
-    min_length: float = config.quantity(30.0, unit="px", above=0.0, high=640.0, doc="shorter arcs are not used")
+    appearance: str = config.choice("red", options=("red", "dark"),
+                                    doc="red: redder than everything else; dark: darker than what is behind it")
+    redness: float = config.quantity(20.0, low=1.0, high=255.0, doc="least R - max(G, B) of a red wire [grey values]")
+    darkness: float = config.quantity(7.0, low=1.0, high=255.0, doc="least ridge answer of a dark wire [grey values]")
+    min_length: float = config.quantity(30.0, unit="px", above=0.0, high=640.0, doc="shorter red arcs are not used")
+    dark_min_length: float = config.quantity(120.0, unit="px", above=0.0, high=640.0,
+                                             doc="shorter dark arcs are not used: texture and corners make short ones")
     tolerance: float = config.quantity(1.5, unit="px", above=0.0, high=20.0, doc="of ridge points from their arc")
     max_gap: float = config.quantity(25.0, unit="px", above=0.0, high=200.0, doc="hole after which an arc is another one")
     sigma: float = config.quantity(0.2, unit="px", above=0.0, high=5.0, doc="error of an arc that averaging does not remove")
+
+
+    @property
+    def least(self) -> float:
+        """Least length of an arc [px]."""
+        return self.min_length if self.appearance == "red" else self.dark_min_length
 
 
 @dataclass(frozen=True)
@@ -41,7 +53,7 @@ class LineSighting:
         rays_C: unit rays to its axis in C, in order along it, shape (7, 3).
         ends_C: rays to its visible ends, shape (2, 3).
         sigma: 1-sigma of a ray across the arc [rad].
-        width: angle that the wire's thickness subtends [rad].
+        width: angle that the wire's thickness subtends [rad]; 0 where it was not measured.
         length: in the image [px].
     """
 
@@ -59,19 +71,31 @@ def redness(image: np.ndarray) -> np.ndarray:
 
 
 def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> list[LineSighting]:
-    """Red wires in an rgb8 image, shape (height, width, 3); the longest first."""
-    red = redness(image)
-    mask = (red > settings.redness).astype(np.uint8)
+    """Wires in an image, the longest first.
+
+    Args:
+        image: rgb8, shape (height, width, 3); for dark wires mono8, shape (height, width), too.
+        camera: its lens.
+        settings: what counts as a wire.
+    """
+    if settings.appearance == "red":
+        strength, threshold = redness(image), settings.redness
+    else:
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        strength, threshold = dark_ridges(grey), settings.darkness
+    mask = (strength > threshold).astype(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     sightings = []
     for label in range(1, count):
         x, y, w, h = stats[label, :4]
-        if max(w, h) < settings.min_length:
+        if max(w, h) < settings.least:
             continue
         window = slice(y, y + h), slice(x, x + w)
-        blob = np.where(labels[window] == label, red[window], 0).astype(float)
+        blob = np.where(labels[window] == label, strength[window], 0).astype(float)
         pixels, widths = ridge_points(blob)
+        if settings.appearance == "dark":
+            widths = np.zeros_like(widths)  # the filter's width, not the wire's
         sightings += _arcs(pixels + (x, y), widths, camera, settings)
     return sorted(sightings, key=lambda sighting: -sighting.length)
 
@@ -106,7 +130,7 @@ def _arcs(pixels, widths, camera, settings) -> list[LineSighting]:
     rays = camera.unproject(pixels)
     seen = np.all(np.isfinite(rays), axis=1)
     pixels, widths, rays = pixels[seen], widths[seen], rays[seen]
-    if len(rays) < settings.min_length:
+    if len(rays) < settings.least:
         return []
     along, across = _arc_coordinates(rays)
     rng = np.random.default_rng(len(pixels))  # the same image gives the same arcs
@@ -114,10 +138,10 @@ def _arcs(pixels, widths, camera, settings) -> list[LineSighting]:
     left = np.arange(len(pixels))
     sightings: list[LineSighting] = []
     for _ in range(MAX_LINES):
-        if len(left) < settings.min_length:
+        if len(left) < settings.least:
             break
         inlier, spread = _best_arc(along[left], across[left], rng, tolerance)
-        if inlier.sum() < settings.min_length:
+        if inlier.sum() < settings.least:
             break
         chosen = left[inlier]
         chosen = chosen[np.argsort(along[chosen], kind="stable")]
@@ -172,7 +196,7 @@ def _pieces(ordered: np.ndarray, pixels: np.ndarray, settings: LineDetectionConf
     steps = np.linalg.norm(np.diff(pixels[ordered], axis=0), axis=1)
     pieces = np.split(ordered, np.nonzero(steps > settings.max_gap)[0] + 1)
     return [p for p in pieces if len(p) >= 2 * SAMPLES
-            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.min_length]
+            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.least]
 
 
 def _sighting(piece, pixels, widths, rays, spread, camera, settings) -> LineSighting:
