@@ -39,7 +39,8 @@ def install(wanted: Platform, fresh: bool) -> None:
     total = sum(_pins(lock.read_text()) for lock in wanted.locks)
     with Step(f"installing {total} packages") as step:
         arguments = [word for lock in wanted.locks for word in ("-r", str(lock))]
-        pip = [VENV_PYTHON, "-m", "pip", "install", "--progress-bar", "off", "--no-input"]
+        # The locks are complete, so pip has nothing to resolve; tests check that they fit together.
+        pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--progress-bar", "off", "--no-input"]
         quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
         step.run([*pip, *quiet, *arguments], "pip", environment, _narrator(total))
         if wanted.uses_wheels:

@@ -106,6 +106,18 @@ def test_the_lock_for_an_installation_leaves_ros_alone_and_fits_its_binaries():
     assert lock["numpy"].startswith("1.26.") and lock["empy"].startswith("3.")
 
 
+def test_both_ways_to_ros_run_the_same_packages():
+    wheels, installed = pins("python.lock"), pins("python-ros-jazzy.lock")
+    assert {name for name in wheels if installed[name] != wheels[name]} == {"numpy", "pytest"}
+
+
+@pytest.mark.skipif(not (Path(sys.prefix) / "share" / "rclpy").exists(), reason="ROS is installed, not from wheels")
+def test_the_locks_are_complete_and_fit_together():
+    # packages are installed without resolving dependencies
+    result = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout
+
+
 # -- stamps ----------------------------------------------------------------------------------------------------------
 
 
