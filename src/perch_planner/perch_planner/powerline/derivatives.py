@@ -24,6 +24,7 @@ class Parameters:
     """The problem's parameters as symbols: see `nlp.Numbers`."""
 
     lines: Sequence[ca.MX]
+    body_rate: ca.MX
     reference: ca.MX
     run: ca.MX
     end: ca.MX
@@ -83,40 +84,68 @@ def split(x: ca.MX, N: int) -> tuple[ca.MX, ca.MX]:
     return ca.horzcat(stages[:STAGE_STATES, :], x[N * STRIDE:]), stages[STAGE_STATES:, :]
 
 
-def constraint_rows(N: int, lines: int) -> tuple[np.ndarray, int, np.ndarray]:
-    """First rows of the dynamics of every interval, of the start condition, and of the clearances of nodes 1..N."""
-    dynamics = np.array([0] + [STAGE_STATES + STATES + k * (STAGE_STATES + lines) for k in range(N - 1)])
-    clearance = dynamics[1:] + STAGE_STATES
-    return dynamics, STAGE_STATES, np.append(clearance, STAGE_STATES + STATES + (N - 1) * (STAGE_STATES + lines))
+@dataclass(frozen=True)
+class Rows:
+    """Where the constraints are: fatrop wants an interval's dynamics first, then what else constrains its first node.
+
+    Attributes:
+        dynamics: first of 18 rows of every interval, shape (N,).
+        start: first of 17 rows of the start condition.
+        turn: row of the middle of every interval, shape (N,).
+        inner: first row of the path constraints of nodes 1..N, shape (N,).
+        count: number of all rows.
+    """
+
+    dynamics: np.ndarray
+    start: int
+    turn: np.ndarray
+    inner: np.ndarray
+    count: int
+
+
+def constraint_rows(N: int, path: int) -> Rows:
+    """Rows of a problem with N intervals and `path` constraints at every node but the first."""
+    first = STAGE_STATES + STATES + 1
+    later = first + np.arange(N - 1) * (STAGE_STATES + path + 1)
+    inner = np.append(later + STAGE_STATES, first + (N - 1) * (STAGE_STATES + path + 1))
+    return Rows(np.append(0, later), STAGE_STATES, np.append(first - 1, inner[:-1] + path), inner, int(inner[-1]) + path)
+
+
+def path_functions(p: Parameters) -> list[tuple[str, ca.MX]]:
+    """The path constraints of a node in their order, each with its parameter: every line's clearance, then the spin."""
+    return [*(("clear", line) for line in p.lines), ("spin", p.body_rate)]
 
 
 def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int) -> ca.MX:
     """Jacobian of all constraints."""
-    f, count = stages.functions, len(p.lines)
+    f, path = stages.functions, path_functions(p)
     X, U = split(x, N)
-    dynamics, start, clearance = constraint_rows(N, count)
-    out = Gather(int(clearance[-1]) + count, N * STRIDE + STAGE_STATES)
+    at = constraint_rows(N, len(path))
+    out = Gather(at.count, N * STRIDE + STAGE_STATES)
 
     rows, columns = _pattern(stages.jacobian["step"])
     k = np.arange(N)[:, None]
     values = f["step_jac"].map(N)(X[:, :N], U, 1.0 / N)
-    out.add(-ca.vec(values), (dynamics[:, None] + rows).ravel(), (k * STRIDE + columns).ravel())
+    out.add(-ca.vec(values), (at.dynamics[:, None] + rows).ravel(), (k * STRIDE + columns).ravel())
     diagonal = np.arange(STAGE_STATES)
-    out.add(ca.MX(ca.DM.ones(N * STAGE_STATES)), (dynamics[:, None] + diagonal).ravel(), ((k + 1) * STRIDE + diagonal).ravel())
-    out.add(ca.MX(ca.DM.ones(STATES)), start + np.arange(STATES), np.arange(STATES))
-    rows, columns = _pattern(stages.jacobian["clear"])
-    for i, line in enumerate(p.lines):
-        values = f["clear_jac"].map(N)(X[:, 1:], line)
-        out.add(ca.vec(values), (clearance[:, None] + i + rows).ravel(), ((k + 1) * STRIDE + columns).ravel())
+    out.add(ca.MX(ca.DM.ones(N * STAGE_STATES)), (at.dynamics[:, None] + diagonal).ravel(), ((k + 1) * STRIDE + diagonal).ravel())
+    out.add(ca.MX(ca.DM.ones(STATES)), at.start + np.arange(STATES), np.arange(STATES))
+    rows, columns = _pattern(stages.jacobian["turn"])
+    values = f["turn_jac"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate)
+    out.add(ca.vec(values), (at.turn[:, None] + rows).ravel(), (k * STRIDE + columns).ravel())
+    for i, (name, parameter) in enumerate(path):
+        rows, columns = _pattern(stages.jacobian[name])
+        values = f[f"{name}_jac"].map(N)(X[:, 1:], parameter)
+        out.add(ca.vec(values), (at.inner[:, None] + i + rows).ravel(), ((k + 1) * STRIDE + columns).ravel())
     return out.matrix()
 
 
 def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.MX, lam_g: ca.MX, perception: bool
             ) -> tuple[ca.MX, ca.MX]:
     """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g."""
-    f, count = stages.functions, len(p.lines)
+    f, path = stages.functions, path_functions(p)
     X, U = split(x, N)
-    dynamics, start, clearance = constraint_rows(N, count)
+    at = constraint_rows(N, len(path))
     size = N * STRIDE + STAGE_STATES
     out = Gather(size, size)
     pieces: list[tuple[ca.MX, int]] = []  # gradients of one function over the stages, and the first stage
@@ -126,13 +155,16 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
         places = _tiled(_pattern(stages.hessian[name]), STRIDE, STRIDE, number, first * STRIDE, first * STRIDE)
         out.add(ca.vec(values[variables:, :]), *places, mirror=True)
 
-    lam_step = ca.reshape(lam_g[(dynamics[:, None] + np.arange(STAGE_STATES)).ravel().tolist()], STAGE_STATES, N)
+    lam_step = ca.reshape(lam_g[(at.dynamics[:, None] + np.arange(STAGE_STATES)).ravel().tolist()], STAGE_STATES, N)
     take("step", f["step_hess"].map(N)(X[:, :N], U, 1.0 / N, -lam_step), STRIDE, 0, N)
+    turn = f["turn_hess"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate, lam_g[at.turn.tolist()].T)
+    take("turn", turn, STRIDE, 0, N)
     take("run", f["run_hess"].map(N)(X[:, :N], U, p.run, lam_f), STRIDE, 0, N)
     if perception:
         take("see", f["see_hess"].map(N)(X[:, :N], p.lines[0], p.see, lam_f), STAGE_STATES, 0, N)
-    for i, line in enumerate(p.lines):
-        take("clear", f["clear_hess"].map(N)(X[:, 1:], line, lam_g[(clearance + i).tolist()].T), STAGE_STATES, 1, N)
+    for i, (name, parameter) in enumerate(path):
+        values = f[f"{name}_hess"].map(N)(X[:, 1:], parameter, lam_g[(at.inner + i).tolist()].T)
+        take(name, values, STAGE_STATES, 1, N)
     take("end", f["end_hess"](X[:, N], p.reference, p.end, lam_f), STAGE_STATES, N, 1)
 
     gradient = ca.MX.zeros(STRIDE, N + 1)
@@ -140,5 +172,5 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
         rows, number = values.shape
         gradient[:rows, first : first + number] += values
     gradient[:STAGE_STATES, 1:] += lam_step
-    gradient[:STATES, 0] += lam_g[start : start + STATES]
+    gradient[:STATES, 0] += lam_g[at.start : at.start + STATES]
     return ca.vec(gradient)[:size], out.matrix()

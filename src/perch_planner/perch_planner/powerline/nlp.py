@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from perch_core.rotor_model import INPUTS, STATES
-from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, hessian, jacobian, split
+from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, hessian, jacobian, path_functions, split
 from perch_planner.powerline.stage_functions import (
     END_WEIGHTS, LINE_SIZE, REFERENCE, RUN_WEIGHTS, SEE_WEIGHTS, STAGE_STATES, StageFunctions,
 )
@@ -48,7 +48,7 @@ class Numbers:
         duration: bounds of T [s]. [P:eq14c]
         height_min: z_min with its margin [m]. [P:eq14e]
         thrust: bounds of a rotor's thrust [N]. [P:eq14f]
-        body_rate: bound of each component of w_WB_B [rad/s].
+        body_rate: bound of |w_WB_B| [rad/s].
         clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line, see `stage_functions`. [P:eq14j]
         states, inputs: initial guess, shapes (N + 1, 18) and (N, 4), inputs in [-1, 1].
         defects: what is added to the integrator's result at the end of every interval, shape (N, 18); see `defects_of`.
@@ -109,27 +109,30 @@ class Problem:
     max_iterations: int = 300
     _solver: ca.Function = field(init=False, repr=False)
     _equality: np.ndarray = field(init=False, repr=False)
+    _clearances: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         N, count, f = self.structure.intervals, self.structure.lines, self.stages.functions
         x = ca.MX.sym("x", N * STRIDE + STAGE_STATES)
-        sizes = [LINE_SIZE] * count + [STATES, REFERENCE, RUN_WEIGHTS, END_WEIGHTS, SEE_WEIGHTS * N, STAGE_STATES * N]
+        sizes = [LINE_SIZE] * count + [1, STATES, REFERENCE, RUN_WEIGHTS, END_WEIGHTS, SEE_WEIGHTS * N, STAGE_STATES * N]
         p = ca.MX.sym("p", sum(sizes))
-        *lines, start, reference, run, end, see, defects = ca.vertsplit(p, np.cumsum([0, *sizes]).tolist())
-        parameters = Parameters(lines, reference, run, end, ca.reshape(see, SEE_WEIGHTS, N))
+        *lines, body_rate, start, reference, run, end, see, defects = ca.vertsplit(p, np.cumsum([0, *sizes]).tolist())
+        parameters = Parameters(lines, body_rate, reference, run, end, ca.reshape(see, SEE_WEIGHTS, N))
         X, U = split(x, N)
 
         cost = ca.sum2(f["run"].map(N)(X[:, :N], U, run)) + f["end"](X[:, N], reference, end)
         if self.structure.perception:
             cost += ca.sum2(f["see"].map(N)(X[:, :N], lines[0], parameters.see))
         gaps = X[:, 1:] - f["step"].map(N)(X[:, :N], U, 1.0 / N) - ca.reshape(defects, STAGE_STATES, N)
-        clear = ca.vertcat(*[f["clear"].map(N)(X[:, 1:], line) for line in lines], ca.MX(0, N))
-        # The order that fatrop asks for: dynamics of an interval, then what else constrains its first node.
-        later = ca.vec(ca.vertcat(gaps[:, 1:], clear[:, :-1]))
-        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, later, clear[:, -1])
-        dynamics, first, clearance = constraint_rows(N, count)
-        self._equality = np.ones(g.shape[0], bool)
-        self._equality[(clearance[:, None] + np.arange(count)).ravel()] = False
+        path = path_functions(parameters)
+        inside = ca.vertcat(*[f[name].map(N)(X[:, 1:], parameter) for name, parameter in path])
+        turn = f["turn"].map(N)(X[:, :N], U, 1.0 / N, body_rate)
+        later = ca.vec(ca.vertcat(gaps[:, 1:], inside[:, :-1], turn[1:]))
+        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, turn[0], later, inside[:, -1])
+        at = constraint_rows(N, len(path))
+        self._clearances = (at.inner[:, None] + np.arange(count)).ravel()
+        self._equality = np.ones(at.count, bool)
+        self._equality[self._clearances] = self._equality[at.inner + count] = self._equality[at.turn] = False
 
         lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.shape[0])
         gradient, H = hessian(self.stages, x, parameters, N, lam_f, lam_g, self.structure.perception)
@@ -159,7 +162,6 @@ class Problem:
         N = self.structure.intervals
         low, high = np.full((N + 1, STRIDE), -_FREE), np.full((N + 1, STRIDE), _FREE)
         low[1:, 2] = numbers.height_min
-        low[1:, 10:13], high[1:, 10:13] = -numbers.body_rate, numbers.body_rate
         low[1:, 13:17], high[1:, 13:17] = numbers.thrust
         low[0, STATES], high[0, STATES] = numbers.duration
         low[:, STAGE_STATES:], high[:, STAGE_STATES:] = -1.0, 1.0
@@ -182,14 +184,15 @@ class Problem:
         """Solve one problem from its initial guess."""
         N = self.structure.intervals
         guess = np.concatenate([numbers.states, np.vstack([numbers.inputs, np.zeros(INPUTS)])], axis=1).ravel()[:-INPUTS]
-        parameters = np.concatenate([numbers.lines.ravel(), numbers.start, numbers.reference, numbers.run_weights,
+        parameters = np.concatenate([numbers.lines.ravel(), [numbers.body_rate], numbers.start, numbers.reference, numbers.run_weights,
                                      numbers.end_weights, numbers.see_weights.ravel(),
                                      numbers.defects.ravel()])
         low, high = self._bounds(numbers)
+        least = np.zeros(len(self._equality))
+        least[self._clearances] = numbers.clearance
         begin = time.perf_counter()
         answer = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
-                              lbg=np.where(self._equality, 0.0, numbers.clearance),
-                              ubg=np.where(self._equality, 0.0, _FREE))
+                              lbg=least, ubg=np.where(self._equality, 0.0, _FREE))
         elapsed = time.perf_counter() - begin
         statistics = self._solver.stats()
         found = np.concatenate([np.array(answer["x"]).ravel(), np.zeros(INPUTS)]).reshape(N + 1, STRIDE)

@@ -24,7 +24,7 @@ from perch_planner.powerline.stage_functions import line_parameters
 from perch_planner.powerline.validation import check_request
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
-ATTEMPTS = 5  # solves of one manoeuvre: margins raised, then N, then another guess and solver
+ATTEMPTS = 6  # solves of one manoeuvre: margins raised, then N, then another guess and solver
 RADIUS_REDUCTION = 0.02  # the paper's, for the recovery, which starts at the wire [m]
 
 
@@ -213,9 +213,9 @@ class PowerlinePlanner:
             worst = broken[0]
             only_end = all(bound.quantity.startswith("end_") for bound in broken)
             margins, lines = self._tightened(margins, broken), self._joined(lines, request.lines, flown)
-            if attempt >= 2:
+            if attempt >= 2 and not only_end:
                 intervals = int(np.ceil(1.5 * intervals))
-            previous, phase = _resampled(found, intervals), "polish" if only_end and attempt < 2 else "second"
+            previous, phase = _resampled(found, intervals), "polish" if only_end else "second"
         if worst is not None:
             raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {name} within the limits: {worst}")
         raise PlanningRefusal("infeasible", name, -1.0,

@@ -131,13 +131,29 @@ def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
     return h / (h + 2 * dot(l, l))
 
 
+def _spin(x: Vector, limit: Scalar) -> Scalar:
+    """1 - |w|^2 / limit^2: positive where the body turns slower than its limit, about whatever axis."""
+    return 1 - dot(x[W], x[W]) / (limit * limit)
+
+
+def _turn(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, limit: Scalar) -> Scalar:
+    """`_spin` in the middle of the interval that starts at a node.
+
+    A light body may reach its greatest rate between two nodes and stop at both: 5000 rad/s^3 are within its torque.
+    Body rate and thrusts do not depend on the rest of the state, so that this costs little.
+    """
+    rates = tuple(model.thrust_rate_max * value for value in u)
+    half = rotor_model.rk4(model.rotor, x[:STATES], rates, x[STATES] * unit_step / 2)
+    return _spin(half, limit)
+
+
 @dataclass(frozen=True)
 class StageFunctions:
     """The functions of one stage with their derivatives as flat vectors of nonzeros, and where these belong.
 
     Attributes:
         functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, weights)`, `see(x, line, weights)`,
-            `end(x, reference, weights)` -> cost; `clear(x, line)` -> constraint, with x of 18 values (17 states, T) and u
+            `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint, with x of 18 values (17 states, T) and u
             of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f
             and then the nonzeros of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
         jacobian, hessian: sparsity of these nonzeros by base name; the Hessian's is an upper triangle.
@@ -156,7 +172,7 @@ def stage_functions(model: StageModel) -> StageFunctions:
     """Build the stage functions and their derivatives as expressions."""
     x, u = ca.SX.sym("x", STAGE_STATES), ca.SX.sym("u", INPUTS)
     line, reference = ca.SX.sym("line", LINE_SIZE), ca.SX.sym("reference", REFERENCE)
-    unit_step = ca.SX.sym("unit_step")
+    unit_step, limit = ca.SX.sym("unit_step"), ca.SX.sym("limit")
     run, see, end = (ca.SX.sym(name, size) for name, size in
                      (("run", RUN_WEIGHTS), ("see", SEE_WEIGHTS), ("end", END_WEIGHTS)))
     xs, us, ls, rs = map(components, (x, u, line, reference))
@@ -167,6 +183,8 @@ def stage_functions(model: StageModel) -> StageFunctions:
         "see": ([x], [line, see], _see(model, xs, ls, sw)),
         "end": ([x], [reference, end], _end(model, xs, rs, ew)),
         "clear": ([x], [line], _clear(model, xs, ls)),
+        "spin": ([x], [limit], _spin(xs, limit)),
+        "turn": ([x, u], [unit_step, limit], _turn(model, xs, us, unit_step, limit)),
     }
     functions, jacobian, hessian = {}, {}, {}
     for name, (variables, parameters, value) in expressions.items():
