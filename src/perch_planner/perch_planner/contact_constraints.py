@@ -76,29 +76,22 @@ def tube_times(duration: float, settings: PerchSettings) -> np.ndarray:
 class Contact:
     """What does not change while durations are stretched; made once per plan."""
 
-    def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float, free_knots: int = 0) -> None:
-        """
-        Args:
-            problem: what was asked.
-            settings: impact window and tube.
-            perch_offset: velcro below the centre of mass [m].
-            free_knots: knots after the last waypoint at which nothing is given.
-        """
+    def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float) -> None:
         surface = problem.surface
         self.settings, self.velocity = settings, problem.target_velocity
         self.p_contact = surface.p_WS + perch_offset * surface.normal
         self.acceleration = contact_acceleration(surface, settings.impact_acceleration)
-        knots = len(problem.waypoints) + 2 + free_knots
-        self.given = np.zeros((knots, 4), bool)
-        self.values = np.zeros((knots, 4, 3))
+        knots = len(problem.waypoints) + 2
+        self._given = np.zeros((knots, 4), bool)
+        self._values = np.zeros((knots, 4, 3))
         start = problem.start
-        self.given[0], self.values[0] = True, (start.p, start.v, start.a, start.j)
+        self._given[0], self._values[0] = True, (start.p, start.v, start.a, start.j)
         for k, waypoint in enumerate(problem.waypoints, start=1):
             for order, value in enumerate((waypoint.p, waypoint.v, waypoint.a, waypoint.j)):
                 if value is not None:
-                    self.given[k, order], self.values[k, order] = True, value
-        self.given[-1] = (True, False, True, False)
-        self.values[-1, 2] = self.acceleration
+                    self._given[k, order], self._values[k, order] = True, value
+        self._given[-1] = (True, False, True, False)
+        self._values[-1, 2] = self.acceleration
 
         lower, upper = tube_bounds(self.acceleration, settings)
         count = len(tube_times(0.0, settings))
@@ -116,9 +109,19 @@ class Contact:
         self._tube_lower, self._tube_upper = np.tile(lower + INSET, count), np.tile(upper - INSET, count)
 
     def knots(self, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]"""
-        self.values[-1, 0] = self.p_contact + self.velocity * durations.sum()
-        return self.given, self.values
+        """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]
+
+        Where there are more durations than segments of the problem, nothing is given at the knots between the last
+        waypoint and contact.
+        """
+        extra = len(durations) + 1 - len(self._given)
+        given = np.zeros((len(durations) + 1, 4), bool)
+        values = np.zeros((len(durations) + 1, 4, 3))
+        last = len(self._given) - 1
+        given[:last], given[last + extra] = self._given[:last], self._given[last]
+        values[:last], values[last + extra] = self._values[:last], self._values[last]
+        values[-1, 0] = self.p_contact + self.velocity * durations.sum()
+        return given, values
 
     def constraints(self, durations: np.ndarray) -> LinearConstraints:
         """Tube and impact window for these durations. [M:eq14, M:eq15]
@@ -144,6 +147,6 @@ class Contact:
         if everywhere:
             return np.ones(len(durations), bool)
         out = np.arange(len(durations)) >= constraints.segments.min()
-        out[1:] |= self.given[1:-1].all(axis=1)
+        out[1:len(self._given) - 1] |= self._given[1:-1].all(axis=1)
         return out
 

@@ -21,7 +21,7 @@ from perch_planner.cutting import limit_cuts, thrust_cuts, turning_side
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.refusals import PerchRefusal
 from perch_planner.segment_program import COST_ORDER, FORMULATIONS
-from perch_planner.time_allocation import allocate, split_last, stretch_factor, with_last_segment
+from perch_planner.time_allocation import allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
 from perch_planner.yaw_profile import yaw_coefficients
 
 _CUT_ROUNDS = 24
@@ -110,8 +110,8 @@ class _Search:
         self.limits = Limits.of(settings, vehicle)
         p_contact = problem.surface.p_WS + vehicle.perch_offset * problem.surface.normal
         refusals.refuse_hopeless(problem, settings, self.limits, vehicle, p_contact)
-        self.first = split_last(allocate(problem, settings, p_contact))
-        self.contact = Contact(problem, settings, vehicle.perch_offset, len(self.first) - len(problem.waypoints) - 1)
+        self.first = allocate(problem, settings, p_contact)
+        self.contact = Contact(problem, settings, vehicle.perch_offset)
         self.low, self.high = (x / vehicle.mass for x in self.limits.thrust)
         self.attempts: list[Attempt] = []
         self.end_yaw = contact_heading(problem.surface)
@@ -204,9 +204,21 @@ class _Search:
         self.attempts.append(Attempt(float(durations.sum()), float(low), float(high), cuts))
 
     def longer(self, durations: np.ndarray, outcome: _Outcome) -> np.ndarray:
-        """The next durations. [M:IV-C.3]"""
-        if self.settings.stretching == "segments" and outcome.segments is not None:
-            grown = np.where(outcome.segments, _SEGMENT_STRETCH * durations, durations)
+        """The next durations. [M:IV-C.3]
+
+        Args:
+            durations: of the problem's segments, shape (waypoints + 1,).
+            outcome: what they gave.
+        """
+        last = len(durations) - 1
+        violated = np.zeros(last + 1, bool)
+        if outcome.segments is not None:
+            for i in np.flatnonzero(outcome.segments):
+                violated[min(i, last)] = True
+        if self.settings.stretching == "segments" and violated.any():
+            grown = np.where(violated, _SEGMENT_STRETCH * durations, durations)
+        elif self.settings.stretching == "adaptive" and not violated[:last].any():
+            grown = lengthen_approach(durations)
         else:
             grown = outcome.stretch * durations
         return with_last_segment(grown, self.settings)
@@ -219,7 +231,7 @@ class _Search:
             if high - low < 1e-3 or self.iterations >= self.settings.iterations_max:
                 break
             middle = 0.5 * (low + high)
-            tried = self.try_durations(middle * durations)
+            tried = self.try_durations(split_last(middle * durations))
             if tried.proved:
                 high, outcome = middle, tried
             else:
@@ -246,7 +258,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     durations = search.first
     best, stretched = None, 0
     while True:
-        outcome = search.try_durations(durations, patient=stretched < _PATIENCE)
+        outcome = search.try_durations(split_last(durations), patient=stretched < _PATIENCE)
         if outcome.proved:
             break
         stretched += 1
@@ -258,6 +270,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         durations = grown
     if settings.minimum_time:
         durations, outcome = search.shortest(durations, outcome)
+    durations = split_last(durations)
     method = "bernstein"
     if settings.decider == "sturm":
         method = "sturm"

@@ -148,7 +148,8 @@ class PerchSettings:
     formulation: str = choice("reduced", options=("reduced", "full"), doc="reduced QP, or order 14 as in [M:eq5-8, M:eq17]")
     solver: str = choice("daqp", options=("daqp", "osqp", "piqp"), doc="quadratic programming solver")
     decider: str = choice("bernstein", options=("bernstein", "sturm"), doc="thrust bound: subdivision, or [M:alg1]")
-    stretching: str = choice("whole", options=("whole", "segments"), doc="which durations grow when a bound is violated")
+    stretching: str = choice("adaptive", options=("adaptive", "whole", "segments"),
+                             doc="what grows when a bound is violated: the approach or all, all, or as in [M:IV-C.3]")
     cuts: bool = quantity(True, doc="add linear bounds where a limit is violated, before the time is stretched")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")

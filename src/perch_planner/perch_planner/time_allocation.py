@@ -13,7 +13,7 @@ CRUISE_SPEED = 2.5        # [m/s] of the speed profile that spaces the waypoints
 CRUISE_ACCELERATION = 3.0  # [m/s^2]
 TURN_ACCELERATION = 2.0    # [m/s^2]
 MANOEUVRE_TIME = 0.45     # [s] for the rotation before contact, on top of the way
-FINAL_TIME = 0.5          # [s] of the last segment, where the rotation happens
+FINAL_TIME = 0.5          # [s] of the last piece, where the rotation happens
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
 
@@ -72,14 +72,24 @@ def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndar
 
 
 def split_last(durations: np.ndarray) -> np.ndarray:
-    """Divide a long last segment by a knot at which nothing is given.
+    """Divide a long last segment by knots at which nothing is given.
 
     One polynomial over a long way is too stiff for the rotation at its end: without the knot no plan keeps a 0.25 kg
     vehicle under 4.05 N above 105 degrees, with it every inclination is reached.
     """
-    if durations[-1] < 2.0 * FINAL_TIME:
+    last = durations[-1]
+    if last < 2.0 * FINAL_TIME:
         return durations
-    return np.concatenate([durations[:-1], [durations[-1] - FINAL_TIME, FINAL_TIME]])
+    if last < 5.0 * FINAL_TIME:
+        return np.concatenate([durations[:-1], [last - FINAL_TIME, FINAL_TIME]])
+    return np.concatenate([durations[:-1], [last - 2.5 * FINAL_TIME, 1.5 * FINAL_TIME, FINAL_TIME]])
+
+
+def lengthen_approach(durations: np.ndarray) -> np.ndarray:
+    """More time for the last segment, where the run-up and the rotation have to happen, and a little for the rest."""
+    grown = 1.05 * durations
+    grown[-1] = max(1.25 * durations[-1], 2.2 * FINAL_TIME)
+    return grown
 
 
 def stretch_factor(peak: float, limit: float) -> float:
