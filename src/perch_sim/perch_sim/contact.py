@@ -13,6 +13,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.scenario import Adhesion
+from perch_sim.attachment import FREE, Attachment
 from perch_sim.contact_event import ContactEvent, ContactState
 from perch_sim.dynamics import Hold
 from perch_sim.obstacles import Obstacles
@@ -20,8 +21,6 @@ from perch_sim.obstacles import Obstacles
 SEPARATION = 0.05      # a touch is over when nothing has touched for so long [s]
 CRASH_SPEED = 2.0      # rotors and frame do not survive a faster impact [m/s]
 LANDING_TILT = math.radians(45.0)  # steeper on the floor is no landing
-SETTLING = 0.02        # time constant with which the velcro draws the plate flat [s]
-FREE = Hold(False, -1, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 class Impact(NamedTuple):
@@ -71,21 +70,19 @@ class ContactMonitor:
     def __init__(self, plate_offset: float, obstacles: Obstacles, adhesion: Adhesion) -> None:
         self._plate_offset, self._obstacles, self._adhesion = plate_offset, obstacles, adhesion
         self._touched: dict[int, tuple[float, ContactState]] = {}  # surface -> last touch, its state
-        self._attached_at = 0.0
-        self._settle: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(3))
-        self._final: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(4))
+        self._attachment: Attachment | None = None
         self.hold: Hold = FREE
         self.crashed = False
 
     @property
     def attached(self) -> bool:
         """Whether the velcro holds."""
-        return self.hold.active
+        return self._attachment is not None
 
     @property
     def free(self) -> bool:
         """Whether nothing was touched lately."""
-        return not (self._touched or self.hold.active)
+        return not (self._touched or self.attached)
 
     def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
         """What changed at this instant.
@@ -99,14 +96,14 @@ class ContactMonitor:
         events = []
         for s in range(len(distances)):
             plate, rest = distances[s, 0] < 0.0, distances[s, 1] < 0.0
-            if self.attached and s == self.hold.surface:
+            if self.attached and s == self._attachment.surface:
                 continue
             if plate or rest:
                 event = self._touch(time, s, before, x, rest)
                 events += [event] if event else []
         events += self._separations(time)
-        if self.attached:
-            self._draw_flat(time)
+        if self._attachment is not None:
+            self.hold = self._attachment.hold(time)
         return events
 
     def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool) -> ContactEvent | None:
@@ -120,7 +117,7 @@ class ContactMonitor:
         state, reason = self._judge(s, impact, rest)
         self._touched[s] = (time, state)
         if state is ContactState.ATTACHED:
-            self._attach(time, s, x, impact.tilt_error, p_WS)
+            self._attach(time, s, x, p_WS)
         offset = float(np.hypot(impact.offset_S[0], impact.offset_S[1])) if s == self._obstacles.pad else 0.0
         return ContactEvent(time, state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
                             impact.tilt_error, offset, reason)
@@ -146,32 +143,16 @@ class ContactMonitor:
 
     def _separations(self, time: float) -> list[ContactEvent]:
         over = [s for s, (last, _) in self._touched.items()
-                if time - last > SEPARATION and not (self.attached and s == self.hold.surface)]
+                if time - last > SEPARATION and not (self.attached and s == self._attachment.surface)]
         for s in over:
             del self._touched[s]
         if not over or self._touched:
             return []
         return [ContactEvent(time, ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
 
-    def _attach(self, time: float, s: int, x: np.ndarray, tilt: float, p_WS: np.ndarray) -> None:
+    def _attach(self, time: float, s: int, x: np.ndarray, p_WS: np.ndarray) -> None:
         """Hold the plate where it touched; it is then drawn flat on the surface."""
         normal = self._obstacles.surfaces.axes[s, :, 2]
-        b3 = so3.quat_to_matrix(x[3:7])[:, 2]
-        plate_W = x[:3] - self._plate_offset * b3
+        plate_W = x[:3] - self._plate_offset * so3.quat_to_matrix(x[3:7])[:, 2]
         flat_W = plate_W - ((plate_W - p_WS) @ normal) * normal
-        axis = np.cross(b3, normal)
-        sine = float(np.linalg.norm(axis))
-        turn = so3.quat_exp(axis / sine * tilt) if sine > 1e-9 else np.array([0.0, 0.0, 0.0, 1.0])
-        q_flat = so3.quat_multiply(turn, x[3:7])
-        velocity = self._obstacles.surfaces.velocity[s]
-        self._final = (flat_W, q_flat)
-        self._settle = (plate_W - flat_W, so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q_flat), x[3:7])))
-        self._attached_at = time
-        self.hold = Hold(True, s, plate_W.copy(), velocity.copy(), x[3:7].copy())
-
-    def _draw_flat(self, time: float) -> None:
-        age = time - self._attached_at
-        fade = math.exp(-age / SETTLING)
-        anchor = self._final[0] + self.hold.velocity * age + fade * self._settle[0]
-        attitude = so3.quat_multiply(self._final[1], so3.quat_exp(fade * self._settle[1])) if fade > 1e-6 else self._final[1]
-        self.hold = self.hold._replace(anchor_W=anchor, attitude=np.ascontiguousarray(attitude))
+        self._attachment = Attachment(time, s, plate_W, flat_W, x[3:7], normal, self._obstacles.surfaces.velocity[s])

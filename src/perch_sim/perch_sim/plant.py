@@ -9,10 +9,12 @@ import numpy as np
 from perch_core.scenario import Scenario
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding
+from perch_sim.attachment import FREE
 from perch_sim.body import PLATE_POINTS, Body, make_body
+from perch_sim.cable_contact import CableMonitor
 from perch_sim.contact import ContactMonitor
 from perch_sim.contact_event import ContactEvent
-from perch_sim.dynamics import GRAVITY, STATES, advance, clearances
+from perch_sim.dynamics import GRAVITY, STATES, Hold, advance, clearances
 from perch_sim.obstacles import make_obstacles
 from perch_sim.state_history import TrueState
 from perch_sim.wind import WindField
@@ -54,6 +56,7 @@ class Plant:
         self.body = make_body(vehicle, scenario.disturbance)
         self.obstacles = make_obstacles(scenario)
         self.contact = ContactMonitor(self.body.plate_offset, self.obstacles, scenario.adhesion)
+        self.cables = CableMonitor(scenario.world.cables, scenario.grip, self.body.plate_offset, np.array(vehicle.body_radii))
         self.time = start
         self.rotor_speed = np.zeros(4)
         self._start = start
@@ -67,6 +70,16 @@ class Plant:
         """The present state."""
         x = self._x.copy()
         return TrueState(self.time, x[:3], x[3:7], x[7:10], x[10:13])
+
+    @property
+    def crashed(self) -> bool:
+        """Whether the rotors are broken."""
+        return self.contact.crashed or self.cables.crashed
+
+    @property
+    def hold(self) -> Hold:
+        """What holds the vehicle: the velcro, the gripper, or nothing."""
+        return self.contact.hold if self.contact.attached else self.cables.hold
 
     @property
     def rotor_thrust(self) -> np.ndarray:
@@ -90,8 +103,8 @@ class Plant:
         states, contacts = [], []
         for k in range(1, SUBSTEPS + 1):
             before = self._x.copy()
-            aim = np.zeros(4) if self.contact.crashed else target
-            advance(self._x, self.rotor_speed, aim, wind, self.body, self.obstacles.surfaces, self.contact.hold,
+            aim = np.zeros(4) if self.crashed else target
+            advance(self._x, self.rotor_speed, aim, wind, self.body, self.obstacles.surfaces, self.hold,
                     (self.time - self._start) * 1e-9 + (k - 1) * STEP, STEP, sample)
             total += sample
             time = self.time + k * PERIOD // SUBSTEPS
@@ -99,12 +112,14 @@ class Plant:
             states.append(TrueState(time, x[:3], x[3:7], x[7:10], x[10:13]))
             contacts += self._touches(time, before)
         self.time += PERIOD
+        elapsed = (self.time - self._start) * 1e-9
+        contacts += [e._replace(time=self.time * 1e-9) for e in self.cables.update(elapsed, self._x)]
         return PlantOutput(tuple(states), total / SUBSTEPS, tuple(contacts))
 
     def _warm_up(self) -> None:
         """Compile the kernels now, on a copy of the state, rather than in the first step of a flight in real time."""
         advance(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces,
-                self.contact.hold, 0.0, STEP, np.zeros(6))
+                FREE, 0.0, STEP, np.zeros(6))
         clearances(self._x, self.body, self.obstacles.surfaces, 0.0, self._distances)
 
     def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:

@@ -232,7 +232,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         values: dict[str, Any] = {"time_s": self._simulation.time * 1e-9, "steps": self._index,
                                   **self._times.report(PERIOD * 1e-9), **self._counts,
                                   "motors_timed_out": self._simulation.motors.timed_out,
-                                  "crashed": self._simulation.plant.contact.crashed}
+                                  "crashed": self._simulation.plant.crashed}
         level, message = 0, "ok"
         if self._watch is None:
             values |= {"deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
@@ -240,7 +240,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             message = f"waiting for {self._watch.waiting}"
         if self._simulation.motors.timed_out:
             level, message = 1, "motors stopped: no motor_command"
-        if self._simulation.plant.contact.crashed:
+        if self._simulation.plant.crashed:
             level, message = 2, "crashed"
         self.publish_diagnostics(self._simulation.time * 1e-9, values, level, message)
 

@@ -1,0 +1,142 @@
+"""Contact with cables: when the gripper closes, and what a cable in the rotors does.
+
+The gripper sits `perch_offset` below the centre of mass and points along -b3; it turns freely about its axis. It closes
+when the cable is as near as it gets: it then holds within the tolerances of position, tilt and speed of the scenario.
+Tilt is how far b3 is from being square to the cable: the pitch about the cable is free.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.catenary import Catenary
+from perch_core.scenario import Cable, Grip
+from perch_sim.attachment import FREE, Attachment
+from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.dynamics import Hold
+
+TOUCH = 0.01       # nearer than this the cable is in the claw [m]
+LEAVING = 0.02     # ... and it has left when it is this far beyond the tolerance of position [m]
+MAX_ERROR = 1e-3   # of a cable's straight pieces [m]
+
+
+class Nearest(NamedTuple):
+    """The point of a cable that is nearest to a point."""
+
+    point_W: np.ndarray      # (3,) [m]
+    direction: np.ndarray    # of the cable there, unit, (3,)
+    distance: float          # [m]
+
+
+class CableLine:
+    """A cable as straight pieces."""
+
+    def __init__(self, cable: Cable) -> None:
+        hanging = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag)
+        # the sagitta of an arc: pieces so short that none is further than MAX_ERROR from the cable
+        pieces = math.ceil(math.sqrt(max(1.0, cable.sag / MAX_ERROR)))
+        points = hanging.sample(pieces + 1)
+        self._start, chord = points[:-1], np.diff(points, axis=0)
+        self._length = np.linalg.norm(chord, axis=1)
+        self._direction = chord / self._length[:, None]
+        self.radius = cable.radius
+
+    def nearest(self, p_W: np.ndarray) -> Nearest:
+        """Nearest point of the axis to `p_W` (3,) [m]."""
+        along = np.clip(((p_W - self._start) * self._direction).sum(axis=1), 0.0, self._length)
+        points = self._start + along[:, None] * self._direction
+        distances = np.linalg.norm(points - p_W, axis=1)
+        k = int(np.argmin(distances))
+        return Nearest(points[k], self._direction[k], float(distances[k]))
+
+    def enters(self, p_WB: np.ndarray, R_WB: np.ndarray, radii: np.ndarray) -> bool:
+        """Whether the cable enters the ellipsoid of the body, inflated by the wire's radius."""
+        scale = radii + self.radius
+        a = (self._start - p_WB) @ R_WB / scale
+        d = (self._direction * self._length[:, None]) @ R_WB / scale
+        s = np.clip(-(a * d).sum(axis=1) / (d * d).sum(axis=1), 0.0, 1.0)
+        return bool((((a + s[:, None] * d) ** 2).sum(axis=1) < 1.0).any())
+
+
+def grip_refusal(distance: float, tilt: float, speed: float, grip: Grip) -> str:
+    """Why the gripper does not hold, one clause per missed limit; empty: it holds. [m], [rad], [m/s]"""
+    problems = [
+        (distance > grip.position, f"the cable passed at {distance:.3f} m, beyond {grip.position:g} m"),
+        (math.degrees(tilt) > grip.tilt_deg, f"{math.degrees(tilt):.1f} deg from square, above {grip.tilt_deg:g} deg"),
+        (speed > grip.speed, f"speed {speed:.2f} is above {grip.speed:g} m/s"),
+        (not grip.enabled, "the grip is switched off in the scenario"),
+    ]
+    return "; ".join(text for missed, text in problems if missed)
+
+
+class CableMonitor:
+    """Follows the cables near a vehicle. Owns the gripper's hold; a cable in the rotors is a crash."""
+
+    def __init__(self, cables: tuple[Cable, ...], grip: Grip, gripper_offset: float, radii: np.ndarray) -> None:
+        """
+        Args:
+            cables: of the world.
+            grip: tolerances.
+            gripper_offset: gripper below the centre of mass [m].
+            radii: semi-axes of the ellipsoid that holds the body and its rotors, (3,) [m].
+        """
+        self._lines = [CableLine(cable) for cable in cables]
+        self._grip, self._offset, self._radii = grip, gripper_offset, np.array(radii, float)
+        self._before = [math.inf] * len(cables)   # distance one update ago
+        self._decided = [False] * len(cables)     # this pass has been judged
+        self._attachment: Attachment | None = None
+        self.hold: Hold = FREE
+        self.crashed = False
+
+    def update(self, time: float, x: np.ndarray) -> list[ContactEvent]:
+        """What changed since the last call, one control period ago.
+
+        Args:
+            time: [s].
+            x: state (13,).
+        """
+        if self._attachment is not None:
+            self.hold = self._attachment.hold(time)
+        if self._attachment is not None or self.crashed:
+            return []
+        R_WB = so3.quat_to_matrix(x[3:7])
+        gripper_W = x[:3] - self._offset * R_WB[:, 2]
+        events = []
+        for k, line in enumerate(self._lines):
+            near = line.nearest(gripper_W)
+            closest = near.distance < TOUCH or self._before[k] < near.distance
+            reach = self._grip.position + LEAVING
+            self._before[k] = near.distance
+            if near.distance > reach:
+                self._decided[k] = False
+            elif closest and not (self._decided[k] or self.crashed or self._attachment):
+                self._decided[k] = True
+                events.append(self._judge(time, k, x, R_WB, gripper_W, near))
+            if not (self.crashed or self._attachment) and line.enters(x[:3], R_WB, self._radii):
+                self.crashed = True
+                events.append(self._event(time, ContactState.COLLISION, k, x, R_WB, near, "crashed: a cable in the rotors"))
+        return events
+
+    def _judge(self, time: float, k: int, x: np.ndarray, R_WB: np.ndarray, gripper_W: np.ndarray,
+               near: Nearest) -> ContactEvent:
+        event = self._event(time, ContactState.ATTACHED, k, x, R_WB, near, "")
+        speed = math.hypot(event.normal_speed, event.tangential_speed)
+        refusal = grip_refusal(near.distance, event.tilt_error, speed, self._grip)
+        if refusal:
+            return event._replace(state=ContactState.BOUNCED, reason=refusal)
+        square = R_WB[:, 2] - (R_WB[:, 2] @ near.direction) * near.direction
+        self._attachment = Attachment(time, -1, gripper_W, near.point_W, x[3:7], square / np.linalg.norm(square), np.zeros(3))
+        self.hold = self._attachment.hold(time)
+        return event
+
+    def _event(self, time: float, state: ContactState, k: int, x: np.ndarray, R_WB: np.ndarray, near: Nearest,
+               reason: str) -> ContactEvent:
+        velocity = x[7:10] + R_WB @ np.cross(x[10:13], [0.0, 0.0, -self._offset])
+        into = float(-velocity @ R_WB[:, 2])  # the gripper meets the cable along -b3
+        across = float(np.linalg.norm(velocity + into * R_WB[:, 2]))
+        tilt = abs(float(so3.angle_between(R_WB[:, 2], near.direction)) - math.pi / 2)
+        return ContactEvent(time, state, f"cable {k}", into, across, tilt, near.distance, reason)
