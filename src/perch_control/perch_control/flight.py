@@ -16,7 +16,7 @@ from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.monitors import Persistent, TrackingMonitor
 from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.recovery import Recovery
-from perch_control.reference import Setpoint
+from perch_control.reference import Following, Setpoint
 from perch_control.rotor_lag import RotorEstimate, thrusts
 from perch_control.settings import GeometricGains
 from perch_control.vector3 import axes_of, axpy, norm
@@ -34,9 +34,9 @@ class Law(Protocol):
     def prepare(self, source: Any, contact: bool) -> Any:
         """The reference to follow for a trajectory, which ends in a contact or not."""
 
-    def control(self, state: tuple[float, ...], preview, rotors: RotorEstimate, compensation: tuple[float, ...],
-                time_to_contact: float) -> ControlOutput:
-        """Rotor commands; `preview(dt)` is the setpoint `dt` seconds from now."""
+    def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
+                compensation: tuple[float, ...], time_to_contact: float) -> ControlOutput:
+        """Rotor commands for one period."""
 
 
 class FlightController:
@@ -291,7 +291,7 @@ class FlightController:
         extra = NO_COMPENSATION
         if self.compensator is not None:
             extra = self.compensator.update(m.belief, m.rotors, m.now)
-        out = self.law.control(m.belief, m.setpoint, m.rotors, extra, contact)
+        out = self.law.control(m.belief, m, m.rotors, extra, contact)
         m.rotors = m.rotors.following(out.rotor_speed)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top

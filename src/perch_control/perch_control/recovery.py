@@ -42,6 +42,7 @@ class Recovery:
     """Guidance from the present state; `update` first in each period, then `setpoint`."""
 
     duration = float("inf")
+    by_state = True  # a function of the state, with nothing to be previewed
 
     def __init__(self, settings: RecoverySettings, specific_thrust_max: float, state: tuple[float, ...],
                  normal: tuple[float, float, float] | None) -> None:

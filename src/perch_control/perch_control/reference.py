@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, sin
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -52,6 +53,16 @@ def heading(yaw: float, rate: float = 0.0, acceleration: float = 0.0) -> tuple[V
     c, s = cos(yaw), sin(yaw)
     return ((-s, c, 0.0), (-c * rate, -s * rate, 0.0),
             (s * rate * rate - c * acceleration, -c * rate * rate - s * acceleration, 0.0))
+
+
+class Following(Protocol):
+    """A running reference: its source, the time since it began, and its setpoint some time from now."""
+
+    source: Any
+    elapsed: float
+
+    def setpoint(self, ahead: float = 0.0) -> Setpoint:
+        """Setpoint `ahead` seconds from now."""
 
 
 @dataclass(frozen=True)

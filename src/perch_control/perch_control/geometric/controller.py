@@ -10,6 +10,7 @@ import numpy as np
 from perch_control.allocation import mixing_columns
 from perch_control.geometric.rehearsal import flown, rehearsed
 from perch_control.geometric.step import control_step
+from perch_control.reference import Following
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
 from perch_core.vehicle import Vehicle
@@ -70,10 +71,10 @@ class GeometricController:
         """The reference is wanted this far ahead of the state [s]."""
         return self.gains.lead
 
-    def control(self, state: tuple[float, ...], preview, rotors: RotorEstimate,
+    def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
                 compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
-        """As `step`, with `preview(dt)` giving the setpoint `dt` seconds from now."""
-        return self.step(state, preview(self.gains.lead).packed, rotors, compensation, time_to_contact)
+        """As `step`, with the running reference."""
+        return self.step(state, reference.setpoint(self.gains.lead).packed, rotors, compensation, time_to_contact)
 
     def step(self, state: tuple[float, ...], reference: tuple[float, ...], rotors: RotorEstimate,
              compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
