@@ -22,7 +22,8 @@ MAX_ITERATIONS = 12
 SAME_POSE = np.radians(0.5)        # branches closer than this are one and the same minimum [rad]
 PRIOR_SIGMA = np.radians(10.0)     # how far the attitude may have turned since it was predicted [rad]
 MAX_OUTLIER_RATIO = 5.0            # residuals beyond this many sigma (RMS) mean that a tag is not where it should be
-MAX_RESIDUAL = 0.35                # ... if they also exceed this [px]
+MAX_RESIDUAL = 0.35                # ... if they also exceed this [px] ...
+CALIBRATION_SHARE = 0.005          # ... and this share of the corners' extent: the lens is not known better
 
 
 class LocalizationRefusal(PerchError):
@@ -73,7 +74,8 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
     """
     best = _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start)
-    if not _contradicts(best, sigma):
+    extent = float(np.ptp(camera.project(rays_C)[0], axis=(0, 1)).max())
+    if not _contradicts(best, sigma, extent):
         return best
     if len(ids) >= 3:  # of two tags that disagree, either may be the wrong one
         trials = []
@@ -83,13 +85,13 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
             trial = _solve(camera, corners_S[keep], rays_C[keep], sigma[keep], rest, prior_R_CS)
             trials.append((trial.rms, out, trial))
         _, out, trial = min(trials, key=lambda entry: entry[0])
-        if not _contradicts(trial, sigma):
+        if not _contradicts(trial, sigma, extent):
             return BoardPose(**{**trial.__dict__, "dropped": (ids[out],)})
     raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
 
 
-def _contradicts(pose: BoardPose, sigma: np.ndarray) -> bool:
-    return pose.rms > max(MAX_RESIDUAL, MAX_OUTLIER_RATIO * float(np.sqrt(np.mean(sigma**2))))
+def _contradicts(pose: BoardPose, sigma: np.ndarray, extent: float) -> bool:
+    return pose.rms > max(MAX_RESIDUAL, MAX_OUTLIER_RATIO * float(np.sqrt(np.mean(sigma**2))), CALIBRATION_SHARE * extent)
 
 
 def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start=None) -> BoardPose:
