@@ -17,7 +17,7 @@ from perch_core.ros.conversions import nanoseconds, to_stamp
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.scenario import load_scenario
 from perch_sim.camera_stream import Delivery
-from perch_sim.lockstep_watch import LockstepWatch
+from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.motors import MotorCommandError
 from perch_sim.pacing import Pacing
 from perch_sim.parameters import CAMERAS, VehicleParameters
@@ -25,7 +25,7 @@ from perch_sim.participants import CONTROLLER, triggers
 from perch_sim.phase_times import PhaseTimes
 from perch_sim.plant import PERIOD
 from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
-from perch_sim.vehicle_topics import VehicleTopics
+from perch_sim.ros.vehicle_topics import VehicleTopics
 
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
 SWITCH_INTERVAL = 2e-4  # the drawing threads give way to a step sooner than Python's 5 ms [s]
