@@ -1,0 +1,1 @@
+"""Campaigns: thousands of flights over drawn conditions, their failures classified and ranked."""

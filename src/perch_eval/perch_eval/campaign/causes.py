@@ -1,0 +1,62 @@
+"""Why a flight failed: one class each, from the mission's result and from what the vehicle truly touched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from perch_core.scenario import Adhesion
+from perch_sim.contact_event import ContactEvent, ContactState
+
+SUCCESS = "perched"
+CAUSES = ("not_found", "refused", "lost_track", "missed_pad", "too_fast", "too_slow", "tilt", "came_off", "crash", "timeout",
+          "error")
+MEANING = {
+    "not_found": "the target was not seen well enough in time", "refused": "the planner refused to plan",
+    "lost_track": "the controller or the estimator gave up before the contact", "missed_pad": "touched beside the pad, or nothing",
+    "too_fast": "arrived on the pad too fast, along or across it", "too_slow": "arrived on the pad too slowly to stick",
+    "tilt": "arrived on the pad too much tilted", "came_off": "the mission was satisfied, but the velcro did not hold",
+    "crash": "hit something hard, or with another part than the plate", "timeout": "did not come to an end in time",
+    "error": "the flight could not be carried out",
+}
+_BY_OUTCOME = {"not_found": "not_found", "refused": "refused", "timeout": "timeout", "cancelled": "timeout",
+               "bad_goal": "refused"}
+
+
+def cause_of(outcome: str, contacts: Sequence[ContactEvent], adhesion: Adhesion) -> str:
+    """`perched`, or one of `CAUSES`. A perch counts only where the truth shows the vehicle attached at the end.
+
+    Args:
+        outcome: of the mission, in lower case.
+        contacts: what the vehicle truly touched, in order.
+        adhesion: the limits of the velcro.
+    """
+    if outcome == "perched":
+        return SUCCESS if _holds(contacts) else "came_off"
+    touches = [c for c in contacts if c.state in (ContactState.BOUNCED, ContactState.COLLISION)]
+    if outcome in _BY_OUTCOME and not touches:
+        return _BY_OUTCOME[outcome]
+    if not touches:
+        return "missed_pad" if outcome == "missed" else "lost_track"
+    if any(c.state is ContactState.COLLISION for c in touches[:1]) or any("crashed" in c.reason for c in touches):
+        return "crash" if touches[0].body != "pad" or touches[0].state is ContactState.COLLISION else _bounce(touches[0], adhesion)
+    return _bounce(touches[0], adhesion)
+
+
+def _bounce(touch: ContactEvent, adhesion: Adhesion) -> str:
+    """Which limit of the velcro a touch missed by most."""
+    if "outside the pad" in touch.reason:
+        return "missed_pad"
+    low, high = adhesion.normal_speed
+    ratios = {"tilt": math.degrees(touch.tilt_error) / adhesion.tilt_error_max_deg,
+              "too_fast": max(touch.normal_speed / high, touch.tangential_speed / adhesion.tangential_speed_max),
+              "too_slow": low / max(touch.normal_speed, 1e-3)}
+    return max(ratios, key=lambda name: ratios[name])
+
+
+def _holds(contacts: Sequence[ContactEvent]) -> bool:
+    state = False
+    for c in contacts:
+        if c.body == "pad":
+            state = c.state is ContactState.ATTACHED
+    return state

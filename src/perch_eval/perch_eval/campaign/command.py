@@ -1,0 +1,129 @@
+"""Flies a campaign: many flights over drawn conditions, classified failures, one results file, one HTML report."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections import Counter
+from pathlib import Path
+
+from perch_core.errors import PerchError
+from perch_eval.campaign.causes import MEANING, SUCCESS
+from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
+from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.ranking import worst
+from perch_eval.campaign.report import write_report
+from perch_eval.campaign.results import Results, RunResult
+from perch_eval.campaign.specification import Campaign, load_campaign
+from perch_eval.campaign.workers import in_pool, on_cluster
+from perch_eval.statistics import Rate
+
+EXAMPLES = """examples:
+  python3 scripts/campaign.py wind                              config/campaigns/wind.yaml, in process, on all cores
+  python3 scripts/campaign.py my.yaml --engine stack --jobs 1   the real nodes, each flight in a ROS domain of its own
+  python3 scripts/campaign.py wind --resume                     go on after an interruption
+  python3 scripts/campaign.py wind --cluster tcp://host:8786    on a Dask cluster (`local`: one on this machine)
+
+exit code: 0 every run was flown (whatever came of it), 1 some could not be carried out, 2 the caller's mistake,
+130 interrupted (results so far are kept; --resume goes on)"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="campaign.py", description=__doc__, epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out.add_argument("campaign", metavar="CAMPAIGN", help="name in config/campaigns, or a YAML file")
+    out.add_argument("--engine", metavar="NAME", help=f"{' or '.join(ENGINES)}, or your own as module:function (default: the file's)")
+    out.add_argument("--runs", type=_positive, metavar="N", help="flights, with grids per grid point (default: the file's)")
+    out.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="processes (default: %(default)s)")
+    out.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler, or 'local'")
+    out.add_argument("--resume", action="store_true", help="go on with the results in --out")
+    out.add_argument("--out", type=Path, metavar="DIR", help="folder of results and report (default: out/campaigns/<name>)")
+    return out
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not >= 1")
+    return value
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    try:
+        campaign = load_campaign(args.campaign, args.engine, args.runs)
+        resolve(campaign.engine)
+        out = args.out or Path("out") / "campaigns" / campaign.name
+        out.mkdir(parents=True, exist_ok=True)
+        results = Results(out / "results.sqlite", campaign.name, campaign.digest, args.resume)
+    except (PerchError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        fly_all(campaign, results, args.jobs, args.cluster)
+        found = results.all()
+        keep_worst(campaign, found, out)
+        report = write_report(campaign, found, out)
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\ninterrupted: {len(results.finished())} of {len(campaign.runs)} results are in {out / 'results.sqlite'}; "
+              "go on with --resume", file=sys.stderr)
+        return 130
+    finally:
+        results.close()
+    print(summary(found))
+    print(f"results: {out / 'results.sqlite'}\nreport: {report}")
+    return 1 if any(r.cause == "error" for r in found) else 0
+
+
+def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None) -> None:
+    """Fly every run that has no result yet.
+
+    Raises:
+        PerchError: the cluster does not answer.
+        KeyboardInterrupt: what is finished is in the results.
+    """
+    known = results.all()
+    finished = {r.number for r in known}
+    tasks = [Task(run, campaign.mapping(run), campaign.engine, campaign.sensing)
+             for run in campaign.runs if run.number not in finished]
+    print(f"{campaign.name}: {len(tasks)} of {len(campaign.runs)} runs to fly on {campaign.engine}, "
+          + (f"Dask {cluster}" if cluster else f"{jobs} process{'es' if jobs > 1 else ''}"), flush=True)
+    progress = Progress(len(campaign.runs), len(finished), sum(r.cause == SUCCESS for r in known))
+    try:
+        for result in (on_cluster(tasks, cluster, jobs) if cluster else in_pool(tasks, jobs)):
+            results.add(result)
+            progress.add(result.cause == SUCCESS)
+    finally:
+        progress.close()
+
+
+def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
+    """Fly the worst flights once more, with a recording and a report each: the same seed gives the same flight."""
+    by_number = {run.number: run for run in campaign.runs}
+    for result in worst(found, campaign.keep_worst):
+        folder = flight_folder(out, result.number)
+        if not (folder / "report.html").exists() and campaign.engine in ENGINES:
+            run = by_number[result.number]
+            carry_out(Task(run, campaign.mapping(run), campaign.engine, campaign.sensing, str(folder)))
+
+
+def flight_folder(out: Path, number: int) -> Path:
+    """Folder of a kept flight."""
+    return out / "flights" / f"run_{number:05d}"
+
+
+def summary(found: list[RunResult]) -> str:
+    """Success and causes for the terminal, most frequent first."""
+    rate = Rate(sum(r.cause == SUCCESS for r in found), len(found))
+    lines = [f"success: {rate}  (95 % Wilson)"]
+    for cause, count in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():
+        lines.append(f"  {count:5d}  {cause:<11} {MEANING.get(cause, '')}")
+    return "\n".join(lines)
+
+

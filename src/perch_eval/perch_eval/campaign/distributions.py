@@ -1,0 +1,72 @@
+"""How a varied quantity is drawn: choice, uniform, normal, or a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from perch_core.errors import ConfigError
+
+KINDS = ("choice", "uniform", "normal", "grid")
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """One varied quantity.
+
+    Attributes:
+        kind: one of `KINDS`.
+        values: choices, or grid values, or (low, high), or (mean, sigma).
+        low, high: limits of a normal, which is drawn again outside them.
+    """
+
+    kind: str
+    values: tuple[Any, ...]
+    low: float = -np.inf
+    high: float = np.inf
+
+    def draw(self, rng: np.random.Generator) -> Any:
+        """One value; a grid is not drawn but gone through."""
+        if self.kind == "choice":
+            return self.values[int(rng.integers(len(self.values)))]
+        if self.kind == "uniform":
+            return float(rng.uniform(*self.values))
+        for _ in range(1000):
+            value = float(rng.normal(*self.values))
+            if self.low <= value <= self.high:
+                return value
+        raise ConfigError("campaign", "normal", f"[{self.low:g}, {self.high:g}] is hardly ever met by normal{self.values}")
+
+
+def parse(source: str, key: str, entry: Any) -> Distribution:
+    """The distribution that a campaign's file describes, as in `{uniform: [0.8, 3.0]}`.
+
+    Raises:
+        ConfigError: anything else.
+    """
+    if not isinstance(entry, Mapping):
+        raise ConfigError(source, key, f"{entry!r} is not a mapping such as {{uniform: [0.8, 3.0]}}")
+    kinds = [kind for kind in KINDS if kind in entry]
+    extra = set(entry) - set(KINDS) - ({"low", "high"} if kinds == ["normal"] else set())
+    if len(kinds) != 1 or extra:
+        raise ConfigError(source, key, f"{dict(entry)!r} needs exactly one of {', '.join(KINDS)}"
+                          " (normal may have low and high)")
+    kind, values = kinds[0], entry[kinds[0]]
+    if not isinstance(values, (list, tuple)) or not values:
+        raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not a list")
+    if kind in ("uniform", "normal"):
+        if len(values) != 2 or not all(_is_number(v) for v in values):
+            raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not two numbers")
+        if kind == "uniform" and not values[0] < values[1]:
+            raise ConfigError(source, f"{key}.uniform", f"{values[0]} is not below {values[1]}")
+        if kind == "normal" and not values[1] > 0:
+            raise ConfigError(source, f"{key}.normal", f"sigma {values[1]} is not > 0")
+    limits = {name: float(entry[name]) for name in ("low", "high") if name in entry}
+    return Distribution(kind, tuple(tuple(v) if isinstance(v, list) else v for v in values), **limits)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

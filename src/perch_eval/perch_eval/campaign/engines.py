@@ -1,0 +1,137 @@
+"""What carries out one run: the in-process engine, the real nodes, or a function of your own (`module:function`)."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from perch_core.errors import PerchError
+from perch_core.vehicle import load_vehicle
+from perch_eval.campaign.causes import cause_of
+from perch_eval.campaign.results import RunResult
+from perch_eval.campaign.specification import Run, scenario_of
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run, ready to be sent to a worker.
+
+    Attributes:
+        run: number, seed, varied values.
+        scenario: the scenario's mapping.
+        engine: name.
+        sensing: which cameras the in-process engine renders.
+        keep: folder for the flight's full report; empty: none is kept.
+    """
+
+    run: Run
+    scenario: dict[str, Any]
+    engine: str
+    sensing: dict[str, str]
+    keep: str = ""
+
+
+def resolve(name: str) -> Callable[[Task], RunResult]:
+    """The engine of a name.
+
+    Raises:
+        PerchError: there is none.
+    """
+    if name in ENGINES:
+        return ENGINES[name]
+    module, colon, function = name.partition(":")
+    try:
+        if colon:
+            return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise PerchError(f"engine {name!r}: {error}") from None
+    raise PerchError(f"engine {name!r} is not one of {', '.join(ENGINES)}, nor of the form module:function")
+
+
+def carry_out(task: Task) -> RunResult:
+    """Fly one run; whatever goes wrong is a result as well."""
+    began = time.perf_counter()
+    try:
+        result = resolve(task.engine)(task)
+    except Exception as error:  # one run that breaks must not end the campaign; its words are in the results
+        result = RunResult(task.run.number, task.run.seed, "error", "failed", f"{type(error).__name__}: {error}")
+    return dataclasses.replace(result, values=task.run.values, wall_time=time.perf_counter() - began)
+
+
+def fly_in_process(task: Task) -> RunResult:
+    """One run on the in-process engine."""
+    from perch_eval.in_process import Sensing, fly
+    from perch_eval.in_process.recording import TracedFlight, write
+    from perch_eval.metrics import flight_metrics
+    from perch_eval.report import build_report
+
+    scenario = scenario_of(task.scenario, f"run {task.run.number}")
+    trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5 if task.keep else 0.0)
+    metrics = flight_metrics(TracedFlight(trace), load_vehicle(scenario.vehicle), trace.end_time)
+    if task.keep:
+        folder = Path(task.keep)
+        folder.mkdir(parents=True, exist_ok=True)
+        write(trace, folder / "flight.mcap")
+        (folder / "scenario.yaml").write_text(yaml.safe_dump(task.scenario))
+        build_report(folder, scenario, task.run.seed, trace.outcome, trace.message, trace.wall_time, trace.end_time)
+    return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion),
+                     trace.outcome, trace.message, metrics=flatten(metrics, trace.end_time))
+
+
+def fly_on_the_stack(task: Task) -> RunResult:
+    """One run on the real nodes: composed, in lockstep, in a ROS domain of its own."""
+    from perch_eval.demo import fly
+    from perch_eval.flight import Flight
+
+    with contextlib.ExitStack() as stack:
+        folder = Path(task.keep or stack.enter_context(tempfile.TemporaryDirectory(prefix="perch-run-")))
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / "scenario.yaml"
+        file.write_text(yaml.safe_dump(task.scenario))
+        log = stack.enter_context(open(folder / "flight.log", "w"))
+        with contextlib.redirect_stdout(log):
+            report = fly(str(file), task.run.seed, folder, composed=True)
+        contacts = contact_events(Flight(folder / "flight.mcap"))
+        adhesion = scenario_of(task.scenario, str(file)).adhesion
+    return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, adhesion), report["outcome"],
+                     report["message"], metrics=flatten(report, report["simulated_time_s"]))
+
+
+def contact_events(flight: Any) -> list:
+    """The contacts of a recorded flight."""
+    from perch_sim.contact_event import ContactEvent, ContactState
+
+    return [ContactEvent(t, ContactState(m.state), m.body, m.normal_speed, m.tangential_speed, m.tilt_error, m.offset, m.reason)
+            for t, m in flight.messages("contact")]
+
+
+def flatten(metrics: dict[str, Any], end_time: float) -> dict[str, float | None]:
+    """The figures of a flight's report that campaigns compare, by name; None where one could not be had."""
+    out: dict[str, float | None] = {"simulated_time_s": end_time}
+    for name in ("max_body_rate_deg_s", "max_acceleration_m_s2", "attitude_error_at_end_deg"):
+        out[name] = metrics.get(name)
+    for name in ("tracking_rmse_m", "estimation_rmse_m"):
+        for axis, value in zip("xyz", metrics.get(name) or ()):
+            out[f"{name}_{axis}"] = value
+    if metrics.get("tracking_error_at_end_m"):
+        out["tracking_error_at_end_m"] = math.hypot(*metrics["tracking_error_at_end_m"])
+    for part, names in (("contact", ("normal_speed_m_s", "tangential_speed_m_s", "tilt_error_deg", "offset_m", "time")),
+                        ("target_error", ("position_m", "attitude_deg"))):
+        for name in names:
+            out[f"{part}_{name}"] = (metrics.get(part) or {}).get(name)
+    if metrics.get("window_s") and metrics.get("perch_planned"):
+        out["perch_time_s"] = metrics["window_s"][1] - metrics["window_s"][0]
+    return {name: float(v) if v is not None and math.isfinite(v) else None for name, v in out.items()}
+
+
+ENGINES: dict[str, Callable[[Task], RunResult]] = {"in_process": fly_in_process, "stack": fly_on_the_stack}

@@ -1,0 +1,55 @@
+"""How far a campaign is, and how long it will take."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+
+class Progress:
+    """One line that is rewritten on a terminal; elsewhere a line every few seconds."""
+
+    def __init__(self, total: int, already: int = 0, good_already: int = 0, what: str = "runs", out: TextIO | None = None,
+                 period: float = 10.0) -> None:
+        self._total, self._done, self._good, self._already = total, already, good_already, already
+        self._what, self._out, self._period = what, out or sys.stderr, period
+        self._began = self._shown = time.monotonic()
+        self._terminal = self._out.isatty()
+
+    def add(self, good: bool) -> None:
+        """One more is finished."""
+        self._done += 1
+        self._good += good
+        now = time.monotonic()
+        if self._terminal:
+            self._out.write(f"\r\x1b[2K{self.line(now)}")
+            self._out.flush()
+        elif now - self._shown >= self._period or self._done == self._total:
+            print(self.line(now), file=self._out, flush=True)
+        self._shown = now if not self._terminal and now - self._shown >= self._period else self._shown
+
+    def line(self, now: float) -> str:
+        """The line at a time of the monotonic clock."""
+        fresh, elapsed = self._done - self._already, max(now - self._began, 1e-9)
+        rate = fresh / elapsed
+        text = f"  {self._done}/{self._total} {self._what}"
+        if self._done:
+            text += f", {self._good} good ({100 * self._good / self._done:.0f} %)"
+        if fresh:
+            text += f", {60 * rate:.1f} per minute"
+            if self._done < self._total:
+                text += f", {span((self._total - self._done) / rate)} left"
+        return text
+
+    def close(self) -> None:
+        """End the line."""
+        if self._terminal and self._done > self._already:
+            self._out.write("\n")
+
+
+def span(seconds: float) -> str:
+    """A duration in words."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,111 @@
+"""Results of a campaign in one SQLite file: a row is there or it is not, whatever happens to the process."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from perch_core.errors import PerchError
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS campaign (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS runs (
+    run INTEGER PRIMARY KEY,      -- number in the campaign
+    seed INTEGER NOT NULL,
+    cause TEXT NOT NULL,          -- 'perched', or why not
+    outcome TEXT NOT NULL,        -- the mission's result
+    message TEXT NOT NULL,
+    vary TEXT NOT NULL,           -- JSON: varied name -> value
+    metrics TEXT NOT NULL,        -- JSON: name -> number or null
+    wall_time REAL NOT NULL,      -- [s]
+    finished TEXT NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now'))
+);
+"""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What one flight gave."""
+
+    number: int
+    seed: int
+    cause: str
+    outcome: str
+    message: str
+    values: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, float | None] = field(default_factory=dict)
+    wall_time: float = 0.0
+
+
+class ResultsError(PerchError):
+    """The results file does not belong to this campaign, or may not be overwritten."""
+
+
+class Results:
+    """The file. One process writes; others may read at any time."""
+
+    def __init__(self, path: Path, name: str, digest: str, resume: bool) -> None:
+        """
+        Args:
+            path: of the file.
+            name, digest: of the campaign.
+            resume: go on where an earlier campaign ended.
+
+        Raises:
+            ResultsError: it holds another campaign's results, or results and `resume` is not asked for.
+        """
+        self._db = sqlite3.connect(path)
+        self._db.execute("PRAGMA journal_mode=WAL")
+        self._db.execute("PRAGMA synchronous=NORMAL")
+        self._db.executescript(_SCHEMA)
+        known = dict(self._db.execute("SELECT key, value FROM campaign"))
+        if known and known.get("digest") != digest:
+            self._db.close()
+            raise ResultsError(f"{path} holds results of campaign {known.get('name')!r} with other settings: "
+                               "choose another --out, or the settings of then")
+        if self.finished() and not resume:
+            count = len(self.finished())
+            self._db.close()
+            raise ResultsError(f"{path} already holds {count} results: --resume goes on with them, another --out starts anew")
+        with self._db:
+            self._db.executemany("INSERT OR REPLACE INTO campaign VALUES (?, ?)", [("name", name), ("digest", digest)])
+
+    def add(self, result: RunResult) -> None:
+        """Write one row; a run that is there already is left as it is."""
+        with self._db:
+            self._db.execute(
+                "INSERT OR IGNORE INTO runs (run, seed, cause, outcome, message, vary, metrics, wall_time) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                (result.number, result.seed, result.cause, result.outcome, result.message, json.dumps(result.values),
+                 json.dumps(result.metrics), result.wall_time))
+
+    def finished(self) -> set[int]:
+        """Numbers of the runs that have a result."""
+        return {row[0] for row in self._db.execute("SELECT run FROM runs")}
+
+    def all(self) -> list[RunResult]:
+        """Every result, by number."""
+        return _read(self._db)
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the file and close it."""
+        self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        self._db.close()
+
+
+def read_results(path: Path) -> list[RunResult]:
+    """Every result in a file, by number, also while a campaign is writing it."""
+    db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    try:
+        return _read(db)
+    finally:
+        db.close()
+
+
+def _read(db: sqlite3.Connection) -> list[RunResult]:
+    rows = db.execute("SELECT run, seed, cause, outcome, message, vary, metrics, wall_time FROM runs ORDER BY run")
+    return [RunResult(n, seed, cause, outcome, message, json.loads(vary), json.loads(metrics), wall)
+            for n, seed, cause, outcome, message, vary, metrics, wall in rows]

@@ -1,0 +1,173 @@
+"""What a campaign is: a scenario, what varies in it, how often. One YAML file in `config/campaigns/` each.
+
+A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`), an entry of one of its vectors
+(`wind.steady.0`), or a node's parameter (`parameters.controller.snapdragon.lead`). `seed` can be varied by a grid, too.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import itertools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perch_core import config
+from perch_core.config import choice, part, quantity, text
+from perch_core.errors import ConfigError
+from perch_core.scenario import Scenario
+from perch_eval.campaign.distributions import Distribution, parse
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensingChoice:
+    """Which cameras the in-process engine renders."""
+
+    vio: str = choice("model", options=("model", "rendered"))
+    target: str = choice("model", options=("model", "rendered"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    """A campaign's file."""
+
+    name: str = text()
+    description: str = text("")
+    scenario: str = text("surface_90", doc="name in config/scenarios, or a file")
+    engine: str = choice("in_process", options=("in_process", "stack"))
+    sensing: SensingChoice = part(SensingChoice)
+    runs: int = quantity(100, low=1, high=1_000_000, doc="flights; with grids: flights per grid point")
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of the campaign: draws and the flights' seeds come from it")
+    vary: dict[str, Any] = text(None, doc="name -> distribution")
+    map: tuple[str, ...] = quantity((), doc="two varied names: axes of the success map")
+    keep_worst: int = quantity(5, low=0, high=100, doc="flights whose full reports are kept")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One flight of a campaign."""
+
+    number: int
+    seed: int
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign that has been checked: every run's scenario is valid.
+
+    Attributes:
+        name, description, engine, sensing, axes, keep_worst: as in the file.
+        base: the scenario's mapping, before the variation.
+        vary: varied name -> distribution.
+        runs: what is flown.
+        digest: SHA-256 of everything that decides the results.
+    """
+
+    name: str
+    description: str
+    engine: str
+    sensing: dict[str, str]
+    axes: tuple[str, ...]
+    keep_worst: int
+    base: dict[str, Any]
+    vary: dict[str, Distribution]
+    runs: tuple[Run, ...]
+    digest: str
+
+    def mapping(self, run: Run) -> dict[str, Any]:
+        """The scenario's mapping of a run, as a scenario file holds it."""
+        out = copy.deepcopy(self.base)
+        for name, value in run.values.items():
+            place(out, name, value)
+        return out
+
+
+def scenario_of(mapping: Mapping[str, Any], source: str) -> Scenario:
+    """The scenario of a run.
+
+    Raises:
+        ConfigError: a value is out of range, or a name is unknown.
+    """
+    return config.from_mapping(Scenario, dict(mapping), source)
+
+
+def load_campaign(path: Path | str, engine: str | None = None, runs: int | None = None) -> Campaign:
+    """Read a campaign's file and draw its runs.
+
+    Args:
+        path: name in `config/campaigns`, or a file.
+        engine: replaces the file's.
+        runs: replaces the file's.
+
+    Raises:
+        ConfigError: the file, a distribution, or a drawn scenario is refused.
+    """
+    file = config.find("campaigns", path)
+    content = config.load(_File, file)
+    base = config.read_yaml(config.find("scenarios", content.scenario))
+    vary = {name: parse(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
+    for axis in content.map:
+        if axis not in vary:
+            raise ConfigError(str(file), "map", f"{axis!r} is not varied; varied: {', '.join(vary) or 'nothing'}")
+    if len(content.map) not in (0, 2):
+        raise ConfigError(str(file), "map", f"needs two names, has {len(content.map)}")
+    engine = engine or content.engine
+    sensing = {"vio": content.sensing.vio, "target": content.sensing.target}
+    drawn = _draw(vary, runs or content.runs, content.seed)
+    axes = content.map or tuple(vary)[:2]
+    decisive = json.dumps([engine, sensing, base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
+    campaign = Campaign(content.name, content.description, engine, sensing, axes if len(axes) == 2 else (),
+                        content.keep_worst, base, vary, drawn, hashlib.sha256(decisive.encode()).hexdigest())
+    for run in drawn:
+        scenario_of(campaign.mapping(run), f"{file}: run {run.number} ({_words(run.values)})")
+    return campaign
+
+
+def place(mapping: dict[str, Any], name: str, value: Any) -> None:
+    """Set a dotted name in a scenario's mapping; a number names an entry of a vector that is zero otherwise."""
+    *groups, leaf = name.split(".")
+    if groups and groups[0] == "parameters" and len(groups) >= 2:
+        mapping.setdefault("parameters", {}).setdefault(groups[1], {})[".".join((*groups[2:], leaf))] = value
+        return
+    if leaf.isdigit() and groups:
+        *outer, vector = groups
+        target = _group(mapping, outer)
+        entries = list(target.get(vector, (0.0, 0.0, 0.0)))
+        if int(leaf) >= len(entries):
+            raise ConfigError("campaign", f"vary.{name}", f"{vector} has {len(entries)} entries")
+        entries[int(leaf)] = value
+        target[vector] = entries
+        return
+    _group(mapping, groups)[leaf] = list(value) if isinstance(value, tuple) else value
+
+
+def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
+    for group in groups:
+        mapping = mapping.setdefault(group, {})
+        if not isinstance(mapping, dict):
+            raise ConfigError("campaign", f"vary.{'.'.join(groups)}", f"{group} is a value, not a group")
+    return mapping
+
+
+def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, ...]:
+    """Grid points, each with `runs` draws of the rest. The k-th run is the same however many there are."""
+    grids = {name: d.values for name, d in vary.items() if d.kind == "grid"}
+    points = [dict(zip(grids, point)) for point in itertools.product(*grids.values())]
+    out = []
+    for number in range(runs * len(points)):
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
+        values = {name: d.draw(rng) for name, d in vary.items() if d.kind != "grid"}
+        values |= points[number % len(points)]
+        flight_seed = int(values.pop("seed", int(rng.integers(1, 2**31 - 1))))
+        out.append(Run(number, flight_seed, values))
+    return tuple(out)
+
+
+def _words(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())

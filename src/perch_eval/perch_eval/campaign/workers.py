@@ -1,0 +1,108 @@
+"""Where runs are carried out: a pool of processes on this machine, or a Dask cluster. Neither loses a result."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+from perch_core.errors import PerchError
+from perch_eval.campaign.engines import Task, carry_out
+from perch_eval.campaign.results import RunResult
+
+ATTEMPTS = 3  # a run whose worker died so often is given up
+_PR_SET_PDEATHSIG = 1
+
+
+def prepare_worker() -> None:
+    """One thread per library, Ctrl-C is the campaign's own matter, and no worker outlives its campaign."""
+    for name in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
+        os.environ[f"{name}_NUM_THREADS"] = "1"
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # an exception, so that nodes are stopped on the way out
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def dead(task: Task, why: str) -> RunResult:
+    """The result of a run whose workers died."""
+    return RunResult(task.run.number, task.run.seed, "error", "failed", why, task.run.values)
+
+
+def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
+    """Carry out tasks in `jobs` processes; results come as they are finished.
+
+    A worker that dies takes the pool with it: it is made anew, and what was under way is carried out again.
+    """
+    waiting, attempts = list(reversed(tasks)), {}
+    while waiting:
+        pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
+        under_way: dict[Future, Task] = {}
+        try:
+            while waiting or under_way:
+                while waiting and len(under_way) < 2 * jobs:
+                    task = waiting.pop()
+                    under_way[pool.submit(carry_out, task)] = task
+                done, _ = wait(under_way, return_when=FIRST_COMPLETED)
+                for future in done:
+                    result = future.result()
+                    del under_way[future]
+                    yield result
+        except BrokenProcessPool:
+            for future, task in under_way.items():
+                if future.done() and future.exception() is None:
+                    yield future.result()
+                    continue
+                attempts[task.run.number] = attempts.get(task.run.number, 0) + 1
+                if attempts[task.run.number] >= ATTEMPTS:
+                    yield dead(task, f"its worker died {ATTEMPTS} times")
+                else:
+                    waiting.append(task)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def on_cluster(tasks: Sequence[Task], address: str, jobs: int) -> Iterator[RunResult]:
+    """Carry out tasks on a Dask cluster; Dask repeats what a lost worker had under way.
+
+    Args:
+        tasks: what to carry out.
+        address: of the scheduler (`tcp://host:8786`), or `local` for a cluster of `jobs` processes here.
+        jobs: workers of a local cluster.
+
+    Raises:
+        PerchError: the scheduler does not answer.
+    """
+    from distributed import Client, LocalCluster, as_completed
+
+    cluster: Any = None
+    if address == "local":
+        cluster = LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+    try:
+        try:
+            client = Client(cluster or address, timeout="20s")
+        except (OSError, TimeoutError, ValueError) as error:
+            raise PerchError(f"--cluster {address}: {error or 'no answer from the scheduler'}") from None
+        with client:
+            futures = {client.submit(carry_out, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
+                       task for task in tasks}
+            for future in as_completed(list(futures)):
+                task = futures.pop(future)
+                if future.status == "finished":
+                    yield future.result()
+                else:
+                    yield dead(task, f"{type(future.exception()).__name__}: {future.exception()}")
+                future.release()
+    finally:
+        if cluster is not None:
+            cluster.close()

@@ -1,0 +1,64 @@
+"""Figures with their uncertainty: Wilson intervals for rates, medians with ranges for errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Successes out of trials with the Wilson score interval."""
+
+    successes: int
+    trials: int
+    confidence: float = 0.95
+
+    @property
+    def value(self) -> float:
+        """Share of successes; nan without trials."""
+        return self.successes / self.trials if self.trials else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson score interval: sensible at 0 and at 1, too; (0, 1) without trials."""
+        n = self.trials
+        if n == 0:
+            return 0.0, 1.0
+        z, p = float(norm.ppf(0.5 + self.confidence / 2)), self.successes / n
+        centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        return max(0.0, centre - half), min(1.0, centre + half)
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.successes}/{self.trials} = {100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median with range of the finite values."""
+
+    median: float
+    low: float
+    high: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Iterable[float | None]) -> Spread:
+        """Of any values; those that are None or not finite are left out."""
+        finite = [float(v) for v in values if v is not None and math.isfinite(v)]
+        if not finite:
+            return cls(math.nan, math.nan, math.nan, 0)
+        return cls(float(np.median(finite)), min(finite), max(finite), len(finite))
+
+    def words(self, scale: float = 1.0, digits: int = 1, unit: str = "") -> str:
+        """`1.2 [0.8, 2.0] cm`, or a dash without values."""
+        if not self.count:
+            return "-"
+        tail = f" {unit}" if unit else ""
+        return f"{scale * self.median:.{digits}f} [{scale * self.low:.{digits}f}, {scale * self.high:.{digits}f}]{tail}"
