@@ -21,6 +21,8 @@ class TrackerConfig:
     noise_factor: float = quantity(2.0, low=0.0, high=100.0, doc="least corner strength, in those that noise alone makes")
     window: int = quantity(21, unit="px", low=5, high=61, doc="side of the tracked patch")
     levels: int = quantity(3, low=0, high=6, doc="pyramid levels above the image")
+    reference_reach: float = quantity(1.5, unit="px", above=0.0, doc="largest correction by the reference frame's patch")
+    reference_change: float = quantity(8.0, unit="px", low=0.0, doc="motion apart that asks for a new reference; 0: each frame")
     back_check: float = quantity(0.7, unit="px", above=0.0, doc="tracking there and back must return this close")
     epipolar: float = quantity(2.0, unit="px", above=0.0, doc="largest distance from the epipolar plane")
     view_angle: float = quantity(1.40, unit="rad", above=0.1, high=1.6, doc="features beyond this from the axis are not used")

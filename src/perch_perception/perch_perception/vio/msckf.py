@@ -16,6 +16,7 @@ from perch_perception.vio import ekf
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import Bearings, corrected, residuals
 from perch_perception.vio.config import VioConfig
+from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.state import Landmark, State
 from perch_perception.vio.tracks import Track, Tracks
@@ -103,11 +104,12 @@ class Msckf:
         ended = self.tracks.take_ended(ids)
         self.tracks.observe(frame, ids, bearings)
         self._update_landmarks(report)
-        full = len(s.clones) >= self.config.filter.clones
+        if len(s.clones) >= self.config.filter.clones:
+            spanning = self._spanning()
+            self._take_in_landmarks(spanning, report)
+            ended |= self._spend(spanning)
         self._update_tracks(ended, report)
-        if full:
-            self._take_in_landmarks(report)
-            s.drop_clones(list(range(len(s.clones) - self.config.filter.clones + 1)))
+        s.drop_clones(list(range(len(s.clones) - self.config.filter.clones + 1)))
         if s.clones:
             self.tracks.forget_before(s.clones[0].frame)
         self._used &= self.tracks.by_id.keys()
@@ -159,18 +161,34 @@ class Msckf:
         self._used |= bad
         s.drop_landmarks(bad)
 
-    def _take_in_landmarks(self, report: FrameReport) -> None:
-        """Make landmarks of tracks that span the whole window, longest first, as far as there is room."""
+    def _spanning(self) -> dict[int, Track]:
+        """Tracks that span the whole window and are not in the state, those with parallax, most parallax first."""
         s, limits = self.state, self.config.filter
-        room = min(limits.landmarks - len(s.landmarks), limits.landmarks_per_frame)
-        if room <= 0:
-            return
         oldest = s.clones[0].frame
-        spanning = {i: t for i, t in self.tracks.by_id.items() if i not in s.landmarks and i not in self._used
-                    and t.frames[0] <= oldest and len(t.frames) >= limits.clones - 1}
-        for i in self._with_parallax(spanning):
-            if room <= 0:
+        return self._with_parallax({
+            i: t for i, t in self.tracks.by_id.items() if i not in s.landmarks and i not in self._used
+            and t.frames[0] <= oldest and len(t.frames) >= limits.clones - 1})
+
+    def _spend(self, spanning: dict[int, Track]) -> dict[int, Track]:
+        """Use spanning tracks that found no place as landmarks as if they had ended here; they begin anew."""
+        spent = {}
+        for i, track in spanning.items():
+            if i not in self.state.landmarks and len(spent) < self.config.filter.tracks_per_frame:
+                spent[i] = self.tracks.by_id[i]
+                self.tracks.by_id[i] = Track()
+        return spent
+
+    def _take_in_landmarks(self, spanning: dict[int, Track], report: FrameReport) -> None:
+        """Make landmarks of spanning tracks where the view has room for them."""
+        s, limits = self.state, self.config.filter
+        if limits.landmarks == 0:
+            return
+        spread = Spread({i: self.tracks.by_id[i].b_C[-1] for i in s.landmarks}, limits.landmarks)
+        for i in spanning:
+            if report.landmarks_new >= limits.landmarks_per_frame:
                 return
+            if not spread.admits(spanning[i].b_C[-1]):
+                continue
             prepared = self._prepare([spanning[i]])
             if not prepared:
                 continue
@@ -182,6 +200,10 @@ class Msckf:
             if ekf.squared_distance(H_0, P, r_0, self.sigma**2) > self._gate.limit(len(r_0)):
                 report.refused += 1
                 continue
+            victim = spread.add(i, spanning[i].b_C[-1])
+            if victim is not None:
+                s.drop_landmarks({victim})
+                self._used.add(victim)
             inverse = np.linalg.inv(R_f)
             cross = -inverse @ H_1 @ s.P[columns]
             own = inverse @ (H_1 @ P @ H_1.T + self.sigma**2 * np.eye(3)) @ inverse.T
@@ -189,7 +211,6 @@ class Msckf:
             s.landmarks[i] = Landmark(X + inverse @ r_1, X)
             self.apply(columns, H_0, r_0, self.sigma**2)
             report.landmarks_new += 1
-            room -= 1
 
     # -- tracks that have ended --------------------------------------------------------------------------------------
 
@@ -255,10 +276,10 @@ class Msckf:
             begin += m
         return out
 
-    def _with_parallax(self, tracks: dict[int, Track]) -> list[int]:
+    def _with_parallax(self, tracks: dict[int, Track]) -> dict[int, Track]:
         """Tracks whose first and last rays in W differ enough to be worth a triangulation, most parallax first."""
         if not tracks:
-            return []
+            return {}
         s = self.state
         R = {c.frame: c.R_WB @ s.R_BC for c in s.clones}
         ends = [(R[t.frames[0]] @ t.b_C[0]) @ (R[t.frames[-1]] @ t.b_C[-1]) if t.frames[0] in R else 1.0
@@ -266,7 +287,7 @@ class Msckf:
         enough = np.cos(np.radians(self.config.filter.least_parallax_deg))
         order = np.argsort(ends, kind="stable")
         ids = list(tracks)
-        return [ids[k] for k in order if ends[k] < enough]
+        return {ids[k]: tracks[ids[k]] for k in order if ends[k] < enough}
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)

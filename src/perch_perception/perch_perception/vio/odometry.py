@@ -175,7 +175,7 @@ class VisualInertialOdometry:
         steps = self._imu.run(state.stamp, until)
         if len(steps):
             self.filter.propagate(steps, until)
-            rest.hold(self.filter, steps, self.config.start, self.config.imu.gyro_noise)
+            rest.hold(self.filter, self.config.start)
         self._informed = exposed
         result = self._result(FrameOutcome.RESTING, features, FrameReport())
         return replace(result, blind_for=0.0, estimate=replace(result.estimate, stamp=exposed, w_WB_B=np.zeros(3)))

@@ -34,21 +34,19 @@ def looks_at_rest(config: StartConfig, steps: np.ndarray, gyro_bias: np.ndarray,
     return bool(np.linalg.norm(w) < config.rest_gyro and change < config.rest_accel)
 
 
-def hold(filter: Msckf, steps: np.ndarray, config: StartConfig, gyro_noise: float) -> None:
-    """Update with standing still over IMU steps (m, 9), the last of which ends now.
+def hold(filter: Msckf, config: StartConfig) -> None:
+    """Update with standing still now.
 
-    v = 0; the gyro's mean is its bias; and the pose is that of the window's oldest clone, made when the rest began. The last is
-    relative: it says nothing of where in W that is.
+    v = 0, and the pose is that of the window's oldest clone, made when the rest began. The latter is relative: it says
+    nothing of where in W that is. It tells the gyro's bias as well, since the filter has just integrated the gyro.
     """
     s = filter.state
-    H = np.zeros((12, at.INERTIAL_SIZE + at.CLONE_SIZE))
+    H = np.zeros((9, at.INERTIAL_SIZE + at.CLONE_SIZE))
     H[0:3, at.VELOCITY] = np.eye(3)
-    H[3:6, at.GYRO_BIAS] = np.eye(3)
-    H[6:9, at.THETA], H[6:9, 15:18] = np.eye(3), -np.eye(3)
-    H[9:12, at.POSITION], H[9:12, 18:21] = np.eye(3), -np.eye(3)
+    H[3:6, at.THETA], H[3:6, 15:18] = np.eye(3), -np.eye(3)
+    H[6:9, at.POSITION], H[6:9, 18:21] = np.eye(3), -np.eye(3)
     anchor = s.clones[0]
-    r = np.concatenate([-s.v_WB, steps[:, GYRO].mean(axis=0) - s.gyro_bias,
-                        so3.log(s.R_WB.T @ anchor.R_WB), anchor.p_WB - s.p_WB])
-    variance = np.repeat([config.rest_velocity**2, gyro_noise**2 / len(steps), _HOLD**2, _HOLD**2], 3)
+    r = np.concatenate([-s.v_WB, so3.log(s.R_WB.T @ anchor.R_WB), anchor.p_WB - s.p_WB])
+    variance = np.repeat([config.rest_velocity**2, _HOLD**2, _HOLD**2], 3)
     columns = np.concatenate([np.arange(at.INERTIAL_SIZE), s.clone_at(0) + np.arange(6)])
     filter.apply(columns, H, r, variance)

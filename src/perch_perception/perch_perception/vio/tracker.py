@@ -1,5 +1,8 @@
 """KLT tracks: pyramidal Lucas-Kanade from frame to frame, predicted by the gyro, checked there and back.
 
+Following a patch from frame to frame adds up its errors: in a hover the map turned by 0.1 deg/s. So a *reference* frame is kept
+while the view changes little, and each feature is found again by the patch it had there.
+
 Outliers are found with the known rotation: two tracks then give the direction of translation, and RANSAC over pairs needs
 only a few draws.
 """
@@ -45,12 +48,14 @@ class Features:
 
 
 class Tracker:
-    """Owns the previous frame and the features in it."""
+    """Owns the previous frame, the reference frame, and the features in them."""
 
     def __init__(self, config: TrackerConfig, camera: Camera) -> None:
         self.config, self.camera = config, camera
         self.latest: Features | None = None
         self._previous: np.ndarray | None = None
+        self._reference: np.ndarray | None = None
+        self._origins: dict[int, np.ndarray] = {}  # pixels of features in the reference frame
         self._pixels, self._ids, self._next = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4])
@@ -63,6 +68,7 @@ class Tracker:
     def reset(self) -> None:
         """Forget the previous frame; numbers are not used again."""
         self._previous, self._pixels, self._ids = None, np.zeros((0, 2), np.float32), np.zeros(0, int)
+        self._reference, self._origins = None, {}
 
     def track(self, image: np.ndarray, R_now_before: np.ndarray) -> Features:
         """Follow the features into a new frame and refill them.
@@ -76,10 +82,12 @@ class Tracker:
         smooth = cv2.GaussianBlur(image, (0, 0), self.config.smoothing)
         if self._previous is not None and len(self._pixels):
             disparity = self._follow(image, R_now_before)
+            self._return_to_reference(image)
         self._previous = image
         new = 0
         if len(self._pixels) < self.config.features * self.config.refill:
             new = self._refill(smooth, noise)
+        self._choose_reference(image)
         self.latest = Features(self._ids, self._pixels.astype(float), new, disparity)
         return self.latest
 
@@ -105,6 +113,30 @@ class Tracker:
         disparity = float(np.median(np.linalg.norm(after - guess, axis=1)[good])) if good.any() else np.inf
         self._pixels, self._ids = after[good], self._ids[good]
         return disparity
+
+    def _return_to_reference(self, image: np.ndarray) -> None:
+        """Place features where the patch of the reference frame fits best, if that is close to where they were followed to."""
+        index = np.flatnonzero([i in self._origins for i in self._ids.tolist()])
+        if self._reference is None or not len(index):
+            return
+        origins = np.array([self._origins[i] for i in self._ids[index].tolist()], np.float32).reshape(-1, 1, 2)
+        guess, size = self._pixels[index].reshape(-1, 1, 2), (self.config.window, self.config.window)
+        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)
+        placed, found, _ = cv2.calcOpticalFlowPyrLK(self._reference, image, origins, guess.copy(), winSize=size, maxLevel=0,
+                                                    criteria=stop, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        near = (found.ravel() > 0) & (np.linalg.norm(placed - guess, axis=2).ravel() < self.config.reference_reach)
+        self._pixels[index[near]] = placed.reshape(-1, 2)[near]
+
+    def _choose_reference(self, image: np.ndarray) -> None:
+        """Take this frame as the reference when the old one has lost most features or the view has changed too much."""
+        shared = [k for k, i in enumerate(self._ids.tolist()) if i in self._origins]
+        if self._reference is not None and len(shared) > 0.6 * len(self._ids):
+            moves = self._pixels[shared] - np.array([self._origins[self._ids[k]] for k in shared])
+            # a common shift leaves the patches alike; spread means that they turn or change their size
+            if np.median(np.linalg.norm(moves - np.median(moves, axis=0), axis=1)) < self.config.reference_change:
+                return
+        self._reference = image
+        self._origins = dict(zip(self._ids.tolist(), self._pixels.copy()))
 
     def _one_translation(self, rays: np.ndarray, after: np.ndarray, good: np.ndarray) -> np.ndarray:
         """Tracks that agree with the translation most of them share, (n,) bool; rays are those before, turned."""
