@@ -1,0 +1,124 @@
+"""Pictures of a powerline manoeuvre: from the side with the body and its camera, the line metrics, an animation. [P:Fig.6-8]"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+
+from perch_core import so3
+from perch_core.lines import Segment
+from perch_core.rotor_model import P, Q
+from perch_planner.powerline.visibility import visibility
+
+matplotlib.use("Agg")
+from matplotlib.animation import FuncAnimation, PillowWriter  # noqa: E402  (the backend must be chosen first)
+from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
+if TYPE_CHECKING:
+    from perch_planner.powerline.problem import PlannedProblem
+
+PERCH, RECOVERY, SIGHT, WIRE = "#1f5fa8", "#d9822b", "#3a9a4b", "#b02a2a"
+SIGHT_LENGTH = 0.5  # of the drawn camera axis [m]
+
+
+class SideView:
+    """Projection on the vertical plane that is square to the target line."""
+
+    def __init__(self, line: Segment, start: np.ndarray) -> None:
+        horizontal = np.cross(line.direction, [0.0, 0.0, 1.0])
+        horizontal /= np.linalg.norm(horizontal)
+        self.right_W = horizontal if horizontal @ (line.centre - start) > 0 else -horizontal
+        self.origin = start
+
+    def __call__(self, points_W: np.ndarray) -> np.ndarray:
+        """Points in W, shape (..., 3), as (distance towards the line, height), shape (..., 2)."""
+        points_W = np.asarray(points_W, float)
+        return np.stack([(points_W - self.origin) @ self.right_W, points_W[..., 2]], axis=-1)
+
+    def body(self, state: np.ndarray, radii: tuple[float, float, float]) -> np.ndarray:
+        """Outline of the body's ellipsoid, shape (60, 2): the projection of an ellipsoid is an ellipse."""
+        A = np.stack([self.right_W, [0.0, 0.0, 1.0]]) @ so3.quat_to_matrix(state[Q]) @ np.diag(radii)
+        U, s, _ = np.linalg.svd(A, full_matrices=False)
+        angle = np.linspace(0, 2 * np.pi, 60)
+        return self(state[P]) + (U @ (s[:, None] * np.array([np.cos(angle), np.sin(angle)]))).T
+
+
+def _scene(planned: PlannedProblem, axes: Axes) -> SideView:
+    view = SideView(planned.request.target(), planned.request.start[P])
+    for line in planned.request.lines:
+        ends = view(np.stack(line.ends))
+        target = line.id == planned.request.target_line
+        axes.plot(*ends.T, color=WIRE, lw=2 if target else 1, alpha=0.5)
+        axes.plot(*view(line.centre), "o", color=WIRE, ms=7 if target else 4)
+        axes.annotate(f"line {line.id}", view(line.centre), xytext=(6, 6), textcoords="offset points", fontsize=8)
+    axes.axhline(planned.problem.settings.height_min, color="0.5", ls=":", lw=1)
+    axes.set(xlabel="towards the line [m]", ylabel="height [m]", aspect="equal")
+    return view
+
+
+def _body(axes: Axes, view: SideView, planned: PlannedProblem, state: np.ndarray, colour: str) -> list:
+    R_WB = so3.quat_to_matrix(state[Q])
+    mount = planned.vehicle.mounts[planned.problem.settings.camera]
+    eye = state[P] + R_WB @ mount.p_BC
+    sight = view(np.stack([eye, eye + SIGHT_LENGTH * R_WB @ mount.R_BC[:, 2]]))
+    thrust = view(np.stack([state[P], state[P] + 0.2 * R_WB[:, 2]]))
+    return [*axes.plot(*view.body(state, planned.vehicle.body_radii).T, color=colour, lw=1.2),
+            *axes.plot(*thrust.T, color=colour, lw=1.2), *axes.plot(*sight.T, color=SIGHT, lw=1)]
+
+
+def draw_manoeuvre(planned: PlannedProblem, path: Path, bodies: int = 12) -> None:
+    """The manoeuvre from the side: bodies with their thrust direction (short) and camera axis (green)."""
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes = figure.add_subplot()
+    view = _scene(planned, axes)
+    for name, part, colour in (("perch", planned.plan.perch, PERCH), ("recovery", planned.plan.recovery, RECOVERY)):
+        if part is None:
+            continue
+        axes.plot(*view(part.states[:, P]).T, color=colour, lw=1, label=f"{name}, {part.duration:.2f} s")
+        for k in np.linspace(0, len(part.times) - 1, bodies).astype(int):
+            _body(axes, view, planned, part.states[k], colour)
+    axes.set_title(planned.problem.description or planned.problem.name, fontsize=10)
+    axes.legend(loc="lower left", fontsize=8)
+    figure.savefig(path, dpi=130)
+
+
+def draw_visibility(planned: PlannedProblem, path: Path) -> None:
+    """Reprojection error and visibility of the target line over the perch, as the paper's Fig. 7."""
+    part = planned.plan.perch
+    mount = planned.vehicle.mounts[planned.problem.settings.camera]
+    seen = visibility(part.states, planned.request.target(), mount)
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    top.plot(part.times, np.where(seen.cheirality, np.minimum(seen.reprojection, 2000), np.nan), color=PERCH)
+    top.set(ylabel="|reprojection| [px]", yscale="symlog", title=planned.problem.name)
+    bottom.plot(part.times, seen.in_image, color=SIGHT, label="share of the segment in the image")
+    bottom.fill_between(part.times, 0, 1, where=~(seen.segment & seen.cheirality), color=WIRE, alpha=0.2,
+                        label="segment visibility or cheirality violated")
+    bottom.set(xlabel="time [s]", ylim=(0, 1.05))
+    bottom.legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+
+
+def draw_animation(planned: PlannedProblem, path: Path, rate: float = 20.0) -> None:
+    """The manoeuvre in real time as a GIF, from the side."""
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    axes = figure.add_subplot()
+    view = _scene(planned, axes)
+    trajectory = planned.plan.trajectory(planned.planner.solver.model, step=1 / rate)
+    states = np.concatenate([trajectory.p, trajectory.q], axis=1)
+    axes.plot(*view(trajectory.p).T, color="0.7", lw=1)
+    joint = planned.plan.perch.duration if planned.plan.perch is not None else 0.0
+    drawn: list = []
+
+    def frame(k: int) -> list:
+        while drawn:
+            drawn.pop().remove()
+        drawn.extend(_body(axes, view, planned, states[k], PERCH if trajectory.times[k] <= joint else RECOVERY))
+        axes.set_title(f"{trajectory.times[k]:.2f} s", fontsize=10)
+        return drawn
+
+    FuncAnimation(figure, frame, frames=len(states)).save(path, writer=PillowWriter(fps=rate))

@@ -1,0 +1,74 @@
+"""What a planned problem leaves on disk: the trajectory as CSV, figures and checks as JSON, pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perch_planner.powerline.visibility import visibility
+
+if TYPE_CHECKING:
+    from perch_planner.powerline.problem import PlannedProblem
+
+COLUMNS = ("t", "p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w", "v_x", "v_y", "v_z", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z",
+           "dw_x", "dw_y", "dw_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
+
+
+def write_csv(planned: PlannedProblem, path: Path) -> None:
+    """All samples of perch and recovery in SI units; quaternions xyzw."""
+    t = planned.plan.trajectory(planned.planner.solver.model)
+    rows = np.column_stack([t.times, t.p, t.q, t.v, t.w, t.a, t.dw, t.rotor_thrust])
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows([f"{value:.9g}" for value in row] for row in rows)
+
+
+def summary(planned: PlannedProblem) -> dict[str, Any]:
+    """Durations, solver figures, certificates and visibility of a plan, ready for JSON."""
+    parts = {}
+    for name in ("perch", "recovery"):
+        part = getattr(planned.plan, name)
+        if part is not None:
+            parts[name] = {"duration_s": part.duration, "solve_time_s": part.solve_time, "iterations": part.iterations,
+                           "solver": part.solver, "intervals": part.intervals, "cost": part.cost,
+                           "peak_rotor_thrust_N": float(part.states[:, 13:17].max()), "least_height_m": float(part.states[:, 2].min())}
+    certificates = [{"quantity": b.quantity, "unit": b.unit, "minimum": b.minimum, "maximum": b.maximum,
+                     "lower_limit": _finite(b.lower_limit), "upper_limit": _finite(b.upper_limit), "margin": b.margin,
+                     "holds": b.holds} for b in planned.plan.bounds]
+    out = {"problem": planned.problem.name, "vehicle": planned.vehicle.name, "compiled": planned.planner.solver.compiled,
+           **parts, "certificates": certificates}
+    if planned.plan.perch is not None:
+        mount = planned.vehicle.mounts[planned.problem.settings.camera]
+        out["visibility"] = visibility(planned.plan.perch.states, planned.request.target(), mount).summary()
+    return out
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def write_report(planned: PlannedProblem, folder: Path, animation: bool = False) -> dict[str, Any]:
+    """Write `<name>.csv`, `<name>.json`, `<name>.png`, `<name>_visibility.png` and, if wanted, `<name>.gif`.
+
+    Returns:
+        The content of the JSON file, with the files' names under "files".
+    """
+    from perch_planner.powerline import picture
+
+    folder.mkdir(parents=True, exist_ok=True)
+    name = planned.problem.name
+    paths = {"csv": folder / f"{name}.csv", "picture": folder / f"{name}.png", "visibility": folder / f"{name}_visibility.png"}
+    write_csv(planned, paths["csv"])
+    picture.draw_manoeuvre(planned, paths["picture"])
+    picture.draw_visibility(planned, paths["visibility"])
+    if animation:
+        paths["animation"] = folder / f"{name}.gif"
+        picture.draw_animation(planned, paths["animation"])
+    out = summary(planned)
+    (folder / f"{name}.json").write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
+    return {**out, "files": [str(path) for path in (*paths.values(), folder / f"{name}.json")]}

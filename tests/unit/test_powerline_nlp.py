@@ -1,0 +1,137 @@
+"""Stage functions and the problem's derivatives against CasADi's own, the cache, and the interpreted path. [P:eq14-15]"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from perch_core import lines, so3
+from perch_core.lines import Segment
+from perch_core.rotor_model import RotorModel
+from perch_core.vehicle import load_vehicle
+from perch_planner.powerline import compiled, nlp
+from perch_planner.powerline.stage_functions import StageModel, line_parameters, stage_functions
+
+VEHICLE = load_vehicle("rpg")
+STAGE = StageModel.of(RotorModel.of(VEHICLE), VEHICLE.thrust_rate_max, VEHICLE.body_radii, VEHICLE.mounts["front"])
+STAGES = stage_functions(STAGE)
+LINE = Segment([3.0, 0.2, 4.0], [0.1, 1.0, 0.05], 2.0, 0.03)
+
+
+def state(p: list[float], q: np.ndarray = np.array([0.0, 0, 0, 1]), w: list[float] = (0.0, 0, 0)) -> np.ndarray:
+    return np.concatenate([p, q, np.zeros(3), w, np.full(4, 1.9), [2.0]])
+
+
+@pytest.mark.parametrize("solver", ["fatrop", "ipopt"])
+@pytest.mark.parametrize("perception", [False, True])
+def test_assembled_derivatives_are_those_of_the_chain_rule(solver: str, perception: bool) -> None:
+    problem = nlp.Problem(nlp.Structure(4, 2, perception, solver), STAGES)
+    f, g, jac, hess = (problem._solver.get_function(name) for name in ("nlp_f", "nlp_g", "nlp_jac_g", "nlp_hess_l"))
+    x, p, lam_f, lam_g = (ca.SX.sym(name, size) for name, size in
+                          (("x", f.size1_in(0)), ("p", f.size1_in(1)), ("f", 1), ("g", g.size1_out(0))))
+    lagrangian = lam_f * f.expand()(x, p) + ca.dot(lam_g, g.expand()(x, p))
+    truth = ca.Function("truth", [x, p, lam_f, lam_g], [ca.jacobian(g.expand()(x, p), x), ca.gradient(lagrangian, x),
+                                                        ca.densify(ca.hessian(lagrangian, x)[0])])
+    rng = np.random.default_rng(0)
+    values = [rng.normal(size=x.shape[0]), rng.normal(size=p.shape[0]), 1.7, rng.normal(size=lam_g.shape[0])]
+    J, gradient, H = (np.array(ca.densify(part)) for part in truth(*values))
+    np.testing.assert_allclose(np.array(ca.densify(jac(*values[:2])[1])), J, rtol=1e-9, atol=1e-9 * np.abs(J).max())
+    got = hess(*values)
+    if solver == "fatrop":
+        np.testing.assert_allclose(np.array(got[0]), gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
+        np.testing.assert_allclose(np.array(ca.densify(got[1])), H, rtol=1e-9, atol=1e-12 * np.abs(H).max())
+    else:
+        np.testing.assert_allclose(np.array(ca.densify(got)), np.triu(H), rtol=1e-9, atol=1e-12 * np.abs(H).max())
+
+
+def test_clearance_constraint_is_the_scaled_distance() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        x = state(LINE.centre + rng.normal(0, 0.4, 3), so3.quat_exp(rng.normal(size=3)))
+        d = 1 + lines.scaled_clearance(x[None, :3], x[None, 3:7], LINE, VEHICLE.body_radii)[0]
+        value = float(STAGES.functions["clear"](x, line_parameters(LINE)))
+        assert value == pytest.approx((d * d - 1) / (d * d + 1), abs=1e-6)
+
+
+def test_perception_cost_grows_as_the_camera_turns_away_even_past_the_line() -> None:
+    """[P:eq13] with the authors' arctan is flat where the camera looks along the line; a solver would never turn."""
+    line, weights = line_parameters(Segment([4.0, 0, 4.0], [0, 1, 0], 2.0, 0.03)), [0.0, 0.0, 1.0]
+    yaws = np.radians([0, 20, 60, 80, 89, 100, 130, 170])
+    costs = [float(STAGES.functions["see"](state([0, 0, 4.0], so3.quat_exp([0, 0, yaw])), line, weights)) for yaw in yaws]
+    assert costs[0] == costs[1] == 0.0  # the centred point is on the segment: it subtends 27 deg to either side
+    assert np.all(np.diff(costs[1:]) > 0.05)
+
+
+def test_running_cost_is_equation_15() -> None:
+    x, u, N = state([0, 0, 1], w=[1.0, 2, 3]), np.array([0.1, -0.2, 0.3, 0.4]), 30
+    T, rates = 2.0, 40.0 * u
+    impulse = np.full(4, 1.9) * T / N + rates * T**2 / (2 * N**2)
+    cost = float(STAGES.functions["run"](x, u, [0.02, 0.3, 40.0 / (2 * N)]))
+    assert cost == pytest.approx(0.02 * N**2 * impulse @ impulse + 0.3 * 14)
+
+
+def test_spin_between_the_nodes_sees_a_peak_that_both_nodes_miss() -> None:
+    x, u = state([0, 0, 1], w=[0.0, -6.0, 0]), np.array([-1.0, 1, 1, -1]) * 0.9
+    x[13:17] = [3.1, 0.7, 0.7, 3.1]
+    step = float(1 / 30)
+    after = np.array(STAGES.functions["step"](x, u, step)).ravel()
+    middle = float(STAGES.functions["turn"](x, u, step, 7.0))
+    fine = np.array(STAGES.functions["step"](x, u, step / 2)).ravel()
+    assert middle == pytest.approx(1 - fine[10:13] @ fine[10:13] / 49, abs=1e-6)
+    assert np.abs(after[11] - x[11]) < np.abs(fine[11] - x[11])  # the middle is farther out than the end
+
+
+def test_defects_make_two_steps_as_exact_as_eight() -> None:
+    problem = nlp.Problem(nlp.Structure(4, 0, False, "ipopt"), STAGES)
+    rng = np.random.default_rng(2)
+    states = np.array([state([0, 0, 2], so3.quat_exp(rng.normal(size=3)), rng.normal(0, 3, 3)) for _ in range(5)])
+    states[:, 17] = 0.3  # intervals of 75 ms, as in flight
+    inputs = rng.uniform(-1, 1, (4, 4))
+    step = STAGES.functions["step"]
+    for x, u, defect in zip(states, inputs, problem.defects_of(states, inputs)):
+        fine = x
+        for _ in range(50):
+            fine = step(fine, u, 0.25 / 50)
+        corrected = np.array(step(x, u, 0.25)).ravel() + defect
+        error, before = (np.abs(value - np.array(fine).ravel())[:10].max() for value in (corrected, np.array(step(x, u, 0.25)).ravel()))
+        assert error < 0.02 * before
+
+
+def test_compiled_functions_give_the_interpreted_values() -> None:
+    """Uses the machine's cache: only the first run on a machine compiles."""
+    fast, done = compiled.load(STAGES)
+    if not done:
+        pytest.skip("no C compiler here: the interpreted path is what everybody gets")
+    rng = np.random.default_rng(3)
+    for name, function in STAGES.functions.items():
+        arguments = [rng.random(function.size_in(i)) for i in range(function.n_in())]
+        slow, quick = (np.array(f(*arguments)) for f in (function, fast.functions[name]))
+        np.testing.assert_allclose(quick, slow, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(slow).max()), err_msg=name)
+
+
+@pytest.fixture
+def small() -> dict[str, ca.Function]:
+    x = ca.SX.sym("x")
+    return {"twice": ca.Function("twice", [x], [2 * x])}
+
+
+def test_the_cache_is_used_again_and_follows_the_source(small: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if compiled.compiler() is None:
+        pytest.skip("no C compiler here")
+    monkeypatch.setenv("PERCH_CACHE", str(tmp_path))
+    first = compiled.build(small)
+    assert first.parent == tmp_path and float(ca.external("twice", str(first))(3)) == 6
+    stamp = first.stat().st_mtime_ns
+    assert compiled.build(small) == first and first.stat().st_mtime_ns == stamp
+    x = ca.SX.sym("x")
+    assert compiled.build({"twice": ca.Function("twice", [x], [2 * x + 1])}) != first
+    assert [path.suffix for path in tmp_path.iterdir()] == [".so", ".so"]  # nothing temporary is left
+
+
+def test_no_compiler_means_interpreted(small: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "compiler", lambda: None)
+    assert compiled.build(small) is None
+    assert compiled.load(STAGES) == (STAGES, False)
