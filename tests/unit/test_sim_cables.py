@@ -63,11 +63,28 @@ def test_the_grip_can_be_switched_off():
     assert events[0].state is ContactState.BOUNCED and "switched off" in events[0].reason
 
 
+def test_a_gripper_that_slows_down_in_reach_grips_then():
+    """A vehicle that swings its gripper in too fast and comes to rest at the cable holds it."""
+    R_WB = so3.exp(np.array([0.0, -np.radians(80.0), 0.0]))
+    plant = Plant(SCENARIO, VEHICLE, 1, 0)
+    plant.place(POINT + (VEHICLE.perch_offset + 0.004) * R_WB[:, 2], so3.quat_from_matrix(R_WB), np.zeros(3),
+                np.array([0.0, -4.0, 0.0]), OFF)  # the gripper passes with 0.6 m/s
+    events = []
+    for _ in range(6):
+        events += plant.advance(OFF).contacts
+    assert not events and not plant.hold.active
+    state = plant.state
+    plant.place(state.p_WB, state.q_WB, np.zeros(3), np.zeros(3), OFF)
+    for _ in range(20):
+        events += plant.advance(OFF).contacts
+    assert [e.state for e in events] == [ContactState.ATTACHED] and np.hypot(events[0].normal_speed, events[0].tangential_speed) < 0.4
+
+
 def test_a_cable_in_the_rotors_is_a_crash():
     plant = Plant(SCENARIO, VEHICLE, 1, 0)
     plant.place(POINT + [0.0, 0.0, -0.4], np.array([0, 0, 0, 1.0]), np.array([0, 0, 3.5]), np.zeros(3), np.full(4, 1000.0))
     events = [e for _ in range(100) for e in plant.advance(np.full(4, 1000.0)).contacts]
-    assert [e.state for e in events if e.body == "cable 0"] == [ContactState.COLLISION]
+    assert [e.state for e in events if e.body == "cable 0"] == [ContactState.COLLISION]  # it came from below, not at the gripper
     assert plant.crashed and np.all(plant.rotor_speed < 300.0)
 
 

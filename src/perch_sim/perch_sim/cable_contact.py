@@ -1,8 +1,9 @@
 """Contact with cables: when the gripper closes, and what a cable in the rotors does.
 
 The gripper sits `perch_offset` below the centre of mass and points along -b3; it turns freely about its axis. It closes
-when the cable is as near as it gets: it then holds within the tolerances of position, tilt and speed of the scenario.
-Tilt is how far b3 is from being square to the cable: the pitch about the cable is free.
+as soon as the cable is in the claw, or comes no nearer, while all tolerances of the scenario hold: position, tilt and
+speed of the gripper against the cable. Tilt is how far b3 is from being square to the cable: the pitch about it is free.
+A cable that leaves the gripper's reach again without that was missed, and the event tells how it was when nearest.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class CableMonitor:
         self._lines = [CableLine(cable) for cable in cables]
         self._grip, self._offset, self._radii = grip, gripper_offset, np.array(radii, float)
         self._before = [math.inf] * len(cables)   # distance one update ago
-        self._decided = [False] * len(cables)     # this pass has been judged
+        self._nearest: list[ContactEvent | None] = [None] * len(cables)  # of this pass
         self._attachment: Attachment | None = None
         self.hold: Hold = FREE
         self.crashed = False
@@ -108,30 +109,39 @@ class CableMonitor:
         events = []
         for k, line in enumerate(self._lines):
             near = line.nearest(gripper_W)
-            closest = near.distance < TOUCH or self._before[k] < near.distance
-            reach = self._grip.position + LEAVING
+            if near.distance <= self._grip.position + LEAVING:
+                events += self._within_reach(time, k, x, R_WB, gripper_W, near)
+            else:
+                events += self._missed(k)
             self._before[k] = near.distance
-            if near.distance > reach:
-                self._decided[k] = False
-            elif closest and not (self._decided[k] or self.crashed or self._attachment):
-                self._decided[k] = True
-                events.append(self._judge(time, k, x, R_WB, gripper_W, near))
-            if not (self.crashed or self._attachment) and line.enters(x[:3], R_WB, self._radii):
+            if self._attachment is not None:
+                break
+            if not self.crashed and line.enters(x[:3], R_WB, self._radii):
                 self.crashed = True
+                events += self._missed(k)
                 events.append(self._event(time, ContactState.COLLISION, k, x, R_WB, near, "crashed: a cable in the rotors"))
         return events
 
-    def _judge(self, time: float, k: int, x: np.ndarray, R_WB: np.ndarray, gripper_W: np.ndarray,
-               near: Nearest) -> ContactEvent:
-        event = self._event(time, ContactState.ATTACHED, k, x, R_WB, near, "")
+    def _missed(self, k: int) -> list[ContactEvent]:
+        """The pass of a cable is over."""
+        event, self._nearest[k] = self._nearest[k], None
+        return [] if event is None else [event]
+
+    def _within_reach(self, time: float, k: int, x: np.ndarray, R_WB: np.ndarray, gripper_W: np.ndarray,
+                      near: Nearest) -> list[ContactEvent]:
+        """Grip the cable, or remember how near it came."""
+        event = self._event(time, ContactState.BOUNCED, k, x, R_WB, near, "")
         speed = math.hypot(event.normal_speed, event.tangential_speed)
         refusal = grip_refusal(near.distance, event.tilt_error, speed, self._grip)
-        if refusal:
-            return event._replace(state=ContactState.BOUNCED, reason=refusal)
-        square = R_WB[:, 2] - (R_WB[:, 2] @ near.direction) * near.direction
-        self._attachment = Attachment(time, -1, gripper_W, near.point_W, x[3:7], square / np.linalg.norm(square), np.zeros(3))
-        self.hold = self._attachment.hold(time)
-        return event
+        if not refusal and (near.distance < TOUCH or near.distance >= self._before[k]):
+            square = R_WB[:, 2] - (R_WB[:, 2] @ near.direction) * near.direction
+            self._attachment = Attachment(time, -1, gripper_W, near.point_W, x[3:7], square / np.linalg.norm(square), np.zeros(3))
+            self.hold = self._attachment.hold(time)
+            return [event._replace(state=ContactState.ATTACHED)]
+        known = self._nearest[k]
+        if refusal and (known is None or near.distance < known.offset):
+            self._nearest[k] = event._replace(reason=refusal)
+        return []
 
     def _event(self, time: float, state: ContactState, k: int, x: np.ndarray, R_WB: np.ndarray, near: Nearest,
                reason: str) -> ContactEvent:
