@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
-from scipy.stats import norm
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Rate:
         n = self.trials
         if n == 0:
             return 0.0, 1.0
-        z, p = float(norm.ppf(0.5 + self.confidence / 2)), self.successes / n
+        z, p = NormalDist().inv_cdf(0.5 + self.confidence / 2), self.successes / n
         centre = (p + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
         return max(0.0, centre - half), min(1.0, centre + half)

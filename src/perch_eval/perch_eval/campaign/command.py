@@ -13,7 +13,6 @@ from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.ranking import worst
-from perch_eval.campaign.report import write_report
 from perch_eval.campaign.results import Results, RunResult
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
@@ -64,6 +63,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     try:
         fly_all(campaign, results, args.jobs, args.cluster)
+        from perch_eval.campaign.report import write_report  # draws figures: not needed before, nor by workers
+
         found = results.all()
         keep_worst(campaign, found, out)
         report = write_report(campaign, found, out)
@@ -127,3 +128,7 @@ def summary(found: list[RunResult]) -> str:
     return "\n".join(lines)
 
 
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""Cheap engines for tests of campaigns; workers import this file by name."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from perch_eval.campaign.results import RunResult
+
+
+def quick(task) -> RunResult:
+    """A flight in 10 ms that succeeds in light wind."""
+    time.sleep(0.01)
+    gust = task.run.values.get("wind.gust_sigma", 0.0)
+    cause = "perched" if gust < 0.5 else "tilt" if task.run.seed % 3 else "missed_pad"
+    return RunResult(task.run.number, task.run.seed, cause, "perched" if cause == "perched" else "missed", "as the wind was",
+                     metrics={"contact_tilt_error_deg": 20.0 * gust})
+
+
+def mortal(task) -> RunResult:
+    """As `quick`, but the worker that flies run 11 for the first time is killed in mid-run."""
+    marker = Path(os.environ["PERCH_TEST_MARKER"])
+    if task.run.number == 11 and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return quick(task)
+
+
+def broken(task) -> RunResult:
+    """One run in four cannot be carried out."""
+    if task.run.number % 4 == 0:
+        raise RuntimeError("the simulator is out of fuel")
+    return quick(task)

@@ -1,0 +1,127 @@
+"""Campaigns keep their results whatever happens: to the campaign, to a worker, to a Dask worker, to Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from perch_eval.campaign.results import read_results
+
+HERE = Path(__file__).parent
+
+CAMPAIGN = """
+name: cheap
+scenario: surface_90
+runs: {runs}
+seed: 3
+vary:
+  wind.gust_sigma: {{uniform: [0.0, 1.0]}}
+  target.distance: {{choice: [1.7, 3.0]}}
+map: [target.distance, wind.gust_sigma]
+"""
+
+
+@pytest.fixture
+def campaign(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", f"{HERE}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    monkeypatch.setenv("PERCH_TEST_MARKER", str(tmp_path / "killed"))
+
+    def command(engine: str, runs: int, *options: str) -> list[str]:
+        file = tmp_path / "cheap.yaml"
+        file.write_text(CAMPAIGN.format(runs=runs))
+        return [sys.executable, "-m", "perch_eval.campaign.command", str(file), "--engine", f"campaign_engines:{engine}",
+                "--jobs", "2", "--out", str(tmp_path / "out"), *options]
+
+    return command
+
+
+def run(command: list[str]) -> subprocess.CompletedProcess:
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def numbers(folder: Path) -> list[int]:
+    return [r.number for r in read_results(folder / "out" / "results.sqlite")]
+
+
+def wait_for_results(folder: Path, count: int) -> None:
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        try:
+            if len(numbers(folder)) >= count:
+                return
+        except Exception:  # the file or its table is not there yet
+            pass
+        time.sleep(0.01)
+    raise AssertionError(f"no {count} results within a minute")
+
+
+def test_a_killed_campaign_resumes_to_200_distinct_results(campaign, tmp_path):
+    process = subprocess.Popen(campaign("quick", 200), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for_results(tmp_path, 37)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = numbers(tmp_path)
+    assert 37 <= len(kept) < 200
+    refused = run(campaign("quick", 200))
+    assert refused.returncode == 2 and "--resume" in refused.stderr
+    again = run(campaign("quick", 200, "--resume"))
+    assert again.returncode == 0, again.stderr
+    assert numbers(tmp_path) == list(range(200))
+    assert f"{200 - len(kept)} of 200 runs to fly" in again.stdout
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Causes of failure, ranked" in page and "tilt" in page and "Success over target.distance and wind.gust_sigma" in page
+
+
+def test_results_are_those_of_an_undisturbed_campaign(campaign, tmp_path):
+    assert run(campaign("quick", 40)).returncode == 0
+    found = read_results(tmp_path / "out" / "results.sqlite")
+    gusts = [r.values["wind.gust_sigma"] for r in found]
+    assert len(set(gusts)) == 40 and len({r.seed for r in found}) == 40
+    assert all((r.cause == "perched") == (r.values["wind.gust_sigma"] < 0.5) for r in found)
+
+
+@pytest.mark.parametrize("where", [(), ("--cluster", "local")], ids=["pool", "dask"])
+def test_a_killed_worker_loses_no_result(campaign, tmp_path, where):
+    finished = run(campaign("mortal", 40, *where))
+    assert (tmp_path / "killed").exists()
+    assert finished.returncode == 0, finished.stderr
+    assert numbers(tmp_path) == list(range(40))
+    assert not [r for r in read_results(tmp_path / "out" / "results.sqlite") if r.cause == "error"]
+
+
+def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_path):
+    process = subprocess.Popen(campaign("quick", 5000), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)
+    wait_for_results(tmp_path, 20)
+    os.killpg(process.pid, signal.SIGINT)
+    _, words = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "--resume" in words and "Traceback" not in words
+    assert len(numbers(tmp_path)) >= 20
+    with pytest.raises(ProcessLookupError):  # nothing of the campaign's process group is left
+        for _ in range(100):
+            os.killpg(process.pid, 0)
+            time.sleep(0.05)
+
+
+def test_runs_that_break_are_results_and_the_exit_code_says_so(campaign, tmp_path):
+    finished = run(campaign("broken", 12))
+    assert finished.returncode == 1
+    found = read_results(tmp_path / "out" / "results.sqlite")
+    assert [r.number for r in found if r.cause == "error"] == [0, 4, 8]
+    assert "the simulator is out of fuel" in found[0].message
+
+
+def test_other_settings_do_not_mix_with_kept_results(campaign, tmp_path):
+    assert run(campaign("quick", 5)).returncode == 0
+    other = run(campaign("quick", 6, "--resume"))
+    assert other.returncode == 2 and "other settings" in other.stderr
+
+
+def test_an_unreachable_scheduler_is_the_callers_mistake(campaign):
+    finished = run(campaign("quick", 5, "--cluster", "nonsense://nowhere"))
+    assert finished.returncode == 2 and "nonsense" in finished.stderr

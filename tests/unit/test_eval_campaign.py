@@ -1,0 +1,152 @@
+"""Campaign files, draws, causes of failure, results and their ranking."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest, kstest
+
+from perch_core.errors import ConfigError
+from perch_core.scenario import Adhesion
+from perch_eval.campaign.causes import cause_of
+from perch_eval.campaign.distributions import parse
+from perch_eval.campaign.figures import Axis
+from perch_eval.campaign.ranking import worst
+from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results
+from perch_eval.campaign.specification import load_campaign, scenario_of
+from perch_eval.statistics import Rate, Spread
+from perch_sim.contact_event import ContactEvent, ContactState
+
+
+def write(folder, text):
+    file = folder / "c.yaml"
+    file.write_text(text)
+    return file
+
+
+def test_draws_follow_their_distributions():
+    rng = np.random.default_rng(1)
+    uniform = [parse("c", "a", {"uniform": [2.0, 5.0]}).draw(rng) for _ in range(2000)]
+    normal = [parse("c", "a", {"normal": [1.0, 0.1]}).draw(rng) for _ in range(2000)]
+    assert kstest(uniform, "uniform", (2.0, 3.0)).pvalue > 0.01
+    assert kstest(normal, "norm", (1.0, 0.1)).pvalue > 0.01
+    limited = [parse("c", "a", {"normal": [1.0, 0.1], "low": 0.95, "high": 1.2}).draw(rng) for _ in range(500)]
+    assert min(limited) >= 0.95 and max(limited) <= 1.2
+    assert {parse("c", "a", {"choice": [1, 2, 3]}).draw(rng) for _ in range(100)} == {1, 2, 3}
+
+
+@pytest.mark.parametrize("entry", [3.0, {}, {"uniform": [1, 2], "choice": [1]}, {"uniform": [2, 1]}, {"uniform": [1]},
+                                   {"normal": [0, 0]}, {"choice": []}, {"gauss": [0, 1]}, {"uniform": [0, 1], "low": 0}])
+def test_a_distribution_that_says_nothing_is_refused(entry):
+    with pytest.raises(ConfigError, match="vary.a"):
+        parse("c.yaml", "vary.a", entry)
+
+
+def test_a_grid_is_gone_through_and_the_rest_drawn(tmp_path):
+    campaign = load_campaign(write(tmp_path, """
+name: g
+runs: 3
+vary:
+  target.distance: {grid: [1.7, 3.0]}
+  target.inclination_deg: {grid: [60.0, 90.0]}
+  wind.steady.1: {uniform: [-1.0, 1.0]}
+  parameters.controller.snapdragon.lead: {choice: [0.02, 0.03]}
+"""))
+    assert len(campaign.runs) == 12
+    points = [(r.values["target.distance"], r.values["target.inclination_deg"]) for r in campaign.runs]
+    assert all(points.count(p) == 3 for p in set(points)) and len(set(points)) == 4
+    run = campaign.runs[7]
+    scenario = scenario_of(campaign.mapping(run), "c")
+    assert scenario.target.distance == run.values["target.distance"]
+    assert scenario.wind.steady == (0.0, run.values["wind.steady.1"], 0.0)
+    assert scenario.parameters["controller"]["snapdragon.lead"] == run.values["parameters.controller.snapdragon.lead"]
+    assert len({r.seed for r in campaign.runs}) == 12
+
+
+def test_more_runs_keep_the_first_ones(tmp_path):
+    file = write(tmp_path, "name: g\nruns: 5\nvary: {target.distance: {uniform: [1.0, 3.0]}}\n")
+    assert load_campaign(file, runs=20).runs[:5] == load_campaign(file).runs
+    assert load_campaign(file, runs=20).digest != load_campaign(file).digest
+
+
+@pytest.mark.parametrize("vary, words", [
+    ("target.distanse: {uniform: [1.0, 2.0]}", "distanse"),
+    ("target.distance: {uniform: [5.0, 6.0]}", "outside"),
+    ("wind.steady.7: {uniform: [0.0, 1.0]}", "3 entries"),
+])
+def test_what_no_scenario_accepts_is_refused_before_the_first_flight(tmp_path, vary, words):
+    with pytest.raises(ConfigError, match=words):
+        load_campaign(write(tmp_path, f"name: g\nvary: {{{vary}}}\n"))
+
+
+def touch(state, body="pad", normal=0.5, tangential=0.1, tilt=3.0, reason=""):
+    return ContactEvent(5.0, state, body, normal, tangential, math.radians(tilt), 0.02, reason)
+
+
+GROUND, NONE = touch(ContactState.GROUND, "floor"), touch(ContactState.NONE, "floor")
+ATTACHED, BOUNCED, COLLISION = ContactState.ATTACHED, ContactState.BOUNCED, ContactState.COLLISION
+
+
+@pytest.mark.parametrize("outcome, touches, cause", [
+    ("perched", [touch(ATTACHED)], "perched"),
+    ("perched", [], "came_off"),
+    ("perched", [touch(ATTACHED), touch(ContactState.NONE)], "came_off"),
+    ("not_found", [], "not_found"),
+    ("refused", [], "refused"),
+    ("timeout", [], "timeout"),
+    ("tracking_lost", [], "lost_track"),
+    ("missed", [], "missed_pad"),
+    ("missed", [touch(BOUNCED, normal=1.4, reason="normal speed")], "too_fast"),
+    ("missed", [touch(BOUNCED, tangential=0.9, reason="tangential speed")], "too_fast"),
+    ("missed", [touch(BOUNCED, normal=0.05, reason="normal speed")], "too_slow"),
+    ("missed", [touch(BOUNCED, tilt=22.0, reason="tilt error")], "tilt"),
+    ("missed", [touch(BOUNCED, tilt=22.0, reason="touched 0.1 m outside the pad; tilt error")], "missed_pad"),
+    ("missed", [touch(COLLISION, reason="a rotor touched the pad")], "crash"),
+    ("crashed", [touch(COLLISION, "floor", reason="crashed: touched the floor tilted by 80 deg")], "crash"),
+    ("crashed", [touch(BOUNCED, tilt=30.0, reason="tilt error"), touch(COLLISION, "floor", reason="crashed: floor")], "tilt"),
+])
+def test_causes_come_from_the_first_thing_that_went_wrong(outcome, touches, cause):
+    assert cause_of(outcome, [GROUND, NONE, *touches], Adhesion()) == cause
+
+
+def test_results_outlive_the_writer_and_are_read_while_it_writes(tmp_path):
+    path = tmp_path / "r.sqlite"
+    results = Results(path, "c", "digest", resume=False)
+    for n in (3, 1, 2, 1):
+        results.add(RunResult(n, 10 + n, "perched", "perched", "", {"a": 1.5}, {"x": None, "y": 2.0}))
+    assert [r.number for r in read_results(path)] == [1, 2, 3]
+    del results  # never closed, as after SIGKILL
+    assert read_results(path)[0].metrics == {"x": None, "y": 2.0}
+    with pytest.raises(ResultsError, match="--resume"):
+        Results(path, "c", "digest", resume=False)
+    with pytest.raises(ResultsError, match="other settings"):
+        Results(path, "c", "another", resume=True)
+    assert Results(path, "c", "digest", resume=True).finished() == {1, 2, 3}
+
+
+def test_the_worst_flights_show_every_cause():
+    found = [RunResult(n, n, cause, "", "", metrics={"contact_tilt_error_deg": float(n)})
+             for n, cause in enumerate(["tilt"] * 5 + ["crash"] * 2 + ["perched"] * 3 + ["error"])]
+    assert [r.number for r in worst(found, 4)] == [4, 6, 3, 5]
+    assert [r.cause for r in worst(found, 9)][-2:] == ["perched", "perched"]
+
+
+def test_every_value_has_its_cell():
+    values = list(np.linspace(0.0, 3.0, 40))
+    axis = Axis(values)
+    assert [axis.cell(v) for v in (0.0, 0.51, 2.99, 3.0)] == [0, 1, 5, 5]
+    few = Axis([False, True, True])
+    assert (few.cell(False), few.cell(True)) == (0, 1)
+    assert Axis(["a", "b"]).labels == ["a", "b"]
+
+
+@pytest.mark.parametrize("k, n", [(0, 10), (4, 5), (95, 100), (100, 100), (3, 7)])
+def test_wilson_interval_is_that_of_scipy(k, n):
+    reference = binomtest(k, n).proportion_ci(method="wilson")
+    assert Rate(k, n).interval == pytest.approx((reference.low, reference.high), abs=1e-9)
+
+
+def test_spread_leaves_out_what_is_no_number():
+    spread = Spread.of([3.0, None, 1.0, float("nan"), 2.0])
+    assert (spread.median, spread.low, spread.high, spread.count) == (2.0, 1.0, 3.0, 3)
+    assert Spread.of([]).words() == "-"
