@@ -54,7 +54,7 @@ def certificates(results: np.ndarray, limits: Limits, mass: float, thrust_method
     table = (("thrust", "N", limits.thrust[0], limits.thrust[1], mass, thrust_method),
              ("speed", "m/s", -inf, limits.speed, 1.0, "bernstein"),
              ("height", "m", limits.height[0], limits.height[1], 1.0, "bernstein"),
-             ("clearance", "m", 0.0, inf, 1.0, "bernstein"),
+             ("clearance", "m", limits.clearance, inf, 1.0, "bernstein"),
              ("body_rate", "rad/s", -inf, limits.body_rate, 1.0, "bernstein"))
     out = []
     for row, (quantity, unit, low, high, scale, method) in zip(results.tolist(), table):

@@ -140,7 +140,7 @@ def _widen(out, row, minimum, at_minimum, maximum_, at_maximum):
 
 @compiled
 def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, speed, low_height, high_height,
-          extension, rate):
+          extension, clearance, rate):
     """Prove every limit of a plan, or find where it fails.
 
     Args:
@@ -152,6 +152,7 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
         speed: limit [m/s].
         low_height, high_height: limits [m].
         extension: radius of the vehicle's disc [m].
+        clearance: least distance of its rim from the surface [m].
         rate: limit of |omega| [rad/s].
 
     Returns:
@@ -200,7 +201,7 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
         if thrust[i, 4] > high_thrust and where[0, 0] < 0.0:
             where[0, 0], where[0, 1] = i, thrust[i, 5]
         begin += T
-    _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, gap_wanted)
+    _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, clearance, gap_wanted)
     _prove_rate(out, where, parts, durations, rate, rate_wanted)
     for k in range(5):
         if where[k, 0] >= 0.0:
@@ -209,11 +210,11 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
 
 
 @compiled
-def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, sampled):
-    """Prove a clearance near the sampled one, or else that the limit 0 holds, or else find where it fails."""
+def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, limit, sampled):
+    """Prove a clearance near the sampled one, or else that the limit holds, or else find where it fails."""
     out[3, 0], out[3, 2] = -np.inf, np.inf
-    for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, 0.0):
-        if gap < 0.0:
+    for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, limit):
+        if gap < limit:
             continue
         begin, failed, place = 0.0, -1, 0.0
         for i in range(len(durations)):
@@ -226,7 +227,7 @@ def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extensio
         if failed < 0:
             out[3, 0] = gap
             return
-        if gap == 0.0:
+        if gap == limit:
             where[3, 0], where[3, 1] = failed, place
 
 

@@ -7,6 +7,7 @@ loops is bounded, so that a plan ends after at most `iterations_max` programs.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -26,6 +27,7 @@ from perch_planner.yaw_profile import yaw_coefficients
 
 _CUT_ROUNDS = 24
 _CUT_REACH = 1.7      # peaks beyond this multiple of the limit are stretched first,
+_NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
 _PATIENCE = 5         # and so are peaks before the last waypoint, where a longer time helps most; so many times
 _PLAIN_STRETCH = 1.15
 _SEGMENT_STRETCH = 1.1  # of the paper's per-segment stretching
@@ -105,16 +107,14 @@ _ADVICE = {"": "widen the impact speeds, tangential_speed_max or the tube",
 class _Search:
     """State of one planning call."""
 
-    def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> None:
-        self.problem, self.settings, self.vehicle = problem, settings, vehicle
-        self.limits = Limits.of(settings, vehicle)
-        p_contact = problem.surface.p_WS + vehicle.perch_offset * problem.surface.normal
-        refusals.refuse_hopeless(problem, settings, self.limits, vehicle, p_contact)
-        self.first = allocate(problem, settings, p_contact)
+    def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, limits: Limits) -> None:
+        self.problem, self.settings, self.vehicle, self.limits = problem, settings, vehicle, limits
+        self.low, self.high = (x / vehicle.mass for x in limits.thrust)
         self.contact = Contact(problem, settings, vehicle.perch_offset)
-        self.low, self.high = (x / vehicle.mass for x in self.limits.thrust)
-        self.attempts: list[Attempt] = []
+        self.first = allocate(problem, settings, self.contact.p_contact)
         self.end_yaw = contact_heading(problem.surface)
+        self.attempts: list[Attempt] = []
+        self.failures: Counter[str] = Counter()
 
     @property
     def iterations(self) -> int:
@@ -147,7 +147,7 @@ class _Search:
             outcome, cuts = self._thrust(coefficients, durations, extrema)
             if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
                 return outcome
-            if not outcome or rounds:
+            if not outcome or rounds and outcome.margin > -_NEAR * self.limits.thrust[1]:
                 results, where = self._check(coefficients, yaw, durations)
                 if results[:, plan_checks.HOLDS].all():
                     return _Outcome(coefficients, yaw, results)
@@ -188,7 +188,8 @@ class _Search:
         surface, limits = self.problem.surface, self.limits
         return plan_checks.check(coefficients, yaw, durations, surface.p_WS, self.problem.target_velocity,
                                  np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed,
-                                 limits.height[0], limits.height[1], limits.extension, limits.body_rate)
+                                 limits.height[0], limits.height[1], limits.extension, limits.clearance,
+                                 limits.body_rate)
 
     def _margin(self, results: np.ndarray, name: str) -> float:
         row, limits = results[plan_checks.NAMES.index(name)], self.limits
@@ -202,6 +203,22 @@ class _Search:
         mass = self.vehicle.mass
         low, high = (np.nan, np.nan) if extrema is None else (mass * extrema[:, 1].min(), mass * extrema[:, 4].max())
         self.attempts.append(Attempt(float(durations.sum()), float(low), float(high), cuts))
+
+    def run(self) -> tuple[np.ndarray, _Outcome]:
+        """Lengthen until every limit is proved, or the time or the number of programs is used up."""
+        durations, best, stretched = self.first, None, 0
+        while True:
+            outcome = self.try_durations(split_last(durations), patient=stretched < _PATIENCE)
+            if outcome.proved:
+                return durations, outcome
+            stretched += 1
+            self.failures[outcome.failure] += 1
+            if best is None or best.coefficients is None or (outcome.coefficients is not None and outcome.margin > best.margin):
+                best = outcome
+            grown = self.longer(durations, outcome)
+            if grown.sum() > self.settings.duration_max or self.iterations >= self.settings.iterations_max:
+                return durations, best
+            durations = grown
 
     def longer(self, durations: np.ndarray, outcome: _Outcome) -> np.ndarray:
         """The next durations. [M:IV-C.3]
@@ -254,20 +271,12 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         PerchRefusal: there is none, or none was found; with the violated constraint and its margin.
     """
     begin = perf_counter()
-    search = _Search(problem, settings, vehicle)
-    durations = search.first
-    best, stretched = None, 0
-    while True:
-        outcome = search.try_durations(split_last(durations), patient=stretched < _PATIENCE)
-        if outcome.proved:
-            break
-        stretched += 1
-        if best is None or best.coefficients is None or (outcome.coefficients is not None and outcome.margin > best.margin):
-            best = outcome
-        grown = search.longer(durations, outcome)
-        if grown.sum() > settings.duration_max or search.iterations >= settings.iterations_max:
-            raise _refusal(search, best, durations)
-        durations = grown
+    limits = Limits.of(settings, vehicle)
+    refusals.refuse_hopeless(problem, settings, limits, vehicle)
+    search = _Search(problem, settings, vehicle, limits)
+    durations, outcome = search.run()
+    if not outcome.proved:
+        raise _refusal(search, outcome)
     if settings.minimum_time:
         durations, outcome = search.shortest(durations, outcome)
     durations = split_last(durations)
@@ -277,18 +286,41 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         if not sturm.thrust_below(outcome.coefficients, durations, search.high):
             raise PerchRefusal(refusals.SOLVER, "Algorithm 1 [M:alg1]", 0.0,
                                "Sturm's chain does not confirm the thrust bound that subdivision proves",
-                               certificates(outcome.results, search.limits, vehicle.mass), search.iterations)
+                               certificates(outcome.results, limits, vehicle.mass), search.iterations)
     trajectory = FlatTrajectory(durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
-    proofs = certificates(outcome.results, search.limits, vehicle.mass, method)
+    proofs = certificates(outcome.results, limits, vehicle.mass, method)
     return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))
 
 
-def _refusal(search: _Search, best: _Outcome, durations: np.ndarray) -> PerchRefusal:
-    """The refusal for the best that was found."""
-    name = best.failure
+def _refusal(search: _Search, best: _Outcome) -> PerchRefusal:
+    """Find out what stands in the way: limits are taken away, the most often violated first, until there is a plan."""
+    limits, taken = search.limits, []
     proofs = () if best.results is None else certificates(best.results, search.limits, search.vehicle.mass)
-    margin = best.margin if best.coefficients is not None else float("-inf")
-    amount = f"violated by {-margin:.3g} at best" if np.isfinite(margin) else "not met by any plan that was tried"
-    message = (f"{_WORDS[name]}: {amount}, up to a duration of {durations.sum():.2f} s and {search.iterations} programs; "
-               f"{_ADVICE[name]}")
-    return PerchRefusal(_CODES[name], _WORDS[name], margin, message, proofs, search.iterations)
+    tried = f"{search.iterations} programs up to {search.attempts[-1].duration:.2f} s"
+    for name, _ in search.failures.most_common():
+        if name not in plan_checks.NAMES:
+            continue
+        taken.append(name)
+        limits = limits.without(name)
+        relaxed = _Search(search.problem, search.settings, search.vehicle, limits)
+        _, outcome = relaxed.run()
+        if outcome.proved:
+            needed = certificates(outcome.results, search.limits, search.vehicle.mass)
+            margin, words = _needed(needed, taken, search.limits)
+            constraint = " and ".join(_WORDS[n] for n in taken)
+            return PerchRefusal(_CODES[taken[0]], constraint, margin,
+                                f"no plan keeps the {constraint} ({tried}); without it there is one that takes {words}; "
+                                f"{_ADVICE[taken[0]]}", proofs, search.iterations)
+    name = "solver" if search.failures["solver"] else ""
+    return PerchRefusal(_CODES[name], _WORDS[name], float("-inf"),
+                        f"{_WORDS[name]}: no plan, even without the other limits ({tried}); {_ADVICE[name]}", proofs,
+                        search.iterations)
+
+
+def _needed(proofs: tuple[Certificate, ...], names: list[str], limits: Limits) -> tuple[float, str]:
+    """By how much the first named limit is exceeded by a plan without it, and its figures in words."""
+    by_name = {proof.quantity: proof for proof in proofs}
+    first = by_name[names[0]]
+    margin = min(first.minimum - first.lower_limit, first.upper_limit - first.maximum)
+    words = ", ".join(f"{n} in [{by_name[n].minimum:.3g}, {by_name[n].maximum:.3g}] {by_name[n].unit}" for n in names)
+    return margin, words

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -174,6 +174,7 @@ class Limits:
         speed: greatest speed in W [m/s].
         height: least and greatest height of the centre of mass [m].
         extension: radius of the disc around the centre of mass that stays in front of the surface until contact [m].
+        clearance: least distance of that disc from the surface [m].
     """
 
     thrust: tuple[float, float]
@@ -181,6 +182,11 @@ class Limits:
     speed: float
     height: tuple[float, float]
     extension: float
+    clearance: float = 0.0
+
+    def without(self, name: str) -> Limits:
+        """The limits with one of them taken away: thrust, body_rate, speed, height or clearance."""
+        return replace(self, **{name: {"thrust": (1e-3, 1e3), "height": (-1e3, 1e3), "clearance": -1e3}.get(name, 1e3)})
 
     @classmethod
     def of(cls, settings: PerchSettings, vehicle: Vehicle) -> Limits:

@@ -31,8 +31,7 @@ class PerchRefusal(PlanningRefusal):
         super().__init__(code, constraint, margin, message)
 
 
-def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle,
-                    p_contact) -> None:
+def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
     """Refuse what no trajectory can do, before a QP is solved.
 
     Raises:
@@ -59,6 +58,7 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
                            f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
+    p_contact = problem.surface.p_WS + vehicle.perch_offset * problem.surface.normal
     for name, p in (("start", start.p), ("contact", p_contact), *((f"waypoint {k}", w.p) for k, w in enumerate(problem.waypoints))):
         margin = min(p[2] - limits.height[0], limits.height[1] - p[2])
         if margin < 0.0 and not (name == "contact" and problem.target_velocity[2]):

@@ -9,11 +9,12 @@ import numpy as np
 from perch_core.vehicle import GRAVITY
 from perch_planner.problem import PerchProblem, PerchSettings
 
-CRUISE_SPEED = 2.5        # [m/s] of the speed profile that spaces the waypoints
-CRUISE_ACCELERATION = 3.0  # [m/s^2]
-TURN_ACCELERATION = 2.0    # [m/s^2]
+CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints
+CRUISE_ACCELERATION = 2.8  # [m/s^2]
+TURN_ACCELERATION = 1.2    # [m/s^2]
 MANOEUVRE_TIME = 0.45     # [s] for the rotation before contact, on top of the way
 FINAL_TIME = 0.5          # [s] of the last piece, where the rotation happens
+APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
 
@@ -61,6 +62,7 @@ def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) 
         times = _profile_time(reached, length)
         durations = np.maximum(np.diff(times), _turning_times(points))
         durations = np.maximum(durations * (1.0 + extra / durations.sum()), SEGMENT_MIN)
+        durations[-1] = max(durations[-1], APPROACH_TIME)
     return with_last_segment(durations, settings)
 
 

@@ -1,0 +1,100 @@
+#!/usr/bin/env python3
+"""Plan a perch from a YAML file, without a graph: writes samples (CSV), coefficients and certificates (JSON), a picture (PNG)."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from perch_setup import enter, leave_quietly_on_interrupt
+
+EXAMPLES = """examples:
+  python3 scripts/plan.py surface_90                       config/problems/surface_90.yaml, results in out/plan
+  python3 scripts/plan.py my_problem.yaml --out results    a file of your own
+  python3 scripts/plan.py surface_90 --set objective=jerk --set thrust_max=4.5
+  python3 scripts/plan.py --list                           the problems there are
+
+files: plan.csv (every 2 ms), plan.json (Bernstein coefficients, certificates), plan.png
+exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file"""
+
+
+def _plan_perch(mapping: dict, source: str, out: Path) -> int:
+    from perch_planner import plan_output
+    from perch_planner.planner import plan
+    from perch_planner.problem import Limits
+    from perch_planner.problem_file import read_problem
+
+    problem, settings, vehicle = read_problem(mapping, source)
+    planned = plan(problem, settings, vehicle)
+    out.mkdir(parents=True, exist_ok=True)
+    plan_output.write_csv(out / "plan.csv", planned, vehicle.mass)
+    plan_output.write_json(out / "plan.json", planned)
+    plan_output.draw(out / "plan.png", planned, problem, Limits.of(settings, vehicle), vehicle)
+    print(f"contact after {planned.duration:.3f} s; {planned.iterations} programs in {1e3 * planned.solve_time:.2f} ms")
+    for certificate in planned.certificates:
+        print(f"  {certificate.describe()}")
+    return 0
+
+
+def _plan_powerline(mapping: dict, source: str, out: Path) -> int:
+    from perch_planner.powerline.problem_file import run
+
+    return run(mapping, source, out)
+
+
+KINDS = {"perch": _plan_perch, "powerline": _plan_powerline}
+
+
+def _apply(mapping: dict, changes: list[str]) -> None:
+    """Put `key=value` pairs into the section `settings`."""
+    import yaml
+    from perch_core.errors import ConfigError
+
+    settings = mapping.setdefault("settings", {})
+    for change in changes:
+        key, sign, value = change.partition("=")
+        if not sign:
+            raise ConfigError("--set", change, "is not KEY=VALUE")
+        settings[key] = yaml.safe_load(value)
+
+
+def main() -> int:
+    """Read the problem, plan by its kind, write the files."""
+    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problem", nargs="?", help="name in config/problems, or a YAML file")
+    parser.add_argument("--out", type=Path, default=Path("out/plan"), help="folder for the results (default: %(default)s)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner")
+    parser.add_argument("--list", action="store_true", help="name the problems in config/problems")
+    arguments = parser.parse_args()
+    if not arguments.list and arguments.problem is None:
+        parser.error("a problem is needed; --list names those there are")
+    enter()
+    leave_quietly_on_interrupt()
+    from perch_core import config
+    from perch_core.errors import ConfigError, PerchError, PlanningRefusal
+
+    try:
+        if arguments.list:
+            print("\n".join(sorted(path.stem for path in (config.config_dir() / "problems").glob("*.yaml"))))
+            return 0
+        path = config.find("problems", arguments.problem)
+        mapping = config.read_yaml(path)
+        if not isinstance(mapping, dict) or mapping.get("kind") not in KINDS:
+            kind = mapping.get("kind") if isinstance(mapping, dict) else mapping
+            raise ConfigError(str(path), "kind", f"{kind!r} is not one of {', '.join(KINDS)}")
+        _apply(mapping, arguments.set)
+        return KINDS[mapping["kind"]](mapping, str(path), arguments.out)
+    except PlanningRefusal as refusal:
+        print(f"refused ({refusal.code}): {refusal}", file=sys.stderr)
+        return 2 if refusal.code == "bad_input" else 1
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: {arguments.out}: {error.strerror}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

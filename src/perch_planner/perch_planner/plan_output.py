@@ -1,0 +1,103 @@
+"""A perching plan as files for people and programs: CSV samples, JSON with coefficients and certificates, a picture."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perch_core.flatness import FlatState, flat_to_state
+from perch_core.vehicle import Vehicle
+from perch_planner.planner import PerchPlan
+from perch_planner.problem import Limits, PerchProblem
+
+COLUMNS = ("time", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "qx", "qy", "qz", "qw", "wx", "wy", "wz", "thrust")
+
+
+def states(plan: PerchPlan, mass: float, step: float = 0.002) -> tuple[np.ndarray, list[FlatState]]:
+    """Times and full states of a plan, every `step` seconds and at contact."""
+    times = np.append(np.arange(0.0, plan.duration, step), plan.duration)
+    at = plan.trajectory.sample_many(times)
+    rows = zip(at.p, at.v, at.a, at.j, at.s, at.yaw.tolist(), at.yaw_rate.tolist(), at.yaw_acc.tolist())
+    return times, [flat_to_state(*row, mass) for row in rows]
+
+
+def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
+    """Samples every 2 ms: time [s], position, velocity, acceleration in W, attitude xyzw, rates in B [rad/s], thrust [N]."""
+    from perch_core.so3 import quat_from_matrix
+
+    times, full = states(plan, mass)
+    at = plan.trajectory.sample_many(times)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for k, state in enumerate(full):
+            row = [times[k], *at.p[k], *at.v[k], *at.a[k], at.yaw[k], *quat_from_matrix(state.R_WB), *state.w_WB_B, state.thrust]
+            writer.writerow([f"{float(v):.9g}" for v in row])
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity: null stands for "none"."""
+    return float(value) if math.isfinite(value) else None
+
+
+def as_json(plan: PerchPlan) -> dict[str, Any]:
+    """Segments in Bernstein form, certificates, and what the planning took."""
+    fields = ("lower_limit", "upper_limit", "minimum", "maximum", "time_of_minimum", "time_of_maximum")
+    return {
+        "duration": plan.duration, "iterations": plan.iterations, "solve_time": plan.solve_time,
+        "segments": [{"duration": float(d), **{k: row.tolist() for k, row in zip(("x", "y", "z", "yaw"), c)}}
+                     for d, c in zip(plan.trajectory.durations, plan.trajectory.coefficients)],
+        "certificates": [{"quantity": c.quantity, "unit": c.unit, **{f: _finite(getattr(c, f)) for f in fields},
+                          "method": c.method, "holds": c.holds} for c in plan.certificates],
+    }
+
+
+def write_json(path: Path, plan: PerchPlan) -> None:
+    """Write `as_json`."""
+    path.write_text(json.dumps(as_json(plan), indent=1) + "\n")
+
+
+def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, vehicle: Vehicle) -> None:
+    """Picture: the way in the vertical plane of the approach with the thrust, and thrust, speed, body rate over time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    times, full = states(plan, vehicle.mass)
+    p = np.array([s.p_WB for s in full])
+    heading = problem.surface.heading
+    along = np.array([np.cos(heading), np.sin(heading), 0.0])
+    figure, axes = pyplot.subplots(2, 2, figsize=(11, 7.5), layout="constrained")
+    side, thrust, speed, rate = axes.ravel()
+    x = (p - problem.start.p) @ along
+    side.plot(x, p[:, 2], color="tab:blue")
+    for k in range(0, len(times), max(len(times) // 24, 1)):
+        b3 = full[k].R_WB[:, 2] * full[k].thrust / limits.thrust[1] * 0.25
+        side.annotate("", (x[k] + b3 @ along, p[k, 2] + b3[2]), (x[k], p[k, 2]), arrowprops={"arrowstyle": "->", "color": "tab:orange"})
+    centre = problem.surface.p_WS + problem.target_velocity * plan.duration
+    ends = centre + np.outer([-0.3, 0.3], problem.surface.R_WS[:, 0])
+    side.plot((ends - problem.start.p) @ along, ends[:, 2], color="black", linewidth=3)
+    for waypoint in problem.waypoints:
+        side.plot((waypoint.p - problem.start.p) @ along, waypoint.p[2], "o", color="tab:green")
+    side.set(xlabel="along the approach [m]", ylabel="height [m]", title="side view; arrows: thrust")
+    side.set_aspect("equal", adjustable="datalim")
+    thrust.plot(times, [s.thrust for s in full])
+    for bound in limits.thrust:
+        thrust.axhline(bound, color="tab:red", linestyle="--")
+    thrust.set(xlabel="time [s]", ylabel="thrust [N]", title="collective thrust and its bounds")
+    speed.plot(times, [s.v_WB for s in full], label=["x", "y", "z"])
+    speed.legend()
+    speed.set(xlabel="time [s]", ylabel="velocity [m/s]", title="velocity")
+    rate.plot(times, np.degrees([s.w_WB_B for s in full]), label=["x", "y", "z"])
+    rate.legend()
+    rate.set(xlabel="time [s]", ylabel="body rate [deg/s]", title="body rate")
+    for axis in axes.ravel():
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

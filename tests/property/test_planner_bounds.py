@@ -1,0 +1,133 @@
+"""Bounds of polynomials: subdivision and Sturm's chain against exact rationals, numpy's roots and dense samples."""
+
+from __future__ import annotations
+
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from perch_core import bernstein
+from perch_core.flatness import flat_to_state
+from perch_planner import bounds, sturm
+from perch_planner.body_rate_bound import rate_at, rate_parts, rate_stays_below
+from perch_planner.plan_checks import specific_force
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "oracles"))
+import exact_sturm  # noqa: E402
+
+seeds = st.integers(0, 2**31 - 1)
+
+
+def thrust_like(seed: int) -> np.ndarray:
+    """A squared norm of degree 24, as [M:eq16] gives."""
+    force = np.random.default_rng(seed).normal(0.0, 5.0, (3, 13))
+    force[2] += 9.81
+    return bernstein.product(force, force).sum(axis=0)
+
+
+@given(seeds)
+@settings(max_examples=60)
+def test_maximum_is_enclosed_and_attained(seed):
+    poly = thrust_like(seed)
+    attained, proved, place = bounds.maximum(poly, 1e-9 * np.abs(poly).max())
+    dense = bernstein.evaluate(poly, np.linspace(0.0, 1.0, 2001))
+    assert proved >= dense.max()
+    assert attained == pytest.approx(float(bernstein.evaluate(poly, place)), rel=1e-9)
+    assert proved - attained <= 2e-9 * np.abs(poly).max()
+
+
+@given(seeds, st.sampled_from([1e-2, 1e-4, 1e-6, 1e-9]), st.sampled_from([-1.0, 1.0]))
+@settings(max_examples=60)
+def test_verdicts_agree_with_exact_sturm_down_to_tiny_margins(seed, margin, side):
+    poly = thrust_like(seed)
+    attained, _, _ = bounds.maximum(poly, 1e-13 * np.abs(poly).max())
+    bound = attained * (1.0 + side * margin)
+    verdict, _ = bounds.stays_below(poly, bound)
+    assert verdict != bounds.UNDECIDED
+    assert (verdict == bounds.BELOW) == exact_sturm.stays_below(poly.tolist(), bound)
+
+
+def test_a_polynomial_on_its_bound_is_not_called_below():
+    touching = bernstein.from_powers(np.array([0.0, 0.0, 0.0]))
+    assert bounds.stays_below(touching, 0.0)[0] != bounds.BELOW
+    parabola = bernstein.from_powers(np.array([-0.09, 0.6, -1.0]))  # -(s - 0.3)^2
+    assert bounds.stays_below(parabola, 0.0)[0] != bounds.BELOW
+
+
+def test_the_papers_example_of_sturms_chain():
+    powers = np.array([-1.0, -1.0, 0.0, 1.0, 1.0])  # [M:eq19]
+    chain, degrees = sturm.sturm_chain(powers)
+    expected = [[-1, -1, 0, 1, 1], [-1, 0, 3, 4], [0.9375, 0.75, 0.1875], [-64, -32], [-0.1875]]
+    for row, degree, wanted in zip(chain, degrees, expected):
+        scaled = np.array(wanted) / np.abs(wanted).max()
+        assert row[:degree + 1] == pytest.approx(scaled)
+    assert sturm.count_roots(powers, 0.0, 2.0) == 1
+    assert exact_sturm.count_roots([Fraction(c) for c in (-1, -1, 0, 1, 1)], Fraction(0), Fraction(2)) == 1
+
+
+@given(st.lists(st.integers(1, 19), min_size=1, max_size=5, unique=True))
+def test_both_chains_count_the_roots_that_were_put_in(roots):
+    powers = [Fraction(1)]
+    for root in roots:
+        powers = [a - Fraction(root, 20) * b for a, b in zip([Fraction(0), *powers], [*powers, Fraction(0)])]
+    assert exact_sturm.count_roots(powers) == len(roots)
+    assert sturm.count_roots(np.array([float(c) for c in powers]), 0.0, 1.0) == len(roots)
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_algorithm_1_agrees_with_subdivision_at_wide_margins(seed):
+    poly = thrust_like(seed)
+    attained, _, _ = bounds.maximum(poly, 1e-9 * np.abs(poly).max())
+    powers = bernstein.to_powers(poly / attained)
+    assert sturm.global_bound_check(powers, 1.2, 0.0, 1.0)
+    assert not sturm.global_bound_check(powers, 0.8, 0.0, 1.0)
+
+
+@given(st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=15), st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=15),
+       st.floats(0.0, 1.0))
+def test_kernels_agree_with_the_library(a, b, s):
+    a, b = np.array(a), np.array(b)
+    assert bounds.product(a, b) == pytest.approx(bernstein.product(a, b), abs=1e-12)
+    assert bounds.derivative(a, 1) == pytest.approx(bernstein.derivative(a), abs=1e-12)
+    assert bounds.value(a, s) == pytest.approx(float(bernstein.evaluate(a, s)), abs=1e-12)
+    assert bounds.bernstein_row(len(a) - 1, s) == pytest.approx(bernstein.basis(len(a) - 1, s), abs=1e-12)
+
+
+def motion(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """A segment of degree 14 with turning yaw, away from free fall."""
+    rng = np.random.default_rng(seed)
+    coefficients = np.cumsum(np.cumsum(rng.normal(0.0, 0.004, (3, 15)), axis=1), axis=1)
+    yaw = rng.uniform(-3.0, 3.0) + np.cumsum(rng.normal(0.0, 0.1, 15))
+    return coefficients, yaw, rng.uniform(0.5, 1.0)
+
+
+def rate_by_flatness(coefficients, yaw, duration, s) -> float:
+    """|omega| by the other implementation, in perch_core."""
+    a, j, snap = (bernstein.evaluate(bernstein.derivative(coefficients, k), s) / duration**k for k in (2, 3, 4))
+    angles = [float(bernstein.evaluate(bernstein.derivative(yaw, k), s)) / duration**k for k in range(3)]
+    return float(np.linalg.norm(flat_to_state(np.zeros(3), np.zeros(3), a, j, snap, *angles, 1.0).w_WB_B))
+
+
+@given(seeds)
+@settings(max_examples=40)
+def test_body_rate_is_that_of_flatness_and_its_bound_is_one(seed):
+    coefficients, yaw, duration = motion(seed)
+    force = specific_force(coefficients, duration)
+    jerk = bernstein.derivative(coefficients, 3) / duration**3
+    parts = rate_parts(force, jerk, yaw, duration)
+    places = np.linspace(0.0, 1.0, 41)
+    rates = [rate_by_flatness(coefficients, yaw, duration, s) for s in places]
+    for s, rate in zip(places[::8], rates[::8]):
+        assert rate_at(parts, s) == pytest.approx(rate, rel=1e-6, abs=1e-8)
+    worst = max(rates)
+    assert rate_stays_below(parts, 0.95 * worst)[0] == bounds.VIOLATED
+    verdict, place = rate_stays_below(parts, 1.05 * worst)
+    if verdict == bounds.VIOLATED:  # the true maximum lies between the samples
+        assert rate_by_flatness(coefficients, yaw, duration, place) >= 1.05 * worst * (1 - 1e-9)
+    else:
+        assert verdict == bounds.BELOW

@@ -1,0 +1,182 @@
+"""The reduced program against the paper's full one, against scipy, and its building blocks against quadrature."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from perch_core import bernstein
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import load_vehicle
+from perch_planner import full_qp, reference_element, solvers
+from perch_planner.contact_constraints import Contact, tube_bounds, tube_times
+from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint, contact_acceleration
+from perch_planner.segment_program import Cut, FullSegments, ReducedSegments
+from perch_planner.yaw_profile import yaw_coefficients
+
+VEHICLE = load_vehicle("snapdragon")
+
+
+def problem(inclination_deg: float = 60.0, waypoints=()) -> PerchProblem:
+    surface = PerchSurface.from_inclination(np.array([2.0, 0.3, 1.5]), np.radians(inclination_deg), 0.2)
+    start = StartState((0.0, 0.0, 1.4), v=(0.3, 0.1, 0.0), a=(0.2, 0.0, 0.1), j=(0.5, 0.0, 0.0))
+    return PerchProblem(start, surface, tuple(Waypoint(p) for p in waypoints))
+
+
+THREE = ((0.5, 0.0, 1.4), (1.0, 0.2, 1.5), (1.5, 0.2, 1.5))
+
+
+def cost(coefficients: np.ndarray, durations: np.ndarray, order: int) -> float:
+    """Integral of the squared derivative by Gauss quadrature. [M:eq4]"""
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    total = 0.0
+    for segment, duration in zip(coefficients, durations):
+        values = bernstein.evaluate(bernstein.derivative(segment, order), 0.5 * (nodes + 1.0)) / duration**order
+        total += float((values**2 @ weights).sum()) * 0.5 * duration
+    return total
+
+
+@pytest.mark.parametrize("order", [3, 4])
+def test_gram_matrices_are_the_integrals(order):
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    rows = bernstein.evaluate(reference_element.TABLES[order, :15 - order].T, 0.5 * (nodes + 1.0))
+    assert reference_element.GRAMS[order] == pytest.approx((rows * weights / 2) @ rows.T, rel=1e-9, abs=1e-8)
+
+
+def test_hermite_functions_are_unit_derivatives_and_bubbles_vanish_at_the_ends():
+    for end, place in ((0, 0.0), (1, 1.0)):
+        for order in range(4):
+            values = bernstein.evaluate(reference_element.TABLES[order, :15 - order].T, place)
+            expected = np.zeros(15)
+            expected[4 * end + order] = 1.0
+            assert values == pytest.approx(expected, abs=1e-9)
+    assert reference_element.GRAMS[4][8:, 8:] == pytest.approx(np.eye(7), abs=1e-9)
+
+
+@pytest.mark.parametrize("objective, order", [("snap", 4), ("jerk", 3)])
+@pytest.mark.parametrize("waypoints, durations", [((), (1.6,)), (THREE, (0.7, 0.5, 0.5, 0.7))])
+def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
+    settings = PerchSettings(objective=objective)
+    durations = np.array(durations)
+    contact = Contact(problem(60.0, waypoints), settings, VEHICLE.perch_offset)
+    reduced, small = ReducedSegments(contact, durations, settings).solve()
+    full, large = FullSegments(contact, durations, PerchSettings(objective=objective, solver="piqp")).solve()
+    assert small.solved and large.solved
+    assert cost(reduced, durations, order) == pytest.approx(cost(full, durations, order), rel=2e-5)
+    assert reduced == pytest.approx(full, abs=2e-3)
+
+
+def test_solvers_find_the_same_minimum():
+    settings = PerchSettings()
+    contact = Contact(problem(80.0), settings, VEHICLE.perch_offset)
+    durations = np.array([1.2, 0.5])
+    answers = []
+    for name in solvers.available():
+        coefficients, solution = ReducedSegments(contact, durations, PerchSettings(solver=name)).solve()
+        assert solution.solved, (name, solution.status, solution.residual)
+        answers.append(coefficients)
+    for other in answers[1:]:
+        assert other == pytest.approx(answers[0], abs=1e-5)
+
+
+def test_least_norm_is_the_minimum_that_scipy_finds():
+    from scipy.optimize import minimize
+
+    rng = np.random.default_rng(4)
+    rows = rng.normal(size=(6, 8))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    lower, upper = np.full(6, 0.1), np.full(6, 0.4)
+    answer = solvers.least_norm(rows, lower, upper)
+    peer = minimize(lambda w: w @ w, np.ones(8), jac=lambda w: 2 * w, method="SLSQP", options={"ftol": 1e-14}, constraints=[
+        {"type": "ineq", "fun": lambda w: rows @ w - lower}, {"type": "ineq", "fun": lambda w: upper - rows @ w}])
+    assert answer.solved and answer.w @ answer.w == pytest.approx(peer.fun, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", solvers.available())
+def test_contradictory_bounds_are_not_called_solved(name):
+    rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
+    answer = solvers.least_norm(rows, np.array([1.0, 1.0]), np.array([2.0, 2.0]), name)
+    assert not answer.solved
+
+
+def test_end_conditions_and_continuity_are_exact():
+    contact = Contact(problem(90.0, THREE), PerchSettings(), VEHICLE.perch_offset)
+    durations = np.array([0.7, 0.5, 0.5, 0.7])
+    coefficients, _ = ReducedSegments(contact, durations, PerchSettings()).solve()
+    given, values = contact.knots(durations)
+    for knot in range(5):
+        for order in range(5):
+            sides = []
+            if knot < 4:
+                sides.append(bernstein.evaluate(bernstein.derivative(coefficients[knot], order), 0.0) / durations[knot]**order)
+            if knot > 0:
+                sides.append(bernstein.evaluate(bernstein.derivative(coefficients[knot - 1], order), 1.0) / durations[knot - 1]**order)
+            if order < 4 and given[knot, order]:
+                for side in sides:
+                    assert side == pytest.approx(values[knot, order], abs=1e-9)
+            if len(sides) == 2:
+                assert sides[0] == pytest.approx(sides[1], rel=1e-8, abs=1e-7)
+
+
+def test_waypoint_derivatives_are_met_even_where_all_are_given():
+    points = (Waypoint(THREE[0], v=(1.0, 0.0, 0.0)), Waypoint(THREE[1], v=(1.0, 0.2, 0.0), a=(0.0, 0.0, 0.0), j=(0.0, 0.0, 0.0)))
+    asked = PerchProblem(problem().start, problem().surface, points)
+    contact = Contact(asked, PerchSettings(), VEHICLE.perch_offset)
+    durations = np.array([0.7, 0.6, 0.9])
+    coefficients, solution = ReducedSegments(contact, durations, PerchSettings()).solve()
+    assert solution.solved
+    for k, waypoint in enumerate(points):
+        for order, value in enumerate((waypoint.p, waypoint.v, waypoint.a, waypoint.j)):
+            if value is not None:
+                reached = bernstein.evaluate(bernstein.derivative(coefficients[k], order), 1.0) / durations[k]**order
+                assert reached == pytest.approx(value, abs=1e-9)
+    snaps = [bernstein.evaluate(bernstein.derivative(coefficients[k], 4), s) / durations[k]**4 for k, s in ((1, 1.0), (2, 0.0))]
+    assert snaps[0] == pytest.approx(snaps[1], rel=1e-7, abs=1e-6)
+
+
+def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
+    settings = PerchSettings()
+    contact = Contact(problem(60.0), settings, VEHICLE.perch_offset)
+    durations = np.array([1.2, 0.5])
+    for make in (ReducedSegments, FullSegments):
+        program = make(contact, durations, PerchSettings(solver="piqp"))
+        free, _ = program.solve()
+        jerk, force = (bernstein.evaluate(bernstein.derivative(free[0], k), 0.4) / durations[0]**k for k in (3, 2))
+        x = np.array([1.0, 0.0, 0.0])
+        bound = jerk[0] - 2.0 * force[0] - 1.0
+        program.add([Cut(0, 0.4, ((3, x), (2, -2.0 * x)), -np.inf, bound)])
+        cut, solution = program.solve()
+        jerk, force = (bernstein.evaluate(bernstein.derivative(cut[0], k), 0.4) / durations[0]**k for k in (3, 2))
+        assert solution.solved and jerk[0] - 2.0 * force[0] <= bound + 1e-5
+
+
+def test_tube_bounds_are_sorted_and_leave_room_on_every_axis():
+    surface = PerchSurface.from_inclination(np.zeros(3), np.pi / 2)
+    end = contact_acceleration(surface, 3.3)
+    lower, upper = tube_bounds(end, PerchSettings())
+    # At 90 degrees the paper's inequality [M:eq15] reads -8.829 <= z <= -10.791, which nothing satisfies, and y = 0.
+    assert (lower[2], upper[2]) == pytest.approx((-10.791, -8.829))
+    assert (lower[1], upper[1]) == pytest.approx((-0.33, 0.33), abs=1e-9)
+    assert (lower < end).all() and (end < upper).all()
+    times = tube_times(2.0, PerchSettings())
+    assert len(times) == 15 and times[0] == pytest.approx(1.85) and times[-1] == pytest.approx(1.99)
+
+
+def test_full_cost_is_the_papers_integral():
+    rng = np.random.default_rng(1)
+    segment = rng.normal(size=15)
+    expected = cost(np.array([[segment, 0 * segment, 0 * segment]]), np.array([0.7]), 4)
+    assert segment @ full_qp.cost_matrix(0.7, 4) @ segment == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("order, degree", [(4, 7), (3, 5)])
+def test_yaw_meets_both_ends_smoothly_by_the_shorter_turn(order, degree):
+    durations = np.array([0.6, 0.3, 0.5])
+    rows = yaw_coefficients(3.0, 0.4, -0.2, -3.0, durations, order)
+    assert np.abs(np.diff(rows, n=degree + 1, axis=1)).max() < 1e-9
+    first = [bernstein.evaluate(bernstein.derivative(rows[0], k), 0.0) / 0.6**k for k in range(3)]
+    last = [bernstein.evaluate(bernstein.derivative(rows[2], k), 1.0) / 0.5**k for k in range(3)]
+    assert first == pytest.approx([3.0, 0.4, -0.2], abs=1e-9)
+    assert last == pytest.approx([2 * np.pi - 3.0, 0.0, 0.0], abs=1e-9)
+    for k in range(4):
+        left = bernstein.evaluate(bernstein.derivative(rows[0], k), 1.0) / 0.6**k
+        assert left == pytest.approx(float(bernstein.evaluate(bernstein.derivative(rows[1], k), 0.0)) / 0.3**k, abs=1e-8)
