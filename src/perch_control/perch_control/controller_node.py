@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from threading import Thread
 from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from perch_msgs.msg import ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, Trajectory
+from perch_msgs.msg import (
+    ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, Trajectory)
 from perch_msgs.srv import SetController
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
@@ -16,12 +18,15 @@ from std_srvs.srv import Trigger
 from perch_control.admission import AtEnd, Order
 from perch_control.flight import FlightController
 from perch_control.geometric import GeometricController
+from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, StepResult
+from perch_control.nmpc import NmpcController
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference, SampledReference
-from perch_core.errors import PerchError
+from perch_core.errors import ConfigError, PerchError
+from perch_core.lines import Segment
 from perch_core.ros import qos
-from perch_core.ros.conversions import to_pose, to_seconds, to_stamp, to_vector
+from perch_core.ros.conversions import to_array, to_pose, to_seconds, to_vector
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import from_message
@@ -41,7 +46,16 @@ class ControllerNode(PerchNode[ControllerParameters]):
         super().__init__("controller", ControllerParameters, self._change, **kwargs)
         self._vehicle = load_vehicle(self.params.vehicle)
         gains = self.params.gain_set(self._vehicle.name)
-        self._flight = FlightController(self._vehicle, GeometricController(self._vehicle, gains), gains, self.params.flight)
+        self._geometric = GeometricController(self._vehicle, gains)
+        self._nmpc: NmpcController | None = None
+        self._flight = FlightController(self._vehicle, self._geometric, gains, self.params.flight)
+        if self.params.controller.adaptive:
+            self._flight.compensator = L1Augmentation(self._vehicle, self.params.l1)
+        if self.params.controller.type == "nmpc":
+            self._build_nmpc()
+            self._flight.use(self._nmpc, gains, self.params.flight)
+        elif self.params.controller.standby:
+            Thread(target=self._build_nmpc, daemon=True).start()
         self._costs: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
         self._arrivals: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
         self._missed = 0
@@ -58,6 +72,8 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
         self._participant.subscribe(ControllerCommand, "controller/command", self._receive_command)
         self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
+        if self.params.nmpc.lines.any:
+            self._participant.subscribe(PowerlineArray, "powerlines", self._receive_lines)
         self._participant.chain(Odometry, "odometry", self._receive_odometry)
         if self.params.estimator_status:
             self._participant.chain(EstimatorStatus, "estimator/status", self._receive_estimator, ESTIMATOR_STEPS)
@@ -68,9 +84,18 @@ class ControllerNode(PerchNode[ControllerParameters]):
     def _change(self, value: ControllerParameters) -> None:
         """New gains and limits count from the next step."""
         if value.vehicle != self.params.vehicle:
-            raise PerchError("vehicle: fixed after the start")
+            raise ConfigError(self.get_name(), "vehicle", "is fixed after the start")
         gains = value.gain_set(self._vehicle.name)
-        self._flight.use(GeometricController(self._vehicle, gains), gains, value.flight)
+        self._geometric = GeometricController(self._vehicle, gains)
+        if self._nmpc is not None:
+            self._nmpc.retune(value.nmpc, self._geometric)
+        if self._flight.compensator is not None:
+            self._flight.compensator.settings = value.l1
+        self._flight.use(self._nmpc if self._flight.law is self._nmpc else self._geometric, gains, value.flight)
+
+    def _build_nmpc(self) -> None:
+        """Compile the predictive controller, or find it compiled; seconds the first time, a tenth of one later."""
+        self._nmpc = NmpcController(self._vehicle, self.params.nmpc, self._geometric)
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
@@ -96,8 +121,15 @@ class ControllerNode(PerchNode[ControllerParameters]):
             self._flight.maneuvers.message = str(error)
             self.get_logger().warning(f"command: {error}")
 
+    def _receive_lines(self, msg: PowerlineArray) -> None:
+        if self._nmpc is None or msg.degenerate:
+            return
+        segments = [Segment.between(to_array(line.start), to_array(line.end), float(line.radius), line.id) for line in msg.lines]
+        segments.sort(key=lambda s: float(s.distance(np.array(self._flight.maneuvers.belief[0:3]))))
+        self._nmpc.lines(tuple((*s.centre.tolist(), *s.direction.tolist(), s.half_length, s.radius) for s in segments))
+
     def _receive_estimator(self, msg: EstimatorStatus) -> None:
-        self._flight.estimator(msg.state, float(msg.vio_age), msg.message)
+        self._flight.supervisor.estimator(msg.state, float(msg.vio_age), msg.message)
 
     def _receive_imu(self, msg: Imu) -> None:
         w, f = msg.angular_velocity, msg.linear_acceleration
@@ -181,11 +213,23 @@ class ControllerNode(PerchNode[ControllerParameters]):
     # -- services ----------------------------------------------------------------------------------------------------
 
     def _set_controller(self, request: SetController.Request, response: SetController.Response) -> SetController.Response:
-        if request.type != "geometric":
-            response.success, response.error_code = False, 1
-            response.message = f"type {request.type!r} is not one of geometric"
+        laws = {"geometric": self._geometric, "nmpc": self._nmpc}
+        response.success, response.error_code = False, 1
+        if request.type not in laws:
+            response.message = f"type {request.type!r} is not one of {', '.join(laws)}"
             return response
-        response.success, response.message = True, f"{request.type} flies"
+        law = laws[request.type]
+        if law is None:
+            response.error_code = 2
+            response.message = "nmpc is not ready: it is being compiled, or controller.standby is false"
+            return response
+        flight = self._flight
+        if request.adaptive and flight.compensator is None:
+            flight.compensator = L1Augmentation(self._vehicle, self.params.l1)
+        elif not request.adaptive:
+            flight.compensator = None
+        flight.use(law, self.params.gain_set(self._vehicle.name), self.params.flight)
+        response.success, response.error_code, response.message = True, 0, f"{flight.law_name} flies"
         return response
 
     def _abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -11,18 +11,18 @@ from perch_control.geometric import ControlOutput, packed_vehicle
 from perch_control.geometric.controller import NO_COMPENSATION
 from perch_control.geometric.step import predicted
 from perch_control.guidance import blended
+from perch_control.l1 import L1Augmentation
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import Command, CommandRefused, State, StepResult
-from perch_control.monitors import Persistent, TrackingMonitor
 from perch_control.odometry_gate import OdometryGate, Verdict
-from perch_control.recovery import Recovery
-from perch_control.reference import Following, Setpoint
+from perch_control.reference import Following
 from perch_control.rotor_lag import RotorEstimate, thrusts
 from perch_control.settings import GeometricGains
+from perch_control.supervisor import Supervisor
 from perch_control.vector3 import axes_of, axpy, norm
 from perch_core.vehicle import Vehicle
 
-_COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
+_AIRBORNE = 0.1              # so far above where it was armed, the ground no longer carries the vehicle [m]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
@@ -30,6 +30,9 @@ class Law(Protocol):
     """A control law: geometric or NMPC."""
 
     name: str
+
+    def begin(self) -> None:
+        """The law takes over: what it remembers of an earlier flight does not count."""
 
     def prepare(self, source: Any, contact: bool) -> Any:
         """The reference to follow for a trajectory, which ends in a contact or not."""
@@ -45,16 +48,16 @@ class FlightController:
     def __init__(self, vehicle: Vehicle, law: Law, gains: GeometricGains, settings: FlightSettings) -> None:
         self.vehicle, self.law = vehicle, law
         self.maneuvers = Maneuvers(vehicle, gains, settings)
+        self.supervisor = Supervisor(self.maneuvers)
         self.gate = OdometryGate(settings.odometry)
         self.odometry_age = inf
         self.margin = 1.0
         self.position_error = 0.0
-        self.compensator = None
+        self.compensator: L1Augmentation | None = None
+        self._ground_height = -inf  # where the vehicle was armed [m]
         self._constants = packed_vehicle(vehicle)
         self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
         self._refused = ""
-        self._monitored = State.DISARMED
-        self._new_monitors()
 
     @property
     def settings(self) -> FlightSettings:
@@ -63,9 +66,11 @@ class FlightController:
 
     def use(self, law: Law, gains: GeometricGains, settings: FlightSettings) -> None:
         """Fly another law, or the same one with other gains and limits, from the next step on."""
+        if law is not self.law:
+            law.begin()
         self.law, self.maneuvers.gains, self.maneuvers.settings = law, gains, settings
         self.gate.limits = settings.odometry
-        self._new_monitors()
+        self.supervisor.restart()
 
     @property
     def state(self) -> State:
@@ -125,6 +130,7 @@ class FlightController:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
         m.enter(State.ARMED, "armed")
         m.rotors = RotorEstimate.at_idle(self.vehicle)
+        self._ground_height = m.belief[2]
 
     def follow(self, order: Order) -> None:
         """Take a trajectory; it starts at its stamp and replaces the running one there.
@@ -145,16 +151,6 @@ class FlightController:
             self._pending = None
             self.maneuvers.stop(reason)
         return self.maneuvers.message
-
-    def estimator(self, state: int, vio_age: float, message: str) -> None:
-        """Take the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
-        m, s = self.maneuvers, self.settings
-        if state == _DIVERGED:
-            m.descend(f"the estimator has diverged: {message}")
-        elif state == _COASTING and vio_age > s.coasting_land_time:
-            m.descend(f"no VIO for {vio_age:.1f} s")
-        elif state == _COASTING and vio_age > s.coasting_time and m.state is State.TRACKING:
-            m.stop(f"hover: no VIO for {vio_age:.1f} s")
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample; used in a descent without position alone. Time [s], in B [rad/s, m/s^2]."""
@@ -184,7 +180,7 @@ class FlightController:
             return self._descend()
         self._activate()
         if m.flying:
-            self._supervise()
+            self.supervisor.act(self.margin)
         return self._fly() if m.flying else self._idle()
 
     def step_blind(self, stamp: float) -> StepResult:
@@ -198,15 +194,7 @@ class FlightController:
         dt = min(max(stamp - m.now, 0.0), 0.1)
         m.now = stamp
         m.rotors = m.rotors.after(dt, self.vehicle.motor_time_constant)
-        if m.state is not self._monitored:
-            self._new_monitors()
         return dt
-
-    def _new_monitors(self) -> None:
-        self._monitored = self.maneuvers.state
-        self._monitor = TrackingMonitor(self.settings, self.vehicle.body_rate_max)
-        self._ground = Persistent(self.settings.ground_time)
-        self._down = Persistent(self.settings.down_time)
 
     def _believe(self, verdict: Verdict, sample: tuple[float, ...], dt: float) -> None:
         m = self.maneuvers
@@ -234,53 +222,6 @@ class FlightController:
             # On the ground there is nothing to continue; in the air the new reference is reached without a jump.
             m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, m.now - order.start))
 
-    def _supervise(self) -> None:
-        m, s = self.maneuvers, self.settings
-        if self._down.update(self._is_down(), m.now):
-            m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
-            return
-        if isinstance(m.source, Recovery):
-            m.source.update(m.belief, m.elapsed)
-            if m.source.finished:
-                m.settle("recovered: hovering")
-            elif m.elapsed > s.recovery.timeout:
-                m.land("landing: the recovery did not come to rest")
-            return
-        if m.state is State.LANDING:
-            return
-        deviation = self._monitor.deviation(m.belief, m.setpoint(), m.now)
-        outside = self._monitor.outside(m.belief[0:3])
-        if deviation:
-            m.recover(deviation)
-        elif outside > s.fence_slack:
-            m.land(f"landing: {outside:.1f} m outside the geofence")
-        elif outside > 0.0 and m.state is State.TRACKING:
-            m.stop(f"hover: {outside:.1f} m outside the geofence")
-        elif self._monitor.exhausted(self.margin, m.now):
-            m.land("landing: the rotors are at their limit")
-        elif m.state is State.TRACKING:
-            self._at_end(m.order, m.elapsed - m.order.source.duration)
-        elif m.elapsed > s.silence_time:
-            m.land(f"landing: no order for {s.silence_time:.0f} s")
-
-    def _at_end(self, order: Order, over: float) -> None:
-        if order.at_end is AtEnd.CONTACT:
-            speed = norm(self.maneuvers.belief[3:6])
-            if over > order.contact_time:
-                self.maneuvers.recover("contact was missed")
-            elif over > 0.0 and speed > self.settings.missed_speed:  # what holds does not fall
-                self.maneuvers.recover(f"contact was missed, falling with {speed:.1f} m/s")
-        elif over >= 0.0:
-            if order.at_end is AtEnd.LAND:
-                self.maneuvers.land(f"landing after trajectory {order.id}")
-            else:
-                self.maneuvers.stop(f"hovering at the end of trajectory {order.id}")
-
-    def _is_down(self) -> bool:
-        """The vehicle rests on something in an attitude in which it cannot hover."""
-        v, w, b3 = self.maneuvers.belief[3:6], self.maneuvers.belief[10:13], axes_of(self.maneuvers.belief[6:10])[2]
-        return b3[2] < 0.5 and norm(v) < 0.15 and norm(w) < 0.5
-
     def _fly(self) -> StepResult:
         m = self.maneuvers
         setpoint = m.setpoint()
@@ -288,22 +229,27 @@ class FlightController:
         contact = inf
         if m.state is State.TRACKING and m.order.at_end is AtEnd.CONTACT:
             contact = max(m.order.source.duration - m.elapsed, 0.0)
-        extra = NO_COMPENSATION
-        if self.compensator is not None:
-            extra = self.compensator.update(m.belief, m.rotors, m.now)
+        extra = self._compensation(contact)
         out = self.law.control(m.belief, m, m.rotors, extra, contact)
         m.rotors = m.rotors.following(out.rotor_speed)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
-        if m.state is State.LANDING and self._ground.update(self._resting(setpoint), m.now):
+        if self.supervisor.landed(setpoint):
             m.motors_off(State.DISARMED, "landed, motors off")
             return self._idle()
         return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event())
 
-    def _resting(self, setpoint: Setpoint) -> bool:
-        """The reference has descended away from under the vehicle: something carries it."""
-        belief = self.maneuvers.belief
-        return abs(belief[5]) < 0.1 and belief[2] - setpoint.p[2] > self.settings.ground_gap
+    def _compensation(self, contact: float) -> tuple[float, ...]:
+        """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
+        m = self.maneuvers
+        if self.compensator is None:
+            return NO_COMPENSATION
+        if m.belief[2] - self._ground_height < _AIRBORNE:
+            self.compensator.reset()
+            return NO_COMPENSATION
+        if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0:
+            return self.compensator.hold()
+        return self.compensator.update(m.belief, m.rotors, m.now)
 
     def _descend(self) -> StepResult:
         m = self.maneuvers

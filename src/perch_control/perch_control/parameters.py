@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from perch_control.flight_settings import FlightSettings
+from perch_control.l1 import L1Settings
+from perch_control.nmpc.settings import NmpcSettings
 from perch_control.settings import GeometricGains
 from perch_core.config import choice, part, quantity, text
 
@@ -15,6 +17,7 @@ class ControllerChoice:
 
     type: str = choice("geometric", options=("geometric", "nmpc"), doc="control law at the start; service set_controller changes it")
     adaptive: bool = quantity(False, doc="L1 augmentation on force and moment")
+    standby: bool = quantity(True, doc="prepare the NMPC in the background, so that set_controller can choose it in flight")
     reference_period: int = quantity(5, low=1, high=500, doc="controller/reference every so many steps")
 
 
@@ -29,6 +32,8 @@ class ControllerParameters:
     controller: ControllerChoice = part(ControllerChoice)
     snapdragon: GeometricGains = part(GeometricGains)
     rpg: GeometricGains = part(GeometricGains)
+    nmpc: NmpcSettings = part(NmpcSettings)
+    l1: L1Settings = part(L1Settings)
     flight: FlightSettings = part(FlightSettings)
 
     def gain_set(self, vehicle_name: str) -> GeometricGains:

@@ -65,6 +65,22 @@ class Following(Protocol):
         """Setpoint `ahead` seconds from now."""
 
 
+class Resting:
+    """Hover at the origin: a reference for warming up."""
+
+    elapsed = 0.0
+    duration = 0.0
+
+    @property
+    def source(self) -> Resting:
+        """Itself."""
+        return self
+
+    def setpoint(self, ahead: float = 0.0) -> Setpoint:
+        """The same at every time."""
+        return Setpoint((0.0, 0.0, 0.0))
+
+
 @dataclass(frozen=True)
 class FlatReference:
     """A polynomial in the flat outputs."""

@@ -98,6 +98,9 @@ class GeometricController:
         gains = self.gains
         return (gains.feedback_max, cone, gains.thrust_floor, self._rate_max, gains.acceleration_max, gains.feedback_rate)
 
+    def begin(self) -> None:
+        """Take over in flight: nothing is remembered from one period to the next."""
+
     def prepare(self, source, contact: bool):
         """The reference to follow for a trajectory: one that ends in contact is rehearsed and offset first."""
         gains = self.gains

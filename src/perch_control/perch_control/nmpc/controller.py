@@ -15,8 +15,9 @@ from perch_control.nmpc.model import DISTURBANCE, INPUTS, LINE, LINES, REFERENCE
 from perch_control.nmpc.qp import QpFailure, solve
 from perch_control.nmpc.reference_rows import PERIOD, ReferenceRows
 from perch_control.nmpc.settings import NmpcSettings
-from perch_control.reference import Following
+from perch_control.reference import Following, Resting
 from perch_control.rotor_lag import RotorEstimate, approached, reachable, thrusts
+from perch_core.errors import ConfigError
 from perch_core.vehicle import Vehicle
 
 _REFERENCE_FLOOR = 0.5   # specific thrust below which the reference's attitude is noise [m/s^2]
@@ -47,27 +48,54 @@ class NmpcController:
         self._H, self._h = np.zeros((INPUTS * N,) * 2), np.zeros(INPUTS * N)
         self._xi, self._G = np.zeros((N + 1, n)), np.zeros((N, N + 1, n, INPUTS))
         self._sums = self._dt * np.kron(np.tril(np.ones((N, N))), np.eye(INPUTS))  # inputs -> thrust states
-        self._rate_max = settings.rate_max or _RATE_RESERVE * vehicle.body_rate_max
-        self._thrust_rate_max = settings.thrust_rate_max or _thrust_rate(vehicle)
         self._warm = False
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
         self.failures = 0
         self._weights()
+        self._warm_up()
 
     @property
     def compiled(self) -> bool:
         """The linearisation runs as machine code."""
         return self._stages.compiled
 
+    def _warm_up(self) -> None:
+        """One step in hover: whatever is compiled on first use is compiled now."""
+        hover = (self.vehicle.speed_min + self.vehicle.speed_max) / 2
+        rest = (0.0,) * 6 + (0.0, 0.0, 0.0, 1.0) + (0.0,) * 3
+        self.control(rest, Resting(), RotorEstimate((hover,) * 4, (hover,) * 4))
+        self._warm, self.failures = False, 0
+
     def _weights(self) -> None:
         s, n = self.settings, self._layout.states
+        self._rate_max = s.rate_max or _RATE_RESERVE * self.vehicle.body_rate_max
+        self._thrust_rate_max = s.thrust_rate_max or _thrust_rate(self.vehicle)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
 
+    def retune(self, settings: NmpcSettings, fallback: GeometricController) -> None:
+        """New weights and limits from the next period on.
+
+        Raises:
+            ConfigError: nodes, horizon, thrust states or the presence of line terms differ: these are compiled in.
+        """
+        old = self.settings
+        for key in ("nodes", "horizon", "thrust_states"):
+            if getattr(settings, key) != getattr(old, key):
+                raise ConfigError("nmpc", key, "is fixed after the start")
+        if settings.lines.any != old.lines.any:
+            raise ConfigError("nmpc", "lines", "line terms cannot be switched on or off after the start")
+        self.settings, self.fallback = settings, fallback
+        self._weights()
+
+    def begin(self) -> None:
+        """Take over in flight: the first iterate is the reference."""
+        self._warm = False
+
     def prepare(self, source: Any, contact: bool) -> Any:
-        """The reference to follow for a trajectory; a contact is rehearsed with the fallback's dynamics."""
+        """The reference to follow for a trajectory: itself; the horizon sees the rotors' limits before they act."""
         return source
 
     def lines(self, lines: tuple[tuple[float, ...], ...]) -> None:

@@ -1,0 +1,125 @@
+"""L1 adaptive augmentation: what acts on the vehicle besides its model is estimated and made up for. [P: ref. 24]
+
+A predictor of velocity and body rates runs beside the vehicle. With piecewise-constant adaptation the disturbance is, at
+each sample, the one that would have caused the prediction error within the last period; a low-pass filter separates the
+fast estimate from what is flown, and so sets the bandwidth (the "L1" filter), whatever the adaptation rate.
+
+All on accelerations: force / mass in W [m/s^2], moment / inertia in B [rad/s^2].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+from perch_control.geometric.controller import packed_vehicle
+from perch_control.geometric.law import GRAVITY
+from perch_control.geometric.step import drag_compensation, wrench_of
+from perch_control.jit import scalar
+from perch_control.rotor_lag import RotorEstimate, thrusts
+from perch_control.vector3 import axes_of, axpy, cross, limited, scale, times
+from perch_core.config import quantity
+from perch_core.vehicle import Vehicle
+
+_ZERO = (0.0,) * 6
+_LONGEST_GAP = 0.01  # a longer time between samples starts the predictor anew [s]
+
+
+@dataclass(frozen=True)
+class L1Settings:
+    """Bandwidths and bounds."""
+
+    predictor: float = quantity(10.0, unit="1/s", above=0.0, high=400.0, doc="decay of the prediction error")
+    force_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0)
+    moment_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=200.0)
+    force_max: float = quantity(6.0, unit="m/s^2", low=0.0, doc="largest acceleration that is made up for")
+    moment_max: float = quantity(60.0, unit="rad/s^2", low=0.0, doc="largest angular acceleration that is made up for")
+
+
+@scalar
+def model_rates(state, f, vehicle):
+    """Accelerations of the model: in W, gravity and drag included, and angular in B; 6 floats. [M:eq1]"""
+    mass, J = vehicle[0][0], vehicle[0][1:4]
+    T, Mx, My, Mz = wrench_of(f, vehicle[2])
+    _, _, b3 = axes_of(state[6:10])
+    w = state[10:13]
+    drag = drag_compensation(state[6:10], state[3:6], vehicle[4], (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    a = axpy(T / mass, b3, (-drag[0], -drag[1], -drag[2] - GRAVITY))
+    gyro = cross(w, times(J, w))
+    return (a[0], a[1], a[2], (Mx - gyro[0]) / J[0], (My - gyro[1]) / J[1], (Mz - gyro[2]) / J[2])
+
+
+@scalar
+def adapted(predicted, measured, filtered, decay, dt, bandwidths, bounds):
+    """One adaptation: disturbance of the last period, and its filtered value, 6 floats each.
+
+    Args:
+        predicted, measured: velocity in W and body rates, 6 floats.
+        filtered: of the last sample, 6 floats.
+        decay: of the prediction error [1/s].
+        dt: time since the last sample [s].
+        bandwidths: of force and moment [rad/s].
+        bounds: of the filtered force and moment [m/s^2, rad/s^2].
+    """
+    # sigma = -Phi^-1 e^(A dt) error, Phi = A^-1 (e^(A dt) - 1), A = -decay.
+    e = exp(-decay * dt)
+    gain = -decay * e / (1.0 - e)
+    raw = (
+        gain * (predicted[0] - measured[0]), gain * (predicted[1] - measured[1]), gain * (predicted[2] - measured[2]),
+        gain * (predicted[3] - measured[3]), gain * (predicted[4] - measured[4]), gain * (predicted[5] - measured[5]),
+    )
+    kf, km = 1.0 - exp(-bandwidths[0] * dt), 1.0 - exp(-bandwidths[1] * dt)
+    force = limited(axpy(kf, raw[0:3], scale(1.0 - kf, filtered[0:3])), bounds[0])
+    moment = limited(axpy(km, raw[3:6], scale(1.0 - km, filtered[3:6])), bounds[1])
+    return raw, (force[0], force[1], force[2], moment[0], moment[1], moment[2])
+
+
+class L1Augmentation:
+    """Owns predictor and filter.
+
+    Attributes:
+        disturbance: filtered estimate, acceleration in W and angular acceleration in B, 6 floats.
+    """
+
+    def __init__(self, vehicle: Vehicle, settings: L1Settings) -> None:
+        self.settings = settings
+        self._vehicle = packed_vehicle(vehicle)
+        self.disturbance: tuple[float, ...] = _ZERO
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the disturbance: the vehicle is on the ground, or has left a surface."""
+        self.disturbance = _ZERO
+        self._last: tuple | None = None
+
+    def hold(self) -> tuple[float, ...]:
+        """Compensation without adaptation, while something else than air acts on the vehicle."""
+        self._last = None
+        return tuple(-x for x in self.disturbance)
+
+    def update(self, state: tuple[float, ...], rotors: RotorEstimate, now: float) -> tuple[float, ...]:
+        """Take a state; returns what makes up for the disturbance, 6 floats (see `geometric_step`).
+
+        Args:
+            state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
+            rotors: rotor speeds now.
+            now: [s].
+        """
+        s = self.settings
+        measured = (*state[3:6], *state[10:13])
+        f = thrusts(rotors.speed, self._vehicle[1][0])
+        if self._last is None or not 0.0 < now - self._last[0] < _LONGEST_GAP:
+            predicted = measured
+        else:
+            time, state0, f0, predicted0, measured0, raw = self._last
+            dt = now - time
+            mean = tuple(0.5 * (a + b) for a, b in zip(f0, f))
+            rates = model_rates(state0, mean, self._vehicle)
+            predicted = tuple(z + dt * (r + d - s.predictor * (z - m))
+                              for z, r, d, m in zip(predicted0, rates, raw, measured0))
+            raw, self.disturbance = adapted(predicted, measured, self.disturbance, s.predictor, dt,
+                                            (s.force_bandwidth, s.moment_bandwidth), (s.force_max, s.moment_max))
+            self._last = (now, state, f, predicted, measured, raw)
+            return tuple(-x for x in self.disturbance)
+        self._last = (now, state, f, predicted, measured, _ZERO)
+        return tuple(-x for x in self.disturbance)

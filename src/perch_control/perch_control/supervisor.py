@@ -1,0 +1,99 @@
+"""The supervisor: what is not as planned leads to a hover, a recovery or a descent, always with the reason said."""
+
+from __future__ import annotations
+
+from perch_control.admission import AtEnd, Order
+from perch_control.maneuvers import Maneuvers
+from perch_control.modes import State
+from perch_control.monitors import Persistent, TrackingMonitor
+from perch_control.recovery import Recovery
+from perch_control.reference import Setpoint
+from perch_control.vector3 import axes_of, norm
+
+_COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
+
+
+class Supervisor:
+    """Watches a flight and acts on it through its manoeuvres. Owns the monitors, which start anew with each state."""
+
+    def __init__(self, maneuvers: Maneuvers) -> None:
+        self._maneuvers = maneuvers
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what has been seen so far: the state or the settings have changed."""
+        m = self._maneuvers
+        self._state, settings = m.state, m.settings
+        self._monitor = TrackingMonitor(settings, m.vehicle.body_rate_max)
+        self._ground = Persistent(settings.ground_time)
+        self._down = Persistent(settings.down_time)
+
+    def estimator(self, state: int, vio_age: float, message: str) -> None:
+        """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
+        m, s = self._maneuvers, self._maneuvers.settings
+        if state == _DIVERGED:
+            m.descend(f"the estimator has diverged: {message}")
+        elif state == _COASTING and vio_age > s.coasting_land_time:
+            m.descend(f"no VIO for {vio_age:.1f} s")
+        elif state == _COASTING and vio_age > s.coasting_time and m.state is State.TRACKING:
+            m.stop(f"hover: no VIO for {vio_age:.1f} s")
+
+    def act(self, margin: float) -> None:
+        """Watch one step of a flight.
+
+        Args:
+            margin: thrust margin of the last command.
+        """
+        m, s = self._maneuvers, self._maneuvers.settings
+        if m.state is not self._state:
+            self.restart()
+        if self._down.update(self._is_down(), m.now):
+            m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
+            return
+        if isinstance(m.source, Recovery):
+            m.source.update(m.belief, m.elapsed)
+            if m.source.finished:
+                m.settle("recovered: hovering")
+            elif m.elapsed > s.recovery.timeout:
+                m.land("landing: the recovery did not come to rest")
+            return
+        if m.state is State.LANDING:
+            return
+        deviation = self._monitor.deviation(m.belief, m.setpoint(), m.now)
+        outside = self._monitor.outside(m.belief[0:3])
+        if deviation:
+            m.recover(deviation)
+        elif outside > s.fence_slack:
+            m.land(f"landing: {outside:.1f} m outside the geofence")
+        elif outside > 0.0 and m.state is State.TRACKING:
+            m.stop(f"hover: {outside:.1f} m outside the geofence")
+        elif self._monitor.exhausted(margin, m.now):
+            m.land("landing: the rotors are at their limit")
+        elif m.state is State.TRACKING:
+            self._at_end(m.order, m.elapsed - m.order.source.duration)
+        elif m.elapsed > s.silence_time:
+            m.land(f"landing: no order for {s.silence_time:.0f} s")
+
+    def _at_end(self, order: Order, over: float) -> None:
+        if order.at_end is AtEnd.CONTACT:
+            speed = norm(self._maneuvers.belief[3:6])
+            if over > order.contact_time:
+                self._maneuvers.recover("contact was missed")
+            elif over > 0.0 and speed > self._maneuvers.settings.missed_speed:  # what holds does not fall
+                self._maneuvers.recover(f"contact was missed, falling with {speed:.1f} m/s")
+        elif over >= 0.0:
+            if order.at_end is AtEnd.LAND:
+                self._maneuvers.land(f"landing after trajectory {order.id}")
+            else:
+                self._maneuvers.stop(f"hovering at the end of trajectory {order.id}")
+
+    def _is_down(self) -> bool:
+        """The vehicle rests on something in an attitude in which it cannot hover."""
+        v, w, b3 = self._maneuvers.belief[3:6], self._maneuvers.belief[10:13], axes_of(self._maneuvers.belief[6:10])[2]
+        return b3[2] < 0.5 and norm(v) < 0.15 and norm(w) < 0.5
+
+    def landed(self, setpoint: Setpoint) -> bool:
+        """The reference has descended away from under the vehicle for a while: the ground carries it."""
+        m = self._maneuvers
+        resting = abs(m.belief[5]) < 0.1 and m.belief[2] - setpoint.p[2] > m.settings.ground_gap
+        return m.state is State.LANDING and self._ground.update(resting, m.now)
