@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from perch_control.admission import AtEnd, Order
 from perch_control.flight import FlightController
 from perch_control.geometric import GeometricController
+from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, StepResult
+from perch_control.nmpc import NmpcController
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference
 from perch_core.errors import PerchError
@@ -43,15 +45,13 @@ class Piloting:
     """Owns the flight controller."""
 
     def __init__(self, params: ControllerParameters, vehicle: Vehicle) -> None:
-        """
-        Raises:
-            PerchError: a control law that this engine does not fly.
-        """
-        if params.controller.type != "geometric" or params.controller.adaptive:
-            raise PerchError(f"controller {params.controller.type!r}{' with L1' if params.controller.adaptive else ''}: "
-                             "the in-process engine flies 'geometric' without L1; use --engine stack")
         gains = params.gain_set(vehicle.name)
-        self._flight = FlightController(vehicle, GeometricController(vehicle, gains), gains, params.flight)
+        geometric = GeometricController(vehicle, gains)
+        self._flight = FlightController(vehicle, geometric, gains, params.flight)
+        if params.controller.adaptive:
+            self._flight.compensator = L1Augmentation(vehicle, params.l1)
+        if params.controller.type == "nmpc":
+            self._flight.use(NmpcController(vehicle, params.nmpc, geometric), gains, params.flight)
 
     def command(self, command: Command, reason: str) -> None:
         """A command that counts from this step on."""
@@ -75,7 +75,7 @@ class Piloting:
 
     def hear(self, estimator: Status) -> None:
         """The estimator's health, at every 50th step."""
-        self._flight.estimator(estimator.health.value, float(estimator.vio_age), estimator.message)
+        self._flight.supervisor.estimator(estimator.health.value, float(estimator.vio_age), estimator.message)
 
     @property
     def status(self) -> PilotStatus:
