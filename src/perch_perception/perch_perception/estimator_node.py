@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
+from perch_core import so3
 from perch_core.ros import qos
 from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_vector
 from perch_core.ros.lockstep import Participant
@@ -44,8 +45,12 @@ class EstimatorNode(PerchNode[UkfConfig]):
         begin = time.perf_counter()
         p, q, v, _ = odometry_arrays(msg)
         covariance = np.array(msg.pose.covariance).reshape(6, 6)
+        velocity_covariance = None
+        if msg.twist.covariance[0] > 0:  # in B; all zero: not given
+            R_WB = so3.quat_to_matrix(q)
+            velocity_covariance = R_WB @ np.array(msg.twist.covariance).reshape(6, 6)[:3, :3] @ R_WB.T
         v = v if msg.twist.covariance[0] >= 0 else None  # -1: no velocity in this message
-        self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v))
+        self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance))
         self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs.append(time.perf_counter() - begin)
 

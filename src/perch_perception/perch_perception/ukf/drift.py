@@ -16,9 +16,11 @@ import dataclasses
 import math
 
 import numpy as np
+from perch_core import so3
 
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import VioNoise
+from perch_perception.ukf.measurement import VioPose
 from perch_perception.ukf.unscented import Belief
 
 
@@ -56,6 +58,30 @@ def advance(belief: Belief, noise: VioNoise, W: np.ndarray, dt: float) -> Belief
     P[:, at.D_DRIFT] *= phi
     P[at.D_DRIFT, at.D_DRIFT] += W
     return dataclasses.replace(belief, x=x, P=P)
+
+
+def no_better_than(belief: Belief, pose: VioPose) -> Belief:
+    """Belief whose pose and velocity are not surer than VIO's.
+
+    VIO has used the very IMU samples that this filter integrates, and the images besides. Whatever this filter makes of
+    VIO's poses and of the same samples cannot beat it, so its covariance must not. Where it is smaller in some
+    direction, the difference is added: P + max(0, C - P), with the maximum over eigenvalues in units of VIO's sigmas.
+    """
+    P = belief.P.copy()
+    rows = np.r_[0:3, 6:9]
+    J = np.zeros((6, 6))
+    J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(belief.x[at.QUATERNION]).T
+    P[np.ix_(rows, rows)] += _missing(J @ pose.covariance @ J.T, P[np.ix_(rows, rows)])
+    if pose.velocity_covariance is not None:
+        P[at.D_VELOCITY, at.D_VELOCITY] += _missing(pose.velocity_covariance, P[at.D_VELOCITY, at.D_VELOCITY])
+    return dataclasses.replace(belief, P=P)
+
+
+def _missing(C: np.ndarray, P: np.ndarray) -> np.ndarray:
+    """Positive part of C - P, in units of C's own sigmas."""
+    scale = np.sqrt(np.maximum(np.diag(C), 1e-12))
+    values, vectors = np.linalg.eigh((C - P) / np.outer(scale, scale))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
 
 
 def white(noise: VioNoise) -> np.ndarray:

@@ -153,7 +153,7 @@ class Estimator:
                 return VioOutcome.GATED
             prior = self._doubt(prior, innovation)
             innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
-        self._settle(self._transform.correct(prior, innovation), pose)
+        self._settle(drift.no_better_than(self._transform.correct(prior, innovation), pose), pose)
         return outcome
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:

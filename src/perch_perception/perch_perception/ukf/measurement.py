@@ -49,6 +49,7 @@ class VioPose:
         q_WB: attitude xyzw, shape (4,).
         covariance: of (position [m], rotation about W's axes [rad]), shape (6, 6).
         v_WB: velocity in W [m/s], shape (3,), or None.
+        velocity_covariance: of v_WB, in W, shape (3, 3), or None.
     """
 
     stamp: int
@@ -56,10 +57,11 @@ class VioPose:
     q_WB: np.ndarray
     covariance: np.ndarray
     v_WB: np.ndarray | None = None
+    velocity_covariance: np.ndarray | None = None
 
     def problem(self) -> VioOutcome | None:
         """Why the pose cannot be used, or None."""
-        numbers = [self.p_WB, self.q_WB, self.covariance] + ([] if self.v_WB is None else [self.v_WB])
+        numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_WB, self.velocity_covariance) if n is not None]
         if not all(np.all(np.isfinite(n)) for n in numbers) or abs(np.linalg.norm(self.q_WB) - 1) > 1e-3:
             return VioOutcome.NOT_FINITE
         scale = np.abs(self.covariance).max()

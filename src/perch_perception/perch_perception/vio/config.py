@@ -36,6 +36,7 @@ class FilterConfig:
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
     landmarks_per_frame: int = quantity(5, low=1, high=50, doc="most new landmarks per frame")
     pixel_noise: float = quantity(2.0, unit="px", above=0.0, doc="1 sigma of a track; its error is not white, see docs/estimation.md")
+    zoom_noise: float = quantity(4.0, low=0.0, high=20.0, doc="growth of the noise with the logarithm of a patch's change of size")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
     tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
     least_parallax_deg: float = quantity(2.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
@@ -64,6 +65,7 @@ class StartConfig:
     rest_accel: float = quantity(0.25, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
     rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
     rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
+    unnoticed_velocity: float = quantity(0.02, unit="m/s", low=0.0, doc="1 sigma of a take-off that is not yet noticed")
     rest_velocity: float = quantity(0.005, unit="m/s", above=0.0, doc="1 sigma of zero velocity on the ground")
 
 

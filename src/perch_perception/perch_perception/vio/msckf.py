@@ -145,9 +145,11 @@ class Msckf:
         H[:, :, :14] = self._pose_and_calibration(first)
         for i in range(m):
             H[i, :, 14 + 3 * i : 17 + 3 * i] = first.by_point[i]
+        trust = self._trust(now.distance / np.array([k.distance for k in s.landmarks.values()]))
+        H, r = H * trust[:, None, None], now.r * trust[:, None]
         P = s.P[np.ix_(columns, columns)]
         S = np.einsum("kia,kja->kij", H @ P, H) + self.sigma**2 * np.eye(2)
-        distance = np.einsum("ki,ki->k", now.r, np.linalg.solve(S, now.r[:, :, None])[:, :, 0])
+        distance = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
         good = (distance < self._gate.limit(2)) & (now.cosine > 0.5)
         bad = set()
         for ok, (i, landmark) in zip(good, s.landmarks.items()):
@@ -157,7 +159,7 @@ class Msckf:
         report.landmarks_used, report.refused = int(good.sum()), report.refused + int((~good).sum())
         if good.any():
             report.nis, report.nis_dimension = float(distance[good].sum()), 2 * int(good.sum())
-            self.apply(columns, H[good].reshape(-1, len(columns)), now.r[good].ravel(), self.sigma**2)
+            self.apply(columns, H[good].reshape(-1, len(columns)), r[good].ravel(), self.sigma**2)
         self._used |= bad
         s.drop_landmarks(bad)
 
@@ -208,7 +210,7 @@ class Msckf:
             cross = -inverse @ H_1 @ s.P[columns]
             own = inverse @ (H_1 @ P @ H_1.T + self.sigma**2 * np.eye(3)) @ inverse.T
             s.P = np.block([[s.P, cross.T], [cross, own]])
-            s.landmarks[i] = Landmark(X + inverse @ r_1, X)
+            s.landmarks[i] = Landmark(X + inverse @ r_1, X, float(np.linalg.norm(X - s.p_WB)))
             self.apply(columns, H_0, r_0, self.sigma**2)
             report.landmarks_new += 1
 
@@ -272,7 +274,9 @@ class Msckf:
             H[:, :, :8] = J[rows, :, :8]
             for k, j in enumerate(js):
                 H[k, :, 8 + 6 * j : 14 + 6 * j] = J[begin + k, :, 8:]
-            out.append((X_W, H.reshape(2 * m, -1), first.by_point[rows].reshape(-1, 3), now.r[rows].ravel(), columns))
+            trust = float(self._trust(now.distance[rows].max() / now.distance[rows].min()))
+            out.append((X_W, trust * H.reshape(2 * m, -1), trust * first.by_point[rows].reshape(-1, 3),
+                        trust * now.r[rows].ravel(), columns))
             begin += m
         return out
 
@@ -288,6 +292,14 @@ class Msckf:
         order = np.argsort(ends, kind="stable")
         ids = list(tracks)
         return {ids[k]: tracks[ids[k]] for k in order if ends[k] < enough}
+
+    def _trust(self, zoom: np.ndarray) -> np.ndarray:
+        """Weight of observations whose patch has changed its size by a factor since it was chosen.
+
+        KLT fits a shift. What a patch grows or shrinks pulls the shift to one side, and that adds up over a track:
+        sigma = sigma_0 sqrt(1 + (zoom_noise ln zoom)^2).
+        """
+        return 1.0 / np.sqrt(1.0 + (self.config.filter.zoom_noise * np.log(zoom)) ** 2)
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)

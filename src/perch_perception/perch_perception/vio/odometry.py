@@ -178,7 +178,11 @@ class VisualInertialOdometry:
             rest.hold(self.filter, self.config.start)
         self._informed = exposed
         result = self._result(FrameOutcome.RESTING, features, FrameReport())
-        return replace(result, blind_for=0.0, estimate=replace(result.estimate, stamp=exposed, w_WB_B=np.zeros(3)))
+        # what is said of now, not of `until`: a take-off may just have begun
+        doubt = self.config.start.unnoticed_velocity**2 * np.eye(3)
+        return replace(result, blind_for=0.0, estimate=replace(
+            result.estimate, stamp=exposed, w_WB_B=np.zeros(3),
+            velocity_covariance=result.estimate.velocity_covariance + doubt))
 
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
         """Whether the filter still sees, or has to start again."""
