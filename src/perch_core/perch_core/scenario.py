@@ -149,7 +149,7 @@ class Scenario:
     mission: Mission = part(Mission)
     time_limit: float = quantity(40.0, unit="s", above=0.0, high=600.0, doc="simulated time after which the flight has failed")
     nodes: tuple[str, ...] = quantity(
-        ("vehicle", "vio_model", "estimator", "target_localizer", "perching_planner", "controller", "mission"))
+        ("vehicle", "vio", "estimator", "target_localizer", "perching_planner", "controller", "mission"))
     parameters: dict[str, dict[str, Any]] = text(None, doc="node -> parameter -> value, over the node's own file")
 
     def __post_init__(self) -> None:
