@@ -13,9 +13,10 @@ EXAMPLES = """examples:
   python3 scripts/plan.py surface_90                       config/problems/surface_90.yaml, results in out/plan
   python3 scripts/plan.py my_problem.yaml --out results    a file of your own
   python3 scripts/plan.py surface_90 --set objective=jerk --set thrust_max=4.5
+  python3 scripts/plan.py powerline_line_180 --animation   a powerline perch with its recovery, as a film too
   python3 scripts/plan.py --list                           the problems there are
 
-files: plan.csv (every 2 ms), plan.json (Bernstein coefficients, certificates), plan.png
+files: plan.csv, plan.json (coefficients or figures, certificates), plan.png; powerline: visibility.png, plan.gif
 exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file"""
 
 
@@ -38,12 +39,19 @@ def _plan_perch(mapping: dict, source: str, out: Path) -> int:
 
 
 def _plan_powerline(mapping: dict, source: str, out: Path) -> int:
-    from perch_planner.powerline.problem_file import run
+    from perch_planner.powerline.problem import run
 
     return run(mapping, source, out)
 
 
+def _animate_powerline(mapping: dict, source: str, out: Path) -> int:
+    from perch_planner.powerline.problem import run
+
+    return run(mapping, source, out, animation=True)
+
+
 KINDS = {"perch": _plan_perch, "powerline": _plan_powerline}
+ANIMATED = {"powerline": _animate_powerline}
 
 
 def _apply(mapping: dict, changes: list[str]) -> None:
@@ -65,6 +73,7 @@ def main() -> int:
     parser.add_argument("problem", nargs="?", help="name in config/problems, or a YAML file")
     parser.add_argument("--out", type=Path, default=Path("out/plan"), help="folder for the results (default: %(default)s)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner")
+    parser.add_argument("--animation", action="store_true", help="powerline: also write plan.gif")
     parser.add_argument("--list", action="store_true", help="name the problems in config/problems")
     arguments = parser.parse_args()
     if not arguments.list and arguments.problem is None:
@@ -84,7 +93,10 @@ def main() -> int:
             kind = mapping.get("kind") if isinstance(mapping, dict) else mapping
             raise ConfigError(str(path), "kind", f"{kind!r} is not one of {', '.join(KINDS)}")
         _apply(mapping, arguments.set)
-        return KINDS[mapping["kind"]](mapping, str(path), arguments.out)
+        if arguments.animation and mapping["kind"] not in ANIMATED:
+            raise ConfigError("--animation", mapping["kind"], f"only for {', '.join(ANIMATED)}")
+        kinds = ANIMATED if arguments.animation else KINDS
+        return kinds[mapping["kind"]](mapping, str(path), arguments.out)
     except PlanningRefusal as refusal:
         print(f"refused ({refusal.code}): {refusal}", file=sys.stderr)
         return 2 if refusal.code == "bad_input" else 1

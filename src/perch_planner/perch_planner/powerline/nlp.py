@@ -81,6 +81,7 @@ class Solution:
         cost: value of [P:eq14a].
         iterations: of the interior-point method.
         time: wall-clock time of the solve [s].
+        cpu_time: time of this process' threads in the solve [s].
     """
 
     states: np.ndarray
@@ -90,6 +91,7 @@ class Solution:
     cost: float
     iterations: int
     time: float
+    cpu_time: float
 
     @property
     def duration(self) -> float:
@@ -190,12 +192,12 @@ class Problem:
         low, high = self._bounds(numbers)
         least = np.zeros(len(self._equality))
         least[self._clearances] = numbers.clearance
-        begin = time.perf_counter()
+        begin, cpu = time.perf_counter(), time.process_time()
         answer = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
                               lbg=least, ubg=np.where(self._equality, 0.0, _FREE))
-        elapsed = time.perf_counter() - begin
+        elapsed, cpu = time.perf_counter() - begin, time.process_time() - cpu
         statistics = self._solver.stats()
         found = np.concatenate([np.array(answer["x"]).ravel(), np.zeros(INPUTS)]).reshape(N + 1, STRIDE)
         return Solution(found[:, :STAGE_STATES], found[:-1, STAGE_STATES:], bool(statistics["success"]),
                         str(statistics.get("return_status", statistics.get("unified_return_status", ""))),
-                        float(answer["f"]), int(statistics["iter_count"]), elapsed)
+                        float(answer["f"]), int(statistics["iter_count"]), elapsed, cpu)

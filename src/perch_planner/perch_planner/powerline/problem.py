@@ -122,6 +122,32 @@ def load(name_or_path: str | Path) -> PowerlineProblem:
     return config.load(PowerlineProblem, config.find("problems", name_or_path))
 
 
+def run(mapping: dict[str, Any], source: str, out: Path, animation: bool = False) -> int:
+    """Plan the content of a problem file, write its report and print what came out, for `scripts/plan.py`.
+
+    Returns:
+        Exit code 0.
+
+    Raises:
+        ConfigError: a value that is refused.
+        PlanningRefusal: bad request, or no trajectory within the limits.
+    """
+    planned = plan(config.from_mapping(PowerlineProblem, mapping, source))
+    written = report(planned, out, animation)
+    for name in ("perch", "recovery"):
+        part = getattr(planned.plan, name)
+        if part is not None:
+            print(f"{name} of {part.duration:.3f} s; {part.solver}, {part.iterations} iterations in {1e3 * part.solve_time:.0f} ms")
+    for bound in planned.plan.bounds:
+        print(f"  {bound}")
+    seen = written.get("visibility")
+    if seen is not None:
+        print(f"line in front {100 * seen['cheirality_share']:.0f} %, its segment at the centre {100 * seen['segment_share']:.0f} %, "
+              f"in the image {100 * seen['seen_share']:.0f} % of the perch; mean |reprojection| {seen['mean_reprojection_px']:.0f} px")
+    print("written: " + ", ".join(written["files"]))
+    return 0
+
+
 def plan(problem: PowerlineProblem, **changes: Any) -> PlannedProblem:
     """Plan a problem in this process.
 

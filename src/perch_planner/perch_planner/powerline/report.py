@@ -34,7 +34,8 @@ def summary(planned: PlannedProblem) -> dict[str, Any]:
     for name in ("perch", "recovery"):
         part = getattr(planned.plan, name)
         if part is not None:
-            parts[name] = {"duration_s": part.duration, "solve_time_s": part.solve_time, "iterations": part.iterations,
+            parts[name] = {"duration_s": part.duration, "solve_time_s": part.solve_time, "cpu_time_s": part.cpu_time,
+                           "iterations": part.iterations,
                            "solver": part.solver, "intervals": part.intervals, "cost": part.cost,
                            "peak_rotor_thrust_N": float(part.states[:, 13:17].max()), "least_height_m": float(part.states[:, 2].min())}
     certificates = [{"quantity": b.quantity, "unit": b.unit, "minimum": b.minimum, "maximum": b.maximum,
@@ -53,7 +54,7 @@ def _finite(value: float) -> float | None:
 
 
 def write_report(planned: PlannedProblem, folder: Path, animation: bool = False) -> dict[str, Any]:
-    """Write `<name>.csv`, `<name>.json`, `<name>.png`, `<name>_visibility.png` and, if wanted, `<name>.gif`.
+    """Write `plan.csv`, `plan.json`, `plan.png`, with a perch `visibility.png`, and if wanted `plan.gif`.
 
     Returns:
         The content of the JSON file, with the files' names under "files".
@@ -61,14 +62,15 @@ def write_report(planned: PlannedProblem, folder: Path, animation: bool = False)
     from perch_planner.powerline import picture
 
     folder.mkdir(parents=True, exist_ok=True)
-    name = planned.problem.name
-    paths = {"csv": folder / f"{name}.csv", "picture": folder / f"{name}.png", "visibility": folder / f"{name}_visibility.png"}
-    write_csv(planned, paths["csv"])
-    picture.draw_manoeuvre(planned, paths["picture"])
-    picture.draw_visibility(planned, paths["visibility"])
+    paths = [folder / "plan.csv", folder / "plan.json", folder / "plan.png"]
+    write_csv(planned, paths[0])
+    picture.draw_manoeuvre(planned, paths[2])
+    if planned.plan.perch is not None:
+        paths.append(folder / "visibility.png")
+        picture.draw_visibility(planned, paths[-1])
     if animation:
-        paths["animation"] = folder / f"{name}.gif"
-        picture.draw_animation(planned, paths["animation"])
+        paths.append(folder / "plan.gif")
+        picture.draw_animation(planned, paths[-1])
     out = summary(planned)
-    (folder / f"{name}.json").write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
-    return {**out, "files": [str(path) for path in (*paths.values(), folder / f"{name}.json")]}
+    paths[1].write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
+    return {**out, "files": [str(path) for path in paths]}

@@ -38,11 +38,11 @@ class RecoveryWeights(PerchWeights):
 class PerceptionWeights:
     """Weights of [P:eq9, P:eq14h, P:eq14i] and their exponential decay along the horizon."""
 
-    reprojection: float = quantity(100.0, low=0.0, doc="line from the image centre, in focal lengths")
+    reprojection: float = quantity(50.0, low=0.0, doc="line from the image centre, in focal lengths")
     cheirality: float = quantity(100.0, low=0.0, doc="soft constraint: the line is in front")
     visibility: float = quantity(100.0, low=0.0, doc="soft constraint: the segment is at the centre")
     reprojection_decay: float = quantity(0.1, low=0.0, doc="per thirtieth of the horizon")
-    soft_decay: float = quantity(10.0, low=0.0, doc="per thirtieth of the horizon, from soft_until on")
+    soft_decay: float = quantity(0.3, low=0.0, doc="per thirtieth of the horizon, from soft_until on")
     soft_until: float = quantity(0.667, low=0.0, high=1.0, doc="share of the horizon with full soft constraints")
 
 

@@ -68,19 +68,20 @@ class Solver:
                 is right but for the integrator's error.
 
         Returns:
-            The last phase's solution, with iterations and time of all; where the first phase diverges, its own.
+            The last phase's solution, with iterations and times of all; where the first phase diverges, its own.
         """
-        iterations, time = 0, 0.0
+        iterations, time, cpu_time = 0, 0.0, 0.0
         if start_phase == "first":
             first = self.problem(structure, "first").solve(numbers)
-            iterations, time = first.iterations, first.time
+            iterations, time, cpu_time = first.iterations, first.time, first.cpu_time
             if not np.all(np.isfinite(first.states)):
                 return first
             numbers = replace(numbers, states=first.states, inputs=first.inputs)
         last = self.problem(structure, "polish" if start_phase == "polish" else "second")
         defects = last.defects_of(numbers.states, numbers.inputs) if self.correct_drift else numbers.defects
         found = last.solve(replace(numbers, end_weights=pinned_end, defects=defects))
-        return replace(found, iterations=iterations + found.iterations, time=time + found.time)
+        return replace(found, iterations=iterations + found.iterations, time=time + found.time,
+                       cpu_time=cpu_time + found.cpu_time)
 
 
 def run_weights(weights: PerchWeights, ramp: float, thrust_rate_max: float, intervals: int) -> np.ndarray:

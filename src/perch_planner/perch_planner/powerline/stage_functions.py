@@ -22,6 +22,7 @@ from perch_core.so3 import quat_from_matrix
 STAGE_STATES = STATES + 1  # the duration T rides along as a constant state
 SUB_STEPS = 2  # one RK4 step per T/30 drifts up to 22 mm when re-integrated; two stay below 0.7 mm
 LINE_SIZE = 8  # centre (3), direction (3), radius, half length
+SEGMENT_AIM = 0.5  # share of the segment's half length within which the soft constraint wants the centred point
 RUN_WEIGHTS, SEE_WEIGHTS, END_WEIGHTS, REFERENCE = 3, 3, 6, 12
 
 
@@ -83,14 +84,14 @@ def _see(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
     [P:eq13] is a quotient with a pole where the camera looks along the line, and its arctan (the authors' remedy) has
     no slope there, so that a solver started so never turns. With s the place of the centred point along the line, in
     half lengths, the constraint says s^2 < 1; the angle of (d3D_z, d3D_z s) says the same, falls linearly as the
-    camera turns, and needs no quotient.
+    camera turns, and needs no quotient. As it is soft, it aims at less than s^2 < 1, see SEGMENT_AIM.
     """
     o_C, l_C = lines.line_in_camera(x[P], x[Q], line[0:3], line[3:6], model.p_BC, model.q_BC)
     n_I, l_I = lines.image_line(o_C, l_C)
     p2D, d3D = lines.centre_points(n_I, l_I)
     in_front = lines.cheirality(n_I, l_I)
     along = (dot(p2D, l_I) - in_front * dot(o_C, l_I)) / line[7]  # = d3D_z s, for |l_C| = 1
-    beside = ca.fabs(ca.atan2(along, in_front)) - np.pi / 4
+    beside = ca.fabs(ca.atan2(along, SEGMENT_AIM * in_front)) - np.pi / 4
     error = lines.reprojection_error(n_I)
     return (weights[0] * error * error + weights[1] * _hinge_squared(in_front)
             + weights[2] * _hinge_squared(-beside))

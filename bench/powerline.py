@@ -1,0 +1,109 @@
+"""Bars of the powerline planner: solve times, share of random starts solved, limits between the nodes, published durations.
+
+    python3 scripts/bench.py powerline            1,000 random starts, some five minutes
+    python3 scripts/bench.py powerline --quick    50 random starts
+
+Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+
+import numpy as np
+from harness import Figure, figure
+
+from perch_core.errors import PlanningRefusal
+from perch_core.vehicle import load_vehicle
+from perch_planner.powerline import compiled, problem
+from perch_planner.powerline.planner import PowerlinePlanner
+from perch_planner.powerline.solving import Solver
+from perch_planner.powerline.starts import random_start
+from perch_planner.powerline.visibility import visibility
+
+SOLVE_BARS = {"line_20": 60.0, "line_80": 60.0, "line_20_pa": 100.0, "line_80_pa": 100.0, "line_180": 110.0}  # [ms]
+PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # [s]
+END_BARS = {"end_position": 1e-3, "end_tilt": 0.1, "end_speed": 0.02}
+
+
+def figures(quick: bool) -> list[Figure]:
+    """Measure everything; `quick` takes 10 starts a case instead of 200."""
+    vehicle = load_vehicle("rpg")
+    out = [figure("compilation", "s", [_compile_time()], bar=30.0, comparison="max <=")]
+    planner = PowerlinePlanner(vehicle)
+    planner.warm_up()
+    solved, asked, refusals, violated, every, wall = 0, 0, [], 0, [], []
+    ends: dict[str, list[float]] = {name: [] for name in END_BARS}
+    for case, bar in SOLVE_BARS.items():
+        setup = problem.load(f"powerline_{case}")
+        nominal, rng = setup.request(vehicle), np.random.default_rng(2026)
+        perch, recovery, iterations = [], [], []
+        for _ in range(10 if quick else 200):
+            asked += 1
+            try:
+                plan = planner.plan(random_start(nominal, setup, vehicle, rng))
+            except PlanningRefusal as refusal:
+                refusals.append(f"{case}: {refusal}")
+                continue
+            solved += 1
+            violated += sum(not bound.holds for bound in plan.bounds)
+            for bound in plan.perch.bounds:
+                if bound.quantity in ends:
+                    ends[bound.quantity].append(bound.maximum)
+            perch.append(1e3 * plan.perch.cpu_time)
+            recovery.append(1e3 * plan.recovery.cpu_time)
+            wall.append(1e3 * plan.perch.solve_time)
+            iterations.append(plan.perch.iterations)
+        every += perch
+        out += [figure(f"{case} perch solve", "ms", perch, bar=bar), figure(f"{case} recovery solve", "ms", recovery, bar=70.0),
+                figure(f"{case} perch iterations", "-", iterations)]
+    out += [figure("every perch solve", "ms", every, bar=250.0, comparison="p99 <="),
+            figure("every perch solve, wall clock", "ms", wall),
+            figure("random starts solved", "%", [100.0 * solved / asked], bar=99.5, comparison="min >="),
+            figure("limits violated at 1 ms", "-", [violated], bar=0, comparison="max ==")]
+    out += [figure(name, {"end_tilt": "deg", "end_speed": "m/s"}.get(name, "m"), values, bar=END_BARS[name], comparison="max <=")
+            for name, values in ends.items()]
+    for refusal in refusals:
+        print(f"refused: {refusal}")
+    return out + _published() + _perception()
+
+
+def _compile_time() -> float:
+    """Processor time to the first ready solver on a machine that has compiled nothing yet [s]; 0 without a compiler."""
+    if compiled.compiler() is None:
+        return 0.0
+    before = os.environ.get("PERCH_CACHE")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["PERCH_CACHE"] = folder
+        begin = os.times()
+        Solver(load_vehicle("rpg"))
+        end = os.times()
+    os.environ.pop("PERCH_CACHE")
+    if before is not None:
+        os.environ["PERCH_CACHE"] = before
+    return sum(end[:4]) - sum(begin[:4])
+
+
+def _published() -> list[Figure]:
+    out = []
+    for name, duration in PUBLISHED.items():
+        planned = problem.plan(problem.load(f"powerline_{name}"))
+        out.append(figure(f"{name}: |T - {duration}|", "s", [abs(planned.plan.perch.duration - duration)], bar=1e-3, comparison="max <="))
+    return out
+
+
+def _perception() -> list[Figure]:
+    """Visibility with and without perception awareness, from the same starts."""
+    out = []
+    for case in ("deg90_perception", "line_80_pa", "line_20_pa"):
+        for perception in (True, False):
+            planned = problem.plan(problem.load(f"powerline_{case}"), perception=perception, with_recovery=False)
+            seen = visibility(planned.plan.perch.states, planned.request.target(), planned.vehicle.mounts["front"]).summary()
+            name = f"{case} {'with' if perception else 'without'}"
+            bar = {"bar": 0.99, "comparison": "min >="} if perception and case == "deg90_perception" else {}
+            out += [figure(f"{name}: cheirality", "-", [seen["cheirality_share"]], **bar),
+                    figure(f"{name}: segment visible", "-", [seen["segment_share"]]),
+                    figure(f"{name}: line in image", "-", [seen["seen_share"]]),
+                    figure(f"{name}: |reprojection|", "px", [seen["mean_reprojection_px"]])]
+    return out
