@@ -287,3 +287,28 @@ def clearances(x: np.ndarray, body: Body, surfaces: Surfaces, time: float, out: 
             out[s, part] = min(out[s, part], _depth(s, point, surfaces, time))
         least = min(least, out[s, 0], out[s, 1])
     return least
+
+
+@compiled
+def advance_to_touch(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.ndarray, body: Body,
+                     surfaces: Surfaces, hold: Hold, time: float, step: float, path: np.ndarray, inertial: np.ndarray,
+                     distances: np.ndarray) -> int:
+    """Steps of `advance` until something is touched: one call per control period in free flight.
+
+    Args:
+        path: receives the state after each step (n, 13); n is the most steps that are made.
+        inertial: gains what `advance` gives in each step, (6,).
+        distances: as in `clearances`, after the last step.
+
+    Returns:
+        Steps made.
+    """
+    sample = np.empty(6)
+    for k in range(path.shape[0]):
+        advance(x, speeds, command, wind, body, surfaces, hold, time + k * step, step, sample)
+        for i in range(6):
+            inertial[i] += sample[i]
+        path[k] = x
+        if clearances(x, body, surfaces, time + (k + 1) * step, distances) <= 0.0:
+            return k + 1
+    return path.shape[0]

@@ -14,7 +14,7 @@ from perch_sim.body import PLATE_POINTS, Body, make_body
 from perch_sim.cable_contact import CableMonitor
 from perch_sim.contact import ContactMonitor
 from perch_sim.contact_event import ContactEvent
-from perch_sim.dynamics import GRAVITY, STATES, Hold, advance, clearances
+from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch
 from perch_sim.obstacles import make_obstacles
 from perch_sim.state_history import TrueState
 from perch_sim.wind import WindField
@@ -99,18 +99,19 @@ class Plant:
             target: rotor speeds that the motors aim at (4,) [rad/s].
         """
         wind = self._wind.next()
-        total, sample = np.zeros(6), np.zeros(6)
-        states, contacts = [], []
-        for k in range(1, SUBSTEPS + 1):
-            before = self._x.copy()
-            aim = np.zeros(4) if self.crashed else target
-            advance(self._x, self.rotor_speed, aim, wind, self.body, self.obstacles.surfaces, self.hold,
-                    (self.time - self._start) * 1e-9 + (k - 1) * STEP, STEP, sample)
-            total += sample
-            time = self.time + k * PERIOD // SUBSTEPS
-            x = self._x.copy()
-            states.append(TrueState(time, x[:3], x[3:7], x[7:10], x[10:13]))
-            contacts += self._touches(time, before)
+        path, total, done, contacts = np.empty((SUBSTEPS, STATES)), np.zeros(6), 0, []
+        while done < SUBSTEPS:
+            last = SUBSTEPS if self.contact.free else done + 1
+            before = path[done - 1] if done else self._x.copy()
+            begin = (self.time - self._start) * 1e-9 + done * STEP
+            made = advance_to_touch(
+                self._x, self.rotor_speed, np.zeros(4) if self.crashed else target, wind, self.body,
+                self.obstacles.surfaces, self.hold, begin, STEP, path[done:last], total, self._distances)
+            before = path[done + made - 2] if made > 1 else before
+            done += made
+            contacts += self._touches(self.time + done * PERIOD // SUBSTEPS, before)
+        states = [TrueState(self.time + (k + 1) * PERIOD // SUBSTEPS, x[:3], x[3:7], x[7:10], x[10:13])
+                  for k, x in enumerate(path)]
         self.time += PERIOD
         elapsed = (self.time - self._start) * 1e-9
         contacts += [e._replace(time=self.time * 1e-9) for e in self.cables.update(elapsed, self._x)]
@@ -118,14 +119,13 @@ class Plant:
 
     def _warm_up(self) -> None:
         """Compile the kernels now, on a copy of the state, rather than in the first step of a flight in real time."""
-        advance(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces,
-                FREE, 0.0, STEP, np.zeros(6))
-        clearances(self._x, self.body, self.obstacles.surfaces, 0.0, self._distances)
+        advance_to_touch(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces, FREE,
+                         0.0, STEP, np.empty((1, STATES)), np.zeros(6), self._distances)
 
     def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:
-        elapsed = (time - self._start) * 1e-9  # surfaces move since the start
-        least = clearances(self._x, self.body, self.obstacles.surfaces, elapsed, self._distances)
-        if least > 0.0 and self.contact.free:
+        """Judge what is touched at a time [ns]; `before` is the state one step earlier."""
+        if self.contact.free and not (self._distances <= 0.0).any():
             return []
+        elapsed = (time - self._start) * 1e-9  # surfaces move since the start
         events = self.contact.update(elapsed, before, self._x, self._distances)
         return [event._replace(time=time * 1e-9) for event in events]
