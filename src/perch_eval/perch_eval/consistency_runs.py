@@ -1,0 +1,82 @@
+"""Monte-Carlo runs of VIO and estimator on rendered perches: NEES and NIS with their bounds, as JSON and a picture.
+
+    python -m perch_eval.consistency_runs --runs 50 --out out/consistency
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+from perch_core.scenario import load_scenario
+from perch_eval import consistency
+from perch_eval import estimation_flight as flights
+from perch_eval.consistency import Consistency
+
+GROUPS = {"estimator: all 15 states": slice(0, 15), "estimator: position": slice(0, 3), "estimator: velocity": slice(3, 6),
+          "estimator: attitude": slice(6, 9)}
+
+
+def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Consistency], dict[str, object]]:
+    """Fly, estimate and judge.
+
+    Args:
+        scenario_name: in config/scenarios.
+        runs: Monte-Carlo runs.
+        first_seed: seeds count up from here.
+
+    Returns:
+        Estimator and VIO NEES over time, and a summary with RMSE through the perch and mean NIS.
+    """
+    scenario, tracks, vio_nees, rmse, nis, vio_nis = load_scenario(scenario_name), [], [], [], [], []
+    grid = None
+    for seed in range(first_seed, first_seed + runs):
+        flight = flights.fly(scenario, seed)
+        steps = flights.run_vio(flight)
+        track = flights.run_estimator(flight, steps)
+        tracks.append(track)
+        perching = track.times >= flight.perch_time
+        rmse.append(np.sqrt((track.errors[perching, :3] ** 2).mean(axis=0)))
+        nis.append(track.nis)
+        seen = [s for s in steps if s.error is not None and s.result.nis_dimension]
+        vio_nis.append(sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen))
+        posed = [s for s in steps if s.error is not None]
+        values = [consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed]
+        if grid is None:
+            grid = np.arange(0.7, flight.motion.duration - 0.1, 1 / 30)
+        vio_nees.append(np.interp(grid, [s.time for s in posed], values))
+    n = min(len(t.times) for t in tracks)
+    errors = np.array([t.errors[:n] for t in tracks])
+    covariances = np.array([t.covariances[:n] for t in tracks])
+    results = [consistency.judge(name, tracks[0].times[:n], consistency.nees(errors[..., s], covariances[..., s, s]), s.stop - s.start)
+               for name, s in GROUPS.items()]
+    results.append(consistency.judge("vio: pose", grid, np.array(vio_nees), 6))
+    rmse = 100 * np.array(rmse)
+    summary = {"scenario": scenario_name, "runs": runs, "rmse_cm_median": np.median(rmse, axis=0).tolist(),
+               "rmse_cm_worst": rmse.max(axis=0).tolist(), "estimator_nis_over_6": float(np.concatenate(nis).mean() / 6),
+               "vio_nis_over_dimension": float(np.mean(vio_nis)),
+               "nees": {r.name: {"inside": r.inside, "above": r.above, "mean_over_dimension": float(r.mean.mean() / r.dimension)}
+                        for r in results}}
+    return results, summary
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="surface_90")
+    parser.add_argument("--runs", type=int, default=50)
+    parser.add_argument("--out", type=Path, default=Path("out/consistency"))
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    results, summary = run(arguments.scenario, arguments.runs)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "consistency.json").write_text(json.dumps(summary, indent=2))
+    consistency.plot(results, arguments.out / "consistency.png", {"take-off": 1.0, "hover": 3.0, "perch": 4.5})
+    print(json.dumps(summary, indent=2))
+
+
+if __name__ == "__main__":
+    main()
