@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
 from . import stamps, virtualenv, workspace
 from .alone import alone
+from .environment import variables
+from .errors import SetupError
 from .layout import BUILD, INSTALL, ROOT, VENV, VENV_PYTHON
 from .machine import Platform, check_python, check_tools, detect_platform, remember
+from .progress import Step
 
 
 def prepare(clean: bool = False) -> Platform:
@@ -36,6 +40,7 @@ def prepare(clean: bool = False) -> Platform:
                 shutil.rmtree(folder, ignore_errors=True)
         _install(wanted, done)
         _build(wanted, done)
+        _warm_up(wanted, done)
     return wanted
 
 
@@ -68,10 +73,26 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
         stamps.save(done)
 
 
+def _warm_up(wanted: Platform, done: dict[str, str]) -> None:
+    """Compile the numerics of a flight into their caches, once for an environment.
+
+    Nothing depends on it: what is not cached is compiled when a node first needs it. So a failure is only mentioned.
+    """
+    if done.get("warmed") == done["environment"]:
+        return
+    with Step("compiling the numerics of a flight") as step:
+        try:
+            step.run((VENV_PYTHON, "-m", "perch_eval.warm_up"), "warm_up", variables(wanted))
+        except SetupError as error:
+            print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
+    done["warmed"] = done["environment"]
+    stamps.save(done)
+
+
 def _nothing_to_do(wanted: Platform, done: dict[str, str]) -> bool:
     """Whether every stamp is up to date and the folders are still there."""
     environment = stamps.environment_stamp(wanted)
-    if done.get("environment") != environment or not VENV_PYTHON.exists():
+    if done.get("environment") != environment or done.get("warmed") != environment or not VENV_PYTHON.exists():
         return False
     return (INSTALL / "setup.bash").exists() and all(
         _is_built(folder, stamps.package_stamp(folder, environment), done)

@@ -132,8 +132,10 @@ class CablePainter:
         bend = length**2 / (8 * self.camera.fx)  # what a fisheye makes of a straight piece
         reach = np.ceil(np.minimum(radius * pieces.scale + bend + MARGIN, 2000)).astype(int)
         left, top = np.maximum((ends - reach[:, None, None]).min(axis=(0, 1)), 0)
-        right, bottom = (ends + reach[:, None, None]).max(axis=(0, 1)) + 1
-        label = np.zeros((min(bottom, self.camera.height) - top, min(right, self.camera.width) - left), np.int32)
+        right, bottom = np.minimum((ends + reach[:, None, None]).max(axis=(0, 1)) + 1, (self.camera.width, self.camera.height))
+        if right <= left or bottom <= top:  # all of it is beside the image
+            return np.zeros(0, int), np.zeros(0, int)
+        label = np.zeros((bottom - top, right - left), np.int32)
         for number, (pair, thick) in enumerate(zip((ends - [left, top]).tolist(), (2 * reach + 1).tolist()), start=1):
             cv2.line(label, pair[0], pair[1], number, thick)
         rows, cols = np.divmod(np.flatnonzero(label.ravel() != 0), label.shape[1])
