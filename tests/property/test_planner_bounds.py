@@ -101,7 +101,7 @@ def test_kernels_agree_with_the_library(a, b, s):
 def motion(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """A segment of degree 14 with turning yaw, away from free fall."""
     rng = np.random.default_rng(seed)
-    coefficients = np.cumsum(np.cumsum(rng.normal(0.0, 0.004, (3, 15)), axis=1), axis=1)
+    coefficients = np.cumsum(np.cumsum(rng.normal(0.0, 0.0015, (3, 15)), axis=1), axis=1)
     yaw = rng.uniform(-3.0, 3.0) + np.cumsum(rng.normal(0.0, 0.1, 15))
     return coefficients, yaw, rng.uniform(0.5, 1.0)
 

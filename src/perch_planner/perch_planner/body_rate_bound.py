@@ -84,6 +84,23 @@ def _squared_rate(parts):
 
 
 @compiled
+def _interval_product(a, b, c, d):
+    """Enclosure of x y for x in [a, b], y in [c, d]."""
+    p, q, r, t = a * c, a * d, b * c, b * d
+    return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
+
+
+@compiled
+def _along(parts, row, size, dx, dy, slack):
+    """Enclosure of d . v for the vector polynomial at `row`, d within an arc whose effect is at most `slack`."""
+    low, high = np.inf, -np.inf
+    for k in range(size):
+        value = dx * parts[row, k] + dy * parts[row + 1, k]
+        low, high = min(low, value), max(high, value)
+    return low - slack, high + slack
+
+
+@compiled
 def _spin_bound(parts):
     """Upper bound of |w_z| over the interval of the parts; infinite where the enclosure is too wide."""
     low, high = parts[9, :15].min(), parts[9, :15].max()
@@ -92,12 +109,17 @@ def _spin_bound(parts):
     least, most = parts[2, :25].min(), parts[2, :25].max()
     if least <= 0.0:
         return np.inf
-    along = np.abs(dx * parts[3, :13] + dy * parts[4, :13]).max() + reach * sqrt(most)
-    turning = np.abs(dx * parts[6, :24] + dy * parts[7, :24]).max() + reach * sqrt(max(parts[1].max(), 0.0))
-    across = least - along * along
+    shortest, longest = sqrt(least), sqrt(most)
+    lean_low, lean_high = _along(parts, 3, 13, dx, dy, reach * longest)
+    turn_low, turn_high = _along(parts, 6, 24, dx, dy, reach * sqrt(max(parts[1].max(), 0.0)))
+    across = least - max(lean_low * lean_low, lean_high * lean_high)
     if across <= 0.0:
         return np.inf
-    return (np.abs(parts[10, :14]).max() * np.abs(parts[5, :13]).max() * sqrt(most) + along * turning / sqrt(least)) / across
+    a, b = _interval_product(parts[10, :14].min(), parts[10, :14].max(), parts[5, :13].min(), parts[5, :13].max())
+    a, b = _interval_product(a, b, shortest, longest)
+    c, d = _interval_product(lean_low, lean_high, turn_low, turn_high)
+    c, d = _interval_product(c, d, 1.0 / longest, 1.0 / shortest)
+    return max(abs(a + c), abs(b + d)) / across
 
 
 @compiled

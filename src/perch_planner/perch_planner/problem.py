@@ -141,11 +141,14 @@ class PerchSettings:
     thrust_reserve: float = quantity(0.9, above=0.0, high=1.0, doc="share of the vehicle's thrust that a plan may use")
     body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
     speed_max: float = quantity(12.0, unit="m/s", above=0.0, doc="bound on the speed in W")
-    height_min: float = quantity(0.15, unit="m", doc="floor for the centre of mass")
-    height_max: float = quantity(1e3, unit="m", doc="ceiling for the centre of mass")
+    height_min: float = quantity(0.15, unit="m", low=-1e4, high=1e4, doc="floor for the centre of mass")
+    height_max: float = quantity(1e3, unit="m", low=-1e4, high=1e4, doc="ceiling for the centre of mass")
     extension: float = quantity(-1.0, unit="m", high=2.0, doc="rim radius that clears the surface; negative: the vehicle's")
+    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of that rim from the surface's plane")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
     formulation: str = choice("reduced", options=("reduced", "full"), doc="reduced QP, or order 14 as in [M:eq5-8, M:eq17]")
+    bubbles: str = choice("tube", options=("tube", "everywhere"),
+                          doc="segments of full order 14 in the reduced QP; with jerk it is always everywhere")
     solver: str = choice("daqp", options=("daqp", "osqp", "piqp"), doc="quadratic programming solver")
     decider: str = choice("bernstein", options=("bernstein", "sturm"), doc="thrust bound: subdivision, or [M:alg1]")
     stretching: str = choice("adaptive", options=("adaptive", "whole", "segments"),
@@ -182,7 +185,7 @@ class Limits:
     speed: float
     height: tuple[float, float]
     extension: float
-    clearance: float = 0.0
+    clearance: float
 
     def without(self, name: str) -> Limits:
         """The limits with one of them taken away: thrust, body_rate, speed, height or clearance."""
@@ -198,6 +201,7 @@ class Limits:
             speed=settings.speed_max,
             height=(settings.height_min, settings.height_max),
             extension=settings.extension if settings.extension >= 0.0 else max(vehicle.body_radii[:2]),
+            clearance=settings.clearance_min,
         )
 
 

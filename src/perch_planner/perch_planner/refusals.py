@@ -23,11 +23,12 @@ class PerchRefusal(PlanningRefusal):
     Attributes:
         certificates: empty where no plan was found at all.
         iterations: QPs solved.
+        limits: names of the limits without which there is a plan (`Limits.without`); empty where that is not known.
     """
 
-    def __init__(self, code: str, constraint: str, margin: float, message: str,
-                 certificates: tuple[Certificate, ...] = (), iterations: int = 0) -> None:
-        self.certificates, self.iterations = certificates, iterations
+    def __init__(self, code: str, constraint: str, margin: float, message: str, certificates: tuple[Certificate, ...] = (),
+                 iterations: int = 0, limits: tuple[str, ...] = ()) -> None:
+        self.certificates, self.iterations, self.limits = certificates, iterations, limits
         super().__init__(code, constraint, margin, message)
 
 
@@ -47,36 +48,41 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(
             UNREACHABLE_TILT, "thrust at contact m alpha within [tau_min, tau_max] [M:eq9, M:eq11]", margin,
             f"holding the surface's attitude takes m alpha = {contact:.3f} N, outside [{low:.3f}, {high:.3f}] N; "
-            f"choose impact_acceleration between {low / vehicle.mass:.2f} and {high / vehicle.mass:.2f} m/s^2")
+            f"choose impact_acceleration between {low / vehicle.mass:.2f} and {high / vehicle.mass:.2f} m/s^2",
+            limits=("thrust",))
     hover = vehicle.mass * GRAVITY
     if high <= 1.02 * hover:
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
-                           f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N")
+                           f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N", limits=("thrust",))
     start = problem.start
     specific = (start.a[0] ** 2 + start.a[1] ** 2 + (start.a[2] + GRAVITY) ** 2) ** 0.5 * vehicle.mass
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
-                           f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
+                           f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N",
+                           limits=("thrust",))
     p_contact = problem.surface.p_WS + vehicle.perch_offset * problem.surface.normal
     for name, p in (("start", start.p), ("contact", p_contact), *((f"waypoint {k}", w.p) for k, w in enumerate(problem.waypoints))):
         margin = min(p[2] - limits.height[0], limits.height[1] - p[2])
         if margin < 0.0 and not (name == "contact" and problem.target_velocity[2]):
             raise PerchRefusal(BOX, f"height of the {name}", margin,
-                               f"{name} height {p[2]:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m")
+                               f"{name} height {p[2]:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m",
+                               limits=("height",))
     speed = float(start.v @ start.v) ** 0.5
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
-                           f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
+                           f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s",
+                           limits=("speed",))
     surface = problem.surface
     lean = abs(float((start.a + (0.0, 0.0, GRAVITY)) @ surface.normal)) * vehicle.mass / max(specific, 1e-9)
     rim = limits.extension * max(1.0 - min(lean, 1.0) ** 2, 0.0) ** 0.5
     distance = float((start.p - surface.p_WS) @ surface.normal)
-    if distance <= rim:
-        raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim,
-                           f"the start is {distance:.3f} m in front of the surface's plane; the vehicle's rim needs {rim:.3f} m")
+    if distance <= rim + limits.clearance:
+        raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
+                           f"the start is {distance:.3f} m in front of the surface's plane; the vehicle's rim needs {rim:.3f} m",
+                           limits=("clearance",))
     for k, waypoint in enumerate(problem.waypoints):
         distance = float((waypoint.p - surface.p_WS) @ surface.normal)
-        if distance <= 0.0 and not problem.target_velocity.any():
+        if distance <= limits.clearance and not problem.target_velocity.any():
             raise PerchRefusal(BOX, f"clearance of waypoint {k} from the surface's plane", distance,
-                               f"waypoint {k} is {-distance:.3f} m behind the surface's plane")
+                               f"waypoint {k} is {-distance:.3f} m behind the surface's plane", limits=("clearance",))

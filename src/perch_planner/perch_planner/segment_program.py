@@ -46,7 +46,8 @@ class ReducedSegments:
     def __init__(self, contact: Contact, durations: np.ndarray, settings: PerchSettings) -> None:
         linear = contact.constraints(durations)
         self._durations, self._solver = durations, settings.solver
-        self._bubbles = contact.bubbles(durations, linear, settings.objective == "jerk")
+        self._bubbles = contact.bubbles(
+            durations, linear, settings.objective == "jerk" or settings.bubbles == "everywhere")
         self._program = reduced_qp.assemble(durations, *contact.knots(durations), self._bubbles, linear.segments,
                                             linear.places, linear.orders, COST_ORDER[settings.objective])
         self._rows = reduced_qp.constraint_rows(self._program, linear.functional, linear.direction, linear.lower, linear.upper)

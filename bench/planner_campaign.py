@@ -1,0 +1,94 @@
+#!/usr/bin/env python3
+"""Plan thousands of random perches and check every answer: plans by the independent verifier, refusals by relaxing what they name.
+
+    nice -n 10 python3 bench/planner_campaign.py --count 10000 --out docs/results/planner/campaign.json
+
+Takes about 0.1 s per problem; it can be stopped at any time with Ctrl-C and still writes what it has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from random_perches import random_problem, requirements
+
+from perch_core import config
+from perch_core.vehicle import load_vehicle
+from perch_planner.planner import plan
+from perch_planner.problem import PerchSettings
+from perch_planner.refusals import PerchRefusal
+from perch_planner.verifier import verify
+
+_RELAXED = {"thrust": {"thrust_min": 1e-3, "thrust_max": 1e3}, "body_rate": {"body_rate_max": 1e3},
+            "speed": {"speed_max": 1e3}, "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3}}
+
+
+def confirmed(problem, refusal: PerchRefusal, settings: PerchSettings, vehicle) -> bool:
+    """Whether the problem has a plan, or another obstacle, without the limits that the refusal names."""
+    changes = {key: value for name in refusal.limits for key, value in _RELAXED[name].items()}
+    if not changes:
+        return False
+    try:
+        plan(problem, config.replace(settings, **changes), vehicle)
+    except PerchRefusal as other:
+        return bool(other.limits) and not set(other.limits) & set(refusal.limits)
+    return True
+
+
+def main() -> int:
+    """Run the campaign and print its figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=10000, help="problems (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
+    parser.add_argument("--step", type=float, default=1e-4, help="sampling of the verifier [s] (default: %(default)s)")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    arguments = parser.parse_args()
+    vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
+    codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
+    begin = time.time()
+    try:
+        for seed in range(arguments.first, arguments.first + arguments.count):
+            problem = random_problem(np.random.default_rng(seed))
+            started = time.perf_counter()
+            try:
+                answer = plan(problem, settings, vehicle)
+            except PerchRefusal as refusal:
+                codes[refusal.code] += 1
+                if not confirmed(problem, refusal, settings, vehicle):
+                    unconfirmed.append([seed, refusal.code, refusal.constraint])
+            except Exception as error:  # the campaign exists to find these
+                exceptions.append([seed, repr(error)])
+            else:
+                times.append(time.perf_counter() - started)
+                durations.append(answer.duration)
+                need = requirements(problem, settings, vehicle)
+                findings = verify(answer.trajectory.durations, answer.trajectory.coefficients, need, arguments.step)
+                broken += [[seed, f.requirement, f.excess, f.time] for f in findings]
+            done += 1
+            if done % 500 == 0:
+                print(f"{done}: {len(times)} plans, {len(broken)} findings, {dict(codes)}, {len(unconfirmed)} unconfirmed, "
+                      f"{len(exceptions)} exceptions, {time.time() - begin:.0f} s", flush=True)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+    ms = 1e3 * np.array(times or [np.nan])
+    result = {"problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
+              "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
+              "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
+              "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}
+    print(json.dumps(result, indent=1))
+    if arguments.out:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    return 1 if broken or unconfirmed or exceptions else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

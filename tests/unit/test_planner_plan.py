@@ -1,0 +1,189 @@
+"""Whole plans: any inclination, starts in motion, moving pads, all options; each re-checked by the independent verifier."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perch_core.errors import ConfigError
+from perch_core.flatness import flat_to_state
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import load_vehicle
+from perch_planner import refusals
+from perch_planner.planner import plan
+from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
+from perch_planner.refusals import PerchRefusal
+from perch_planner.verifier import verify
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
+from random_perches import random_problem, requirements  # noqa: E402
+
+VEHICLE = load_vehicle("snapdragon")
+HOVER = StartState((0.0, 0.0, 1.5))
+
+
+def surface(inclination_deg: float, heading_deg: float = 0.0, p=(1.7, 0.0, 1.5)) -> PerchSurface:
+    if inclination_deg < 30.0:
+        p = (1.7, 0.0, 0.8)
+    if inclination_deg > 150.0:
+        p = (1.7, 0.0, 2.6)
+    return PerchSurface.from_inclination(np.array(p), np.radians(inclination_deg), np.radians(heading_deg))
+
+
+def checked(problem: PerchProblem, settings: PerchSettings = PerchSettings()):
+    """A plan that the verifier accepts and whose certificates all hold."""
+    planned = plan(problem, settings, VEHICLE)
+    need = requirements(problem, settings, VEHICLE)
+    assert verify(planned.trajectory.durations, planned.trajectory.coefficients, need, step=5e-4) == []
+    assert {c.quantity for c in planned.certificates} == {"thrust", "speed", "height", "clearance", "body_rate"}
+    assert all(c.holds for c in planned.certificates)
+    return planned
+
+
+@pytest.mark.parametrize("inclination", [0, 30, 60, 90, 105, 120, 135, 150, 165, 180])
+def test_every_inclination_is_reached(inclination):
+    target = surface(inclination)
+    planned = checked(PerchProblem(HOVER, target))
+    end = planned.trajectory.sample(planned.duration)
+    state = flat_to_state(end.p, end.v, end.a, end.j, end.s, end.yaw, end.yaw_rate, end.yaw_acc, VEHICLE.mass)
+    assert state.R_WB == pytest.approx(target.R_WS, abs=1e-6)  # B coincides with S at contact
+    assert state.thrust == pytest.approx(VEHICLE.mass * 3.3)
+
+
+@pytest.mark.parametrize("heading", [-150.0, -60.0, 45.0, 170.0])
+def test_plans_turn_with_the_world(heading):
+    """Turning the whole problem about the vertical turns the plan, but for the tube, whose box [M:eq15] does not turn."""
+    reference = checked(PerchProblem(HOVER, surface(75.0)))
+    angle = np.radians(heading)
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    target = PerchSurface.from_inclination(R @ [1.7, 0.0, 1.5], np.radians(75.0), angle)
+    turned = checked(PerchProblem(StartState(HOVER.p, yaw=angle), target))
+    assert turned.duration == pytest.approx(reference.duration, rel=0.1)
+    for t in np.linspace(0.0, reference.duration, 7):
+        assert turned.trajectory.sample(t).p == pytest.approx(R @ reference.trajectory.sample(t).p, abs=0.03)
+
+
+def test_both_sides_of_a_surface_can_be_approached():
+    """A pad whose s2 points the other way is approached tail first: the roll direction is the target's."""
+    target = surface(60.0)
+    flipped = PerchSurface(target.p_WS, target.R_WS @ np.diag([-1.0, -1.0, 1.0]), target.size)
+    forward = checked(PerchProblem(HOVER, target))
+    backward = checked(PerchProblem(StartState(HOVER.p, yaw=np.pi), flipped))
+    assert abs(contact_heading(flipped)) == pytest.approx(np.pi)
+    assert backward.trajectory.sample(1.0).p == pytest.approx(forward.trajectory.sample(1.0).p, abs=1e-6)
+
+
+def test_a_running_plan_is_replaced_in_flight():
+    first = checked(PerchProblem(HOVER, surface(60.0)))
+    start = StartState.on(first.trajectory, 0.6)
+    moved = PerchSurface.from_inclination(np.array([1.8, 0.1, 1.5]), np.radians(65.0), 0.05)
+    second = checked(PerchProblem(start, moved))
+    before, after = first.trajectory.sample(0.6), second.trajectory.sample(0.0)
+    for name, slack in (("p", 1e-9), ("v", 1e-9), ("a", 1e-8), ("j", 1e-6)):
+        assert getattr(after, name) == pytest.approx(getattr(before, name), abs=slack)
+    with pytest.raises(ConfigError, match="outside the current trajectory"):
+        StartState.on(first.trajectory, first.duration + 0.1)
+
+
+@pytest.mark.parametrize("inclination, velocity", [(0.0, (3.0, 0.0, 0.0)), (60.0, (1.5, 0.5, 0.0)), (60.0, (-0.5, 0.0, 0.2))])
+def test_moving_pads_are_met_where_they_are(inclination, velocity):
+    target = surface(inclination)
+    problem = PerchProblem(StartState(HOVER.p, v=(0.5, 0.0, 0.0)), target, target_velocity=np.array(velocity))
+    planned = checked(problem)
+    expected = target.p_WS + np.array(velocity) * planned.duration + VEHICLE.perch_offset * target.normal
+    assert planned.trajectory.sample(planned.duration).p == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("options", [
+    {"objective": "jerk"}, {"bubbles": "everywhere"}, {"solver": "osqp"}, {"solver": "piqp"}, {"decider": "sturm"},
+    {"stretching": "whole"}, {"cuts": False, "thrust_reserve": 1.0}, {"formulation": "full"}, {"formulation": "full", "solver": "piqp"}])
+def test_every_option_gives_plans_that_verify(options):
+    points = (Waypoint((0.5, 0.1, 1.5)), Waypoint((0.9, 0.0, 1.5)))
+    planned = checked(PerchProblem(HOVER, surface(60.0), points), PerchSettings(**options))
+    method = {c.quantity: c.method for c in planned.certificates}["thrust"]
+    assert method == ("sturm" if options.get("decider") == "sturm" else "bernstein")
+
+
+def test_minimum_time_is_shorter_and_still_verifies():
+    problem = PerchProblem(HOVER, surface(60.0))
+    usual, shortest = checked(problem), checked(problem, PerchSettings(minimum_time=True))
+    assert shortest.duration < 0.9 * usual.duration
+
+
+def test_certificates_enclose_what_dense_sampling_finds():
+    planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), surface(90.0)))
+    proofs = {c.quantity: c for c in planned.certificates}
+    at = planned.trajectory.sample_many(np.linspace(0.0, planned.duration, 4001))
+    states = [flat_to_state(*row, VEHICLE.mass) for row in zip(at.p, at.v, at.a, at.j, at.s, at.yaw, at.yaw_rate, at.yaw_acc)]
+    thrust = np.array([s.thrust for s in states])
+    rate = np.array([np.linalg.norm(s.w_WB_B) for s in states])
+    for values, name, slack in ((thrust, "thrust", 1e-3), (at.p[:, 2], "height", 2e-3), (rate, "body_rate", 0.15)):
+        proof = proofs[name]
+        assert proof.minimum <= values.min() + 1e-9 and values.max() <= proof.maximum + 1e-9
+        assert proof.maximum <= values.max() * (1 + slack) + 1e-3
+    assert at.p[thrust.argmax(), 2] == pytest.approx(planned.trajectory.sample(proofs["thrust"].time_of_maximum).p[2], abs=0.05)
+
+
+@pytest.mark.parametrize("problem, settings, code", [
+    (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 30.0}, refusals.UNREACHABLE_TILT),
+    (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 1.0}, refusals.UNREACHABLE_TILT),
+    (PerchProblem(HOVER, surface(90.0)), {"thrust_max": 2.3}, refusals.THRUST_FLOOR),
+    (PerchProblem(HOVER, surface(90.0)), {"thrust_max": 2.7, "duration_max": 8.0}, refusals.THRUST_FLOOR),
+    (PerchProblem(HOVER, surface(90.0)), {"body_rate_max": 1.0, "duration_max": 6.0}, refusals.BODY_RATE),
+    (PerchProblem(HOVER, surface(90.0, p=(-1.0, 0.0, 1.5))), {}, refusals.BOX),
+    (PerchProblem(StartState((0.0, 0.0, 0.05)), surface(90.0)), {}, refusals.BOX),
+    (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 0.0, -9.0)), surface(90.0)), {}, refusals.BAD_INPUT),
+])
+def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(**settings), VEHICLE)
+    assert caught.value.code == code
+    assert caught.value.margin < 0.0
+    assert caught.value.constraint and str(caught.value)
+
+
+def test_a_refusal_is_confirmed_by_relaxing_what_it_names():
+    problem = PerchProblem(HOVER, surface(90.0))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(thrust_max=2.6, duration_max=8.0), VEHICLE)
+    assert caught.value.code == refusals.THRUST_FLOOR
+    relaxed = PerchSettings(thrust_max=2.6 - caught.value.margin + 1e-3, duration_max=8.0)
+    checked(problem, relaxed)
+
+
+@pytest.mark.parametrize("make, key", [
+    (lambda: StartState((np.nan, 0.0, 0.0)), "p"), (lambda: StartState((0.0, 0.0, 0.0), yaw=np.inf), "yaw"),
+    (lambda: Waypoint((0.0, 1.0)), "p"), (lambda: PerchProblem(HOVER, surface(90.0), segment_times=(1.0, 1.0)), "segment_times"),
+    (lambda: PerchProblem(HOVER, surface(90.0), segment_times=(-1.0,)), "segment_times"),
+    (lambda: PerchProblem(HOVER, surface(90.0), target_velocity=(0.0, np.inf, 0.0)), "velocity")])
+def test_bad_values_are_named(make, key):
+    with pytest.raises(ConfigError) as caught:
+        make()
+    assert caught.value.key == key
+
+
+def test_limits_come_from_the_vehicle_unless_they_are_set():
+    of_vehicle = Limits.of(PerchSettings(), VEHICLE)
+    assert of_vehicle.thrust == pytest.approx((0.506, 0.9 * 4.496), abs=2e-3)  # the paper's range, with the reserve
+    assert of_vehicle.body_rate == VEHICLE.body_rate_max
+    assert Limits.of(PerchSettings(thrust_max=4.5), VEHICLE).thrust[1] == 4.5
+
+
+@pytest.mark.parametrize("chunk", range(4))
+def test_random_problems_end_in_verified_plans_or_typed_refusals(chunk):
+    """A slice of the campaign of 10,000 (bench/planner_campaign.py)."""
+    planned = 0
+    for seed in range(50 * chunk, 50 * chunk + 50):
+        problem = random_problem(np.random.default_rng(seed))
+        try:
+            answer = plan(problem, PerchSettings(), VEHICLE)
+        except PerchRefusal as refusal:
+            assert refusal.margin < 0.0 and refusal.constraint
+            continue
+        need = requirements(problem, PerchSettings(), VEHICLE)
+        assert verify(answer.trajectory.durations, answer.trajectory.coefficients, need, step=2e-3) == []
+        planned += 1
+    assert planned >= 40  # these problems are generous: most have a plan
