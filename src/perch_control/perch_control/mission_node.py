@@ -106,10 +106,11 @@ class MissionNode(PerchNode[MissionParameters]):
         if self._pending is not None:
             due, future = self._pending
             if to_seconds(step.stamp) >= due - 1e-9:
-                if not future.done():
-                    self._deferred = step
+                if future.done():
+                    self._pending, answer = None, self._planners.answer(future)
+                elif self._participant.lockstep:
+                    self._deferred = step  # simulation time waits; in real time the mission goes on without an answer
                     return
-                self._pending, answer = None, self._planners.answer(future)
         outputs = self._machine.tick(self._inputs(to_seconds(step.stamp), answer))
         self._imu.clear()
         self._act(to_seconds(step.stamp), outputs)

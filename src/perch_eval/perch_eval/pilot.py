@@ -20,6 +20,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 
+SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
+"""Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
+PLANNER_PATIENCE = 300.0  # [s] a planner whose sources changed compiles first
 OUTCOMES = {code: name for code, name in enumerate(
     ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed"))}
 
@@ -101,6 +104,9 @@ class Pilot:
                 on_phase(self._time, *now)
 
         self._spin_until(self._client.server_is_ready, check, stall, "the mission's action server does not appear")
+        for node, service in SERVICES.items():
+            if node in scenario.nodes:
+                self._spin_until(lambda: service in self._services(), check, PLANNER_PATIENCE, f"{node} does not offer {service}")
         began = time.monotonic()
         sent = self._client.send_goal_async(goal_of(scenario), feedback_callback=feedback)
         self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
@@ -126,6 +132,9 @@ class Pilot:
         if cancelled and outcome == "cancelled":
             outcome = "timeout"
         return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - began)
+
+    def _services(self) -> set[str]:
+        return {name.rsplit("/", 1)[-1] for name, _ in self._node.get_service_names_and_types()}
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
