@@ -1,0 +1,20 @@
+#!/usr/bin/env python3
+"""Regenerate the papers' tables and figures beside the papers' values. `--help` shows the options."""
+
+from __future__ import annotations
+
+import sys
+
+from perch_setup import enter
+
+
+def main() -> int:
+    """Set up, then evaluate; the options are those of `perch_eval.evaluation.command`."""
+    enter()
+    from perch_eval.evaluation.command import main as evaluate
+
+    return evaluate()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

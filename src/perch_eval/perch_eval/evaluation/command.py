@@ -1,0 +1,111 @@
+"""Regenerates the tables and figures of both papers, each value beside the paper's with a verdict."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+from perch_core.errors import PerchError
+from perch_eval.evaluation import document
+from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
+
+EXAMPLES = """examples:
+  python3 scripts/evaluate.py                       --quick: 5 seeds a condition
+  python3 scripts/evaluate.py --full --jobs 2       100 seeds; interrupted, the same command goes on
+  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_cable)
+
+exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
+2 the caller's mistake, 130 interrupted"""
+
+
+def _planning(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.planning_times import planning_sections
+
+    return planning_sections(effort)
+
+
+def _flights(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.perching import perching_sections
+
+    return perching_sections(effort)
+
+
+def _powerline(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.powerline import powerline_sections
+
+    return powerline_sections(effort)
+
+
+def _cable(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.cable import cable_sections
+
+    return cable_sections(effort)
+
+
+PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline, "p_cable": _cable}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="evaluate.py", description=__doc__, epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    size = out.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="5 seeds a condition (default)")
+    size.add_argument("--full", action="store_true", help="100 seeds a condition; resumable")
+    out.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
+    out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
+    out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
+    out.add_argument("--fresh", action="store_true", help="fly again what an earlier evaluation of the same code has flown")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    if args.jobs < 1:
+        print(f"error: --jobs {args.jobs} is not >= 1", file=sys.stderr)
+        return 2
+    mode = "full" if args.full else "quick"
+    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, args.fresh)
+    began = time.monotonic()
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        sections = evaluate(effort, args.only or list(PARTS))
+        document.write(sections, args.out, mode, time.monotonic() - began)
+    except KeyboardInterrupt:
+        print("\ninterrupted; finished flights are kept, the same command goes on", file=sys.stderr)
+        return 130
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    found = document.counts(sections)
+    print(f"results: {args.out / 'README.md'}: " + ", ".join(f"{n} {verdict}" for verdict, n in found.items()))
+    return 1 if found.get(FAILS) else 3 if found.get(MISSING) else 0
+
+
+def evaluate(effort: Effort, names: list[str]) -> list[Section]:
+    """The sections of some parts; a part that breaks is a row that is not available, not the end of the others."""
+    sections = []
+    for k, name in enumerate(names):
+        began = time.monotonic()
+        print(f"[{k + 1}/{len(names)}] {name}", flush=True)
+        try:
+            part = PARTS[name](effort)
+        except (PerchError, ImportError, ArithmeticError, LookupError, ValueError, AttributeError, TypeError, RuntimeError) as error:
+            broken = Section(name, f"{name} could not be evaluated", "")
+            broken.missing(name, "", f"{type(error).__name__}: {error}")
+            part = [broken]
+        for section in part:
+            print(f"  {section.title}")
+            for row in section.rows:
+                print(f"    {row.verdict:<14} {row.name}: {row.ours}" + (f"  (paper: {row.paper})" if row.paper else ""), flush=True)
+        print(f"  {time.monotonic() - began:.0f} s", flush=True)
+        sections += part
+    return sections
+
+
+if __name__ == "__main__":
+    sys.exit(main())

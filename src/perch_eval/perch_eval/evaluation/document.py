@@ -1,0 +1,73 @@
+"""The results as a page for people and as JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, Section
+
+_MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", MISSING: "*not available*"}
+
+
+def write(sections: Sequence[Section], folder: Path, mode: str, duration: float) -> None:
+    """Write `README.md` and `results.json` into the folder of the figures."""
+    (folder / "README.md").write_text(_page(sections, mode, duration))
+    content = {"mode": mode, "duration_s": duration, "machine": _machine(), "sections": [
+        {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
+         "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
+    (folder / "results.json").write_text(json.dumps(finite(content), indent=1) + "\n")
+
+
+def counts(sections: Sequence[Section]) -> dict[str, int]:
+    """Rows by verdict."""
+    out: dict[str, int] = {}
+    for section in sections:
+        for row in section.rows:
+            out[row.verdict] = out.get(row.verdict, 0) + 1
+    return out
+
+
+def finite(value: Any) -> Any:
+    """JSON has no nan: null says that a figure could not be had."""
+    if isinstance(value, dict):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _machine() -> str:
+    import os
+
+    return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def _page(sections: Sequence[Section], mode: str, duration: float) -> str:
+    found = counts(sections)
+    lines = ["# Results", "",
+             f"Made by `python3 scripts/evaluate.py --{mode}` in {duration / 60:.0f} min on {_machine()}; this page is generated, edit nothing here.", "",
+             f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail; {found.get('better', 0)} further values are better than the paper's, "
+             f"{found.get('worse', 0)} worse; {found.get(MISSING, 0)} rows are not available.", "",
+             "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "
+             "**P**: Paneque et al., *Perception-Aware Perching on Powerlines with Multirotors*. "
+             "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", ""]
+    for failing in [(s, row) for s in sections for row in s.rows if row.verdict == FAILS]:
+        lines.append(f"* fails: {failing[0].title}: {failing[1].name}: {failing[1].ours} ({failing[1].note})")
+    for section in sections:
+        lines += ["", f"## {section.title}", "", section.about, ""]
+        if section.rows:
+            lines += ["| | ours | paper | verdict | |", "| --- | --- | --- | --- | --- |"]
+            lines += [f"| {_cell(r.name)} | {_cell(r.ours)} | {_cell(r.paper)} | {_MARK.get(r.verdict, r.verdict)} | {_cell(r.note)} |"
+                      for r in section.rows]
+        for name, caption in section.figures:
+            lines += ["", f"![{caption}]({name})", "", f"*{caption}*"]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())

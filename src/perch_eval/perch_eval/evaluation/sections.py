@@ -1,0 +1,95 @@
+"""What a part of the evaluation hands over: rows beside the paper's values, figures, and a verdict on each row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+HOLDS, FAILS, SHOWN, MISSING = "holds", "FAILS", "shown", "not available"
+BETTER, WORSE = "better", "worse"  # a comparison, not a claim
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table.
+
+    Attributes:
+        name: what was measured.
+        ours: our value, with interval or range.
+        paper: the paper's value; empty: it gives none.
+        verdict: `holds` or `FAILS` for a claim, `better` / `worse` for a comparison without a claim, `shown`,
+            `not available` where the part does not exist.
+        note: what the claim is, or why it is not available.
+    """
+
+    name: str
+    ours: str
+    paper: str
+    verdict: str
+    note: str = ""
+
+
+@dataclass
+class Section:
+    """One table or figure of a paper.
+
+    Attributes:
+        key: short name, also that of its files.
+        title: heading.
+        about: what was done, seeds included.
+        rows: the table.
+        figures: (file name, caption), in the folder of the results.
+        data: figures behind the rows, for the JSON file.
+    """
+
+    key: str
+    title: str
+    about: str
+    rows: list[Row] = field(default_factory=list)
+    figures: list[tuple[str, str]] = field(default_factory=list)
+    data: dict = field(default_factory=dict)
+
+    def claim(self, name: str, ours: str, paper: str, holds: bool, note: str) -> None:
+        """A row that says whether a claim holds."""
+        self.rows.append(Row(name, ours, paper, HOLDS if holds else FAILS, note))
+
+    def compare(self, name: str, ours: str, paper: str, better: bool, note: str = "") -> None:
+        """A row that compares without claiming."""
+        self.rows.append(Row(name, ours, paper, BETTER if better else WORSE, note))
+
+    def show(self, name: str, ours: str, paper: str = "", note: str = "") -> None:
+        """A row without a judgement."""
+        self.rows.append(Row(name, ours, paper, SHOWN, note))
+
+    def missing(self, name: str, paper: str, why: str) -> None:
+        """A row whose part does not exist."""
+        self.rows.append(Row(name, "-", paper, MISSING, why))
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is spent.
+
+    Attributes:
+        full: 100 seeds instead of 5, and slow comparisons.
+        jobs: processes for flights.
+        out: folder of the results.
+        state: folder of what a full evaluation resumes from.
+        fresh: forget what an earlier evaluation has done.
+    """
+
+    full: bool
+    jobs: int
+    out: Path
+    state: Path
+    fresh: bool = False
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the flights of each condition."""
+        return range(1, 101) if self.full else range(1, 6)
+
+
+Part = Callable[[Effort], list[Section]]
+"""A part of the evaluation: its sections, in the order of the document."""
