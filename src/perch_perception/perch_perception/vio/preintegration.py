@@ -61,7 +61,7 @@ def _integrate(rows, bg, ba, dR, dp, dv, J, Q):
         dt = rows[k, 0]
         w = rows[k, 1:4] - bg
         a = rows[k, 4:7] - ba
-        half, _ = _rotation(w * (0.5 * dt))
+        half, half_right = _rotation(w * (0.5 * dt))
         full, right = _rotation(w * dt)
         M = dR @ half  # attitude at the middle of the step
         f = M @ a
@@ -79,6 +79,10 @@ def _integrate(rows, bg, ba, dR, dp, dv, J, Q):
         J[0:3, 0:3] -= right * dt
         J[3:6, 3:6] -= M * (0.5 * dt * dt)
         J[6:9, 3:6] -= M * dt
+        # the bias also turns the middle of this step itself
+        turned = (M @ skew @ half_right) * (0.5 * dt * dt)
+        J[3:6, 0:3] += turned * (0.5 * dt)
+        J[6:9, 0:3] += turned
         gyro, accel = rows[k, 7] * dt * dt, rows[k, 8] * dt * dt
         for i in range(3):
             Q[i, i] += gyro

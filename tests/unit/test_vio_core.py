@@ -1,0 +1,429 @@
+"""The MSCKF's parts against independent forms: finite differences, exact motion, projection, null space."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_core.camera import PinholeCamera
+from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_eval.perch_motion import PerchMotion, read_imu
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuSample
+from perch_perception.vio import VioConfig, ekf
+from perch_perception.vio import state as at
+from perch_perception.vio.bearing import corrected, observe, residuals
+from perch_perception.vio.landmark_choice import Spread, cell
+from perch_perception.vio.motion_start import solve_motion
+from perch_perception.vio.msckf import Msckf
+from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.state import State
+from perch_perception.vio.tracks import Tracks
+from perch_perception.vio.triangulation import triangulate
+
+MOUNT = load_vehicle("snapdragon").mounts["down"]
+IMU = load_vehicle("snapdragon").imu
+STEP = 1e-6
+
+
+def scene(rng, n=6):
+    """n body poses and points below them."""
+    R = so3.exp(0.2 * rng.normal(size=(n, 3)))
+    p = 0.1 * rng.normal(size=(n, 3))
+    X = np.column_stack([0.8 * rng.normal(size=(n, 2)), np.full(n, -1.0)])
+    return R, p, X
+
+
+def in_camera(R, p, X, R_BC=MOUNT.R_BC, p_BC=MOUNT.p_BC):
+    return (np.einsum("nji,nj->ni", R, X - p) - p_BC) @ R_BC
+
+
+# -- bearings ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", [MOUNT.camera, PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)])
+def test_a_wrong_focal_length_is_undone_by_the_focal_error(camera):
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)), np.ones(30)])
+    stretched = dataclasses.replace(camera, fx=camera.fx * 1.004, fy=camera.fy * 1.004)
+    measured = observe(camera, stretched.project(points)[0])
+    truth = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.abs(measured.b_C - truth).max() > 5e-4
+    np.testing.assert_allclose(corrected(measured, np.log(1.004)), truth, atol=5e-6)
+
+
+def test_residual_jacobians_are_those_of_finite_differences():
+    rng = np.random.default_rng(1)
+    R, p, X = scene(rng)
+    pixels, valid = MOUNT.camera.project(in_camera(R, p, X))
+    assert valid.all()
+    measured = observe(MOUNT.camera, pixels + rng.normal(0, 3.0, pixels.shape))
+
+    def r(R=R, p=p, X=X, R_BC=MOUNT.R_BC, p_BC=MOUNT.p_BC, focal=0.0):
+        return residuals(R, p, X, R_BC, p_BC, measured, focal).r
+
+    linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured, 0.0)
+    cases = {
+        "by_theta": lambda d: r(R=R @ so3.exp(d)), "by_position": lambda d: r(p=p + d), "by_point": lambda d: r(X=X + d),
+        "by_camera_rotation": lambda d: r(R_BC=MOUNT.R_BC @ so3.exp(d)), "by_camera_position": lambda d: r(p_BC=MOUNT.p_BC + d)}
+    for name, moved in cases.items():
+        # r = H x for an error x of the state: moving the estimate by d leaves the error -d
+        numeric = np.stack([-(moved(STEP * e) - moved(-STEP * e)) / (2 * STEP) for e in np.eye(3)], axis=-1)
+        np.testing.assert_allclose(getattr(linear, name), numeric, atol=1e-7, err_msg=name)
+
+
+def test_the_focal_derivative_is_that_of_another_lens():
+    rng = np.random.default_rng(2)
+    R, p, X = scene(rng)
+    stretched = dataclasses.replace(MOUNT.camera, fx=275.0 * 1.001, fy=275.0 * 1.001)
+    measured = observe(MOUNT.camera, stretched.project(in_camera(R, p, X))[0])
+    linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured, 0.0)
+    np.testing.assert_allclose(linear.r, linear.by_focal * np.log(1.001), atol=2e-6)
+
+
+# -- preintegration ------------------------------------------------------------------------------------------------------
+
+
+def flip_rows(gyro_shift=0.0, accel_shift=0.0):
+    """IMU steps through the fastest 60 ms of a perch, exact but for shifts."""
+    motion = PerchMotion()
+    times = np.arange(motion.duration - 0.12, motion.duration - 0.05, 0.002)
+    m = motion.sample(times)
+    w, f = 0.5 * (m.w_WB_B[1:] + m.w_WB_B[:-1]), 0.5 * (m.f_B[1:] + m.f_B[:-1])
+    n = len(w)
+    return m, np.column_stack([np.full(n, 0.002), w + gyro_shift, f + accel_shift, np.full(n, 1e-4), np.full(n, 0.1)])
+
+
+def test_preintegration_gives_the_exact_motion():
+    m, rows = flip_rows()
+    pre = preintegrate(rows, np.zeros(3), np.zeros(3))
+    g, T = np.array([0, 0, -GRAVITY]), pre.duration
+    np.testing.assert_allclose(m.R_WB[0] @ pre.dR, m.R_WB[-1], atol=2e-4)
+    np.testing.assert_allclose(m.v_WB[0] + g * T + m.R_WB[0] @ pre.dv, m.v_WB[-1], atol=1e-3)
+    np.testing.assert_allclose(m.p_WB[0] + m.v_WB[0] * T + 0.5 * g * T**2 + m.R_WB[0] @ pre.dp, m.p_WB[-1], atol=1e-4)
+    np.testing.assert_allclose(pre.w_end, rows[-1, 1:4])
+
+
+def test_preintegration_bias_jacobian_is_that_of_finite_differences():
+    _, rows = flip_rows()
+    base = preintegrate(rows, np.zeros(3), np.zeros(3))
+    h = 1e-4
+    for i in range(6):
+        d = np.zeros(6)
+        d[i] = h
+        a, b = preintegrate(rows, d[:3], d[3:]), preintegrate(rows, -d[:3], -d[3:])
+        numeric = np.concatenate([so3.log(base.dR.T @ a.dR) - so3.log(base.dR.T @ b.dR), a.dp - b.dp, a.dv - b.dv]) / (2 * h)
+        np.testing.assert_allclose(base.J[:, i], numeric, rtol=2e-3, atol=2e-6)
+
+
+def test_preintegration_noise_is_the_spread_of_noisy_readings():
+    _, rows = flip_rows()
+    rng, base = np.random.default_rng(3), preintegrate(rows, np.zeros(3), np.zeros(3))
+    ends = []
+    for _ in range(800):
+        noisy = rows.copy()
+        noisy[:, 1:4] += rng.normal(0, 0.01, (len(rows), 3))
+        noisy[:, 4:7] += rng.normal(0, np.sqrt(0.1), (len(rows), 3))
+        pre = preintegrate(noisy, np.zeros(3), np.zeros(3))
+        ends.append(np.concatenate([so3.log(base.dR.T @ pre.dR), pre.dp - base.dp, pre.dv - base.dv]))
+    np.testing.assert_allclose(np.std(ends, axis=0), np.sqrt(np.diag(base.Q)), rtol=0.12)
+
+
+# -- triangulation and updates -------------------------------------------------------------------------------------------
+
+
+def test_triangulation_finds_the_point_and_refuses_what_tells_nothing():
+    rng = np.random.default_rng(4)
+    X, centres = np.array([0.4, -0.2, 0.0]), np.column_stack([np.linspace(0, 0.3, 6), np.zeros(6), np.full(6, 1.2)])
+    rays = X - centres
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    np.testing.assert_allclose(triangulate(centres, rays, np.radians(2), 1e-3), X, atol=1e-6)
+    noisy = rays + rng.normal(0, 1e-3, rays.shape)
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    assert np.linalg.norm(triangulate(centres, noisy, np.radians(2), 1e-3) - X) < 0.02
+    assert triangulate(centres, rays, np.radians(20), 1e-3) is None       # too little parallax
+    assert triangulate(centres, -rays, np.radians(2), 1e-3) is None       # behind the camera
+    rays[2] = [0.0, 0.7, -np.sqrt(1 - 0.49)]
+    assert triangulate(centres, rays, np.radians(2), 1e-3) is None        # one ray elsewhere
+
+
+def test_elimination_and_compression_keep_the_information():
+    rng = np.random.default_rng(5)
+    H, H_f, r = rng.normal(size=(20, 9)), rng.normal(size=(20, 3)), rng.normal(size=20)
+    R_f, H_1, r_1, H_0, r_0 = ekf.eliminate(H, H_f, r)
+    # marginal information about x after the point is eliminated (Schur complement), by two ways
+    full = np.hstack([H, H_f])
+    I = full.T @ full
+    schur = I[:9, :9] - I[:9, 9:] @ np.linalg.inv(I[9:, 9:]) @ I[9:, :9]
+    np.testing.assert_allclose(H_0.T @ H_0, schur, atol=1e-10)
+    H_c, r_c = ekf.compress(H_0, r_0)
+    assert H_c.shape == (9, 9)
+    np.testing.assert_allclose(H_c.T @ H_c, schur, atol=1e-10)
+    np.testing.assert_allclose(H_c.T @ r_c, H_0.T @ r_0, atol=1e-10)
+    assert R_f.shape == (3, 3) and H_1.shape == (3, 9) and r_1.shape == (3,)
+
+
+def test_update_is_the_information_form():
+    rng = np.random.default_rng(6)
+    A = rng.normal(size=(8, 8))
+    P, columns, H, r = A @ A.T + np.eye(8), np.array([1, 4, 6]), rng.normal(size=(5, 3)), rng.normal(size=5)
+    full = np.zeros((5, 8))
+    full[:, columns] = H
+    dx, P_new = ekf.update(P, columns, H, r, 0.3)
+    expected = np.linalg.inv(np.linalg.inv(P) + full.T @ full / 0.3)
+    np.testing.assert_allclose(P_new, expected, atol=1e-9)
+    np.testing.assert_allclose(dx, expected @ full.T @ r / 0.3, atol=1e-9)
+
+
+def test_landmarks_are_spread_over_the_view():
+    near = {i: np.array([0.01 * i, 0.0, 1.0]) for i in range(8)}
+    spread = Spread(near, 8)
+    assert not spread.admits(np.array([0.02, 0.01, 1.0]))  # its cell is full
+    far = np.array([1.0, 0.3, 1.0])
+    assert cell(far) != cell(near[0]) and spread.admits(far)
+    assert spread.add(99, far) == 7  # the newest of the crowd goes
+    assert Spread({}, 8).add(1, far) is None
+
+
+# -- the filter on simulated tracks --------------------------------------------------------------------------------------
+
+
+class SimulatedTracks:
+    """Points on the walls of a room, seen through the real lens with noise: tracks without images."""
+
+    def __init__(self, rng, pixel_noise=0.5, count=80):
+        self.rng, self.noise, self.count = rng, pixel_noise, count
+        low, high = np.array([-4.0, -2.5, 0.0]), np.array([1.76, 2.5, 4.0])
+        self.points = rng.uniform(low, high, (3000, 3))
+        face = rng.integers(0, 6, 3000)
+        self.points[np.arange(3000), face // 2] = np.where(face % 2, high[face // 2], low[face // 2])
+        self.active, self.next = {}, 0
+
+    def __call__(self, p_WB, R_WB, R_BC):
+        X_C = ((self.points - p_WB) @ R_WB - MOUNT.p_BC) @ R_BC
+        pixels, valid = MOUNT.camera.project(X_C)
+        valid &= MOUNT.camera.contains(pixels, 8) & (np.arctan2(np.hypot(*X_C[:, :2].T), X_C[:, 2]) < 1.35)
+        self.active = {w: i for w, i in self.active.items() if valid[w] and self.rng.uniform() > 0.01}
+        fresh = self.rng.permutation(np.setdiff1d(np.flatnonzero(valid), list(self.active)))
+        for w in fresh[: max(0, self.count - len(self.active))]:
+            self.active[int(w)], self.next = self.next, self.next + 1
+        where = np.array(list(self.active), int)
+        return np.array(list(self.active.values()), int), pixels[where] + self.rng.normal(0, self.noise, (len(where), 2))
+
+
+@dataclasses.dataclass
+class Run:
+    """The filter over a perch with simulated tracks, from a known state; calibration is wrong as it is in life."""
+
+    seed: int
+    config: VioConfig = dataclasses.field(default_factory=lambda: dataclasses.replace(
+        VioConfig(), filter=dataclasses.replace(VioConfig().filter, pixel_noise=0.6, zoom_noise=0.0)))
+    start: float = 2.2
+    turn_deg: float = 0.5
+    offset: float = 0.010  # true; the file says 0.008
+    steps: list = dataclasses.field(default_factory=list)
+
+    def __post_init__(self):
+        rng = np.random.default_rng(self.seed)
+        self.motion = PerchMotion(seed=self.seed)
+        times = np.arange(0.0, self.motion.duration - 0.003, 0.002)
+        truth = self.motion.sample(times)
+        readings = read_imu(truth, IMU, rng)
+        imu = ImuBuffer(self.config.imu, self.config.faults, 10.0)
+        for k, t in enumerate(times):
+            imu.add(ImuSample(round(t * 1e9), tuple(readings.gyro[k]), tuple(readings.accel[k])))
+        self.imu, self.k0 = imu, round(self.start / 0.002)
+        self.R_BC = MOUNT.R_BC @ so3.exp(np.radians(self.turn_deg) * np.array([0.6, -0.5, 0.62]))
+        k, sigma = self.k0, np.concatenate([np.repeat([0.005, 0.001, 0.02, 0.001, 0.05, 0.009, 0.002], 3), [0.002, 0.003]])
+        e = rng.normal(size=23) * sigma
+        self.filter = Msckf(self.config, State(
+            round(times[k] * 1e9), truth.R_WB[k] @ so3.exp(e[:3]), truth.p_WB[k] + e[3:6], truth.v_WB[k] + e[6:9],
+            readings.gyro_bias[k] + e[9:12], readings.accel_bias[k] + e[12:15], MOUNT.R_BC.copy(), MOUNT.p_BC.copy(), 0.008,
+            np.diag(sigma**2)), MOUNT.camera.fx)
+        self.tracks = SimulatedTracks(rng)
+
+    def frames(self, count=None):
+        stamp, frame, s = self.start + 0.02, 0, self.filter.state
+        while stamp + 0.02 < self.motion.duration - 0.01 and (count is None or frame < count):
+            m = self.motion.sample(np.array([stamp + self.offset]))
+            ids, pixels = self.tracks(m.p_WB[0], m.R_WB[0], self.R_BC)
+            exposed = round((stamp + s.time_offset) * 1e9)
+            self.filter.propagate(self.imu.run(s.stamp, exposed), exposed)
+            report = self.filter.add_frame(frame, ids, observe(MOUNT.camera, pixels))
+            truth = self.motion.sample(np.array([exposed * 1e-9]))
+            error = np.concatenate([so3.log(s.R_WB.T @ truth.R_WB[0]), truth.p_WB[0] - s.p_WB, truth.v_WB[0] - s.v_WB])
+            frame, stamp = frame + 1, stamp + 1 / 30
+            yield report, error
+
+
+def test_the_filter_follows_a_perch_and_finds_the_calibration():
+    run = Run(1)
+    errors = np.array([error for _, error in run.frames()])
+    assert np.sqrt((errors[:, 3:6] ** 2).mean(axis=0)).max() < 0.02
+    s = run.filter.state
+    assert abs(s.time_offset - run.offset) < 5e-4                                  # was 2 ms off
+    assert np.degrees(np.linalg.norm(so3.log(s.R_BC.T @ run.R_BC))) < 0.3         # was 0.5 deg off
+
+
+def test_nees_of_the_filter_on_simulated_tracks():
+    """The settings that fly, over hover and perch, with tracks of 1.5 px noise."""
+    values = []
+    for seed in range(5):
+        run = Run(seed + 10, VioConfig(), start=3.4)
+        run.tracks.noise = 1.5
+        for _, error in run.frames():
+            pass
+        P = run.filter.state.P[:9, :9]
+        values.append(error @ np.linalg.solve(P, error) / 9)
+    assert 0.3 < np.mean(values) < 2.0
+
+
+def test_yaw_and_position_stay_unobservable():
+    """Every update's Jacobian is orthogonal to the null space at the first estimates, and propagation keeps it."""
+    run, angles = Run(2), []
+    filter_ = run.filter
+    original = filter_.apply
+
+    def checked(columns, H, r, variance):
+        N = filter_.state.null_space()[columns]
+        scale = np.linalg.norm(H) * np.linalg.norm(N)
+        angles.append(np.linalg.norm(H @ N) / scale)
+        return original(columns, H, r, variance)
+
+    filter_.apply = checked
+    for _ in run.frames(60):
+        pass
+    assert len(angles) > 60
+    assert max(angles) < 1e-9
+
+
+def test_propagation_carries_the_null_space_along():
+    """Phi N_k = N_(k+1) with N at the first estimates, also after an update has moved the state away from them."""
+    run = Run(3)
+    for _ in run.frames(20):
+        pass
+    s = run.filter.state
+    s.drop_clones(list(range(len(s.clones))))
+    s.drop_landmarks(set(s.landmarks))
+    before = s.null_space()[:9]
+    # a covariance of rank 4 along the null space and no noise: what comes out is Phi N N^T Phi^T
+    s.P = np.zeros((23, 23))
+    s.P[:9, :9] = before @ before.T
+    quiet = dataclasses.replace(run.config.imu, gyro_bias_walk=1e-12, accel_bias_walk=1e-12)
+    run.filter.config = dataclasses.replace(run.config, imu=quiet)
+    rows = run.imu.run(s.stamp, s.stamp + 33_000_000)
+    rows[:, 7:] = 0.0
+    run.filter.propagate(rows, s.stamp + 33_000_000)
+    after = s.null_space()[:9]
+    np.testing.assert_allclose(s.P[:9, :9], after @ after.T, atol=1e-9)
+
+
+def test_yaw_gets_no_surer_than_it_was():
+    run = Run(4)
+    e3 = np.array([0.0, 0.0, 1.0])
+    up = run.filter.state.R_first.T @ e3
+    first = up @ run.filter.state.P[:3, :3] @ up
+    for _ in run.frames(70):
+        s = run.filter.state
+        # variance of the yaw of the oldest clone: everything else in the window is relative to it
+        J = s.clones[0].R_first.T @ e3
+        k = s.clone_at(0)
+        assert J @ s.P[k : k + 3, k : k + 3] @ J > 0.99 * first
+
+
+def test_tracks_that_jump_about_are_kept_out():
+    run = Run(5)
+    base, rng = run.tracks, np.random.default_rng(55)
+
+    def spoiled(*pose):
+        ids, pixels = base(*pose)
+        bad = ids % 10 == 0
+        pixels[bad] += rng.normal(0, 20.0, (int(bad.sum()), 2))
+        return ids, pixels
+
+    run.tracks, used = spoiled, 0
+    for report, error in run.frames(70):
+        used += report.used
+        assert not any(i % 10 == 0 for i in run.filter.state.landmarks)
+    assert used > 500
+    assert np.linalg.norm(error[3:6]) < 0.06
+
+
+def test_a_landmark_that_starts_to_jump_is_dropped():
+    run, chosen = Run(6), []
+    base = run.tracks
+
+    def spoiled(*pose):
+        ids, pixels = base(*pose)
+        pixels[np.isin(ids, chosen)] += 40.0
+        return ids, pixels
+
+    run.tracks = spoiled
+    for frame, (report, _) in enumerate(run.frames(40)):
+        if frame == 25:
+            chosen.append(next(iter(run.filter.state.landmarks)))
+        if frame == 26:
+            assert report.refused >= 1
+    assert chosen[0] not in run.filter.state.landmarks
+
+
+# -- start in motion -----------------------------------------------------------------------------------------------------
+
+
+def test_velocity_and_gravity_from_half_a_second_of_motion():
+    motion = PerchMotion(seed=6)
+    times = 1.9 + np.arange(15) / 30
+    m = motion.sample(times)
+    R0, rng = m.R_WB[0], np.random.default_rng(7)
+    fine = motion.sample(np.arange(times[0], times[-1] + 1e-9, 0.002))
+    g = np.array([0.0, 0.0, -GRAVITY])
+    T = times - times[0]
+    dp = (m.p_WB - m.p_WB[0] - m.v_WB[0] * T[:, None] - 0.5 * g * T[:, None] ** 2) @ R0
+    dR = R0.T @ m.R_WB
+    centres = dR @ MOUNT.p_BC
+    X = np.column_stack([rng.uniform(-1, 1, (40, 2)), np.zeros(40)])
+    rays, frames = [], []
+    for x in X:
+        d = (x - m.p_WB) @ R0 - centres
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        rays.append(d + rng.normal(0, 1e-3, d.shape))
+        rays[-1] /= np.linalg.norm(rays[-1], axis=1, keepdims=True)
+        frames.append(np.arange(15))
+    found = solve_motion(T, dp, centres, rays, frames, 1e-3)
+    assert np.linalg.norm(found.v - R0.T @ m.v_WB[0]) < 0.05
+    assert np.degrees(so3.angle_between(found.g, R0.T @ g)) < 1.0
+    assert np.linalg.norm(found.g) == pytest.approx(GRAVITY)
+    assert fine.times[-1] <= times[-1] + 1e-9
+
+
+def test_a_vehicle_that_stands_still_tells_no_scale():
+    rays = [np.tile([0.1 * k, 0.2, -1.0] / np.linalg.norm([0.1 * k, 0.2, -1.0]), (15, 1)) for k in range(20)]
+    T = np.arange(15) / 30
+    dp = 0.5 * GRAVITY * np.outer(T**2, [0, 0, 1])
+    assert solve_motion(T, dp, np.zeros((15, 3)), rays, [np.arange(15)] * 20, 1e-3) is None
+
+
+# -- bookkeeping ---------------------------------------------------------------------------------------------------------
+
+
+def test_tracks_end_and_forget():
+    tracks = Tracks()
+    camera = MOUNT.camera
+    for frame in range(5):
+        ids = np.array([1, 2]) if frame < 3 else np.array([2, 3])
+        ended = tracks.take_ended(ids)
+        assert list(ended) == ([1] if frame == 3 else [])
+        tracks.observe(frame, ids, observe(camera, np.full((2, 2), 300.0)))
+    tracks.forget_before(2)
+    assert tracks.by_id[2].frames == [2, 3, 4] and len(tracks.by_id[2].b_C) == 3
+
+
+def test_a_clone_is_fully_correlated_with_the_pose():
+    run = Run(8)
+    s = run.filter.state
+    s.P[at.TIME_OFFSET, at.TIME_OFFSET] = 1e-12
+    s.add_clone(0, np.zeros(3))
+    k = s.clone_at(0)
+    np.testing.assert_allclose(s.P[k : k + 6, k : k + 6], s.P[:6, :6], atol=1e-9)
+    np.testing.assert_allclose(s.P[k : k + 6, :6], s.P[:6, :6], atol=1e-9)
+    s.drop_clones([0])
+    assert s.size == at.CORE_SIZE
