@@ -10,7 +10,8 @@ from perch_core.lines import scaled_clearance
 from perch_core.rotor_model import P, Q, THRUST, V, W
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
-from perch_planner.powerline.planner import Manoeuvre, PowerlinePlanner
+from perch_planner.powerline.plan import Manoeuvre
+from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.starts import random_start
 
 VEHICLE = load_vehicle("rpg")

@@ -19,7 +19,7 @@ from perch_core.ros.trajectories import sampled_message
 from perch_core.rotor_model import P, THRUST, V, W, RotorModel, hover_state
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline.certificate import Bound
-from perch_planner.powerline.planner import PowerlinePlan
+from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 from perch_planner.powerline.worker import START_TIMEOUT, PowerlineWorker

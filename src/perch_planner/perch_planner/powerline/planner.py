@@ -2,108 +2,67 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from perch_core import rotor_model
 from perch_core.errors import PlanningRefusal
-from perch_core.lines import Segment
-from perch_core.rotor_model import P, Q, STATES, THRUST, V, W
+from perch_core.lines import Segment, scaled_clearance
+from perch_core.rotor_model import P, Q, STATES, THRUST
 from perch_core.so3 import quat_from_matrix
-from perch_core.trajectory import SampledTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import Bound, certify, certify_end
 from perch_planner.powerline.flight import fly
 from perch_planner.powerline.nlp import Numbers, Solution, Structure
+from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
 from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
-from perch_planner.powerline.settings import Margins, PowerlineSettings
+from perch_planner.powerline.settings import Margins, PerchWeights, PowerlineSettings
 from perch_planner.powerline.solving import PHASES, Solver, end_weights, run_weights, see_weights
 from perch_planner.powerline.stage_functions import line_parameters
 from perch_planner.powerline.validation import check_request
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
 ATTEMPTS = 6  # solves of one manoeuvre: margins raised, then N, then another guess and solver
-RADIUS_REDUCTION = 0.02  # the paper's, for the recovery, which starts at the wire [m]
+RADIUS_REDUCTION = 0.02  # the paper's, for a recovery that starts at the wire: part of a wire's radius is safety [m]
 
 
 @dataclass(frozen=True)
-class Manoeuvre:
-    """A checked perch or recovery.
+class _Task:
+    """One manoeuvre to solve: a perch or a recovery.
 
     Attributes:
-        times: [s], shape (m,), from 0, about 1 ms apart.
-        states: shape (m, 17), see `rotor_model`.
-        rates: thrust rates [N/s], shape (m, 4).
-        bounds: what was checked.
-        intervals: N of the accepted solve.
-        solver: fatrop or ipopt.
-        iterations: of all solves.
-        solve_time: wall-clock time of all solves [s].
-        cpu_time: processor time of all solves [s]; on a quiet machine the same.
-        cost: value of [P:eq14a].
+        name: for messages.
+        start: shape (17,).
+        wanted: end pose and velocity.
+        lines: in the problem, the target first.
+        known: every line, for the check.
+        perception: keep the first line in view.
+        weights: of the first phase.
+        pinned: factors on the end weights in the later phases, shape (6,).
+        duration: bounds of T [s].
+        margins: to begin with.
+        radius_reduction: taken off the wires' radius [m].
+        guess: attempt and N -> states and inputs.
+        accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
+        solver: first choice.
     """
 
-    times: np.ndarray
-    states: np.ndarray
-    rates: np.ndarray
-    bounds: tuple[Bound, ...]
-    intervals: int
+    name: str
+    start: np.ndarray
+    wanted: PerchPose
+    lines: tuple[Segment, ...]
+    known: tuple[Segment, ...]
+    perception: bool
+    weights: PerchWeights
+    pinned: np.ndarray
+    duration: tuple[float, float]
+    margins: Margins
+    radius_reduction: float
+    guess: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
+    accuracy: tuple[float, float, float]
     solver: str
-    iterations: int
-    solve_time: float
-    cpu_time: float
-    cost: float
-
-    @property
-    def duration(self) -> float:
-        """T [s]."""
-        return float(self.times[-1])
-
-
-@dataclass(frozen=True)
-class PowerlinePlan:
-    """A perch, a recovery, or one after the other."""
-
-    perch: Manoeuvre | None
-    recovery: Manoeuvre | None
-
-    @property
-    def parts(self) -> tuple[Manoeuvre, ...]:
-        """Perch and recovery, in order, without those that were not asked for."""
-        return tuple(part for part in (self.perch, self.recovery) if part is not None)
-
-    @property
-    def bounds(self) -> tuple[Bound, ...]:
-        """Every certificate; those of an appended recovery are named `recovery_*`."""
-        if self.perch is None or self.recovery is None:
-            return tuple(bound for part in self.parts for bound in part.bounds)
-        shift = self.perch.duration
-        late = (replace(b, quantity=f"recovery_{b.quantity}", time_of_minimum=b.time_of_minimum + shift,
-                        time_of_maximum=b.time_of_maximum + shift) for b in self.recovery.bounds)
-        return (*self.perch.bounds, *late)
-
-    def trajectory(self, model: rotor_model.RotorModel, start_time: float = 0.0, step: float = 0.0) -> SampledTrajectory:
-        """Perch and recovery as one trajectory for the controller.
-
-        Args:
-            model: constants.
-            start_time: stamp of the start [s].
-            step: wanted spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always there.
-        """
-        times, states = [], []
-        begin = 0.0
-        for part in self.parts:
-            stride = max(1, round(step * (len(part.times) - 1) / part.duration))
-            rows = np.append(np.arange(0, len(part.times) - 1, stride), len(part.times) - 1)[1 if times else 0:]
-            times.append(begin + part.times[rows])
-            states.append(part.states[rows])
-            begin += part.duration
-        times, states = np.concatenate(times), np.concatenate(states)
-        a_W, dw_B = rotor_model.accelerations(model, states)
-        return SampledTrajectory(times=times, p=states[:, P], q=states[:, Q], v=states[:, V], w=states[:, W], a=a_W,
-                                 dw=dw_B, rotor_thrust=states[:, THRUST], start_time=start_time)
 
 
 @dataclass
@@ -131,19 +90,15 @@ class PowerlinePlanner:
             PlanningRefusal: bad request, or no trajectory within the limits was found.
         """
         check_request(request, self.vehicle, self.settings)
+        hover = request.start[P] if request.hover is None else np.asarray(request.hover, float)
         if request.recovery_only:
-            hover = request.start[P] if request.hover is None else request.hover
-            return PowerlinePlan(None, self._recovery(request, request.start, hover))
-        perch = self._perch(request)
-        recovery = None
-        if request.with_recovery:
-            recovery = self._recovery(request, perch.states[-1], request.start[P] if request.hover is None else request.hover)
+            return PowerlinePlan(None, self._fly(self._recovery(request, request.start, hover)))
+        perch = self._fly(self._perch(request))
+        recovery = self._fly(self._recovery(request, perch.states[-1], hover)) if request.with_recovery else None
         return PowerlinePlan(perch, recovery)
 
-    def _perch(self, request: PowerlineRequest) -> Manoeuvre:
-        s = self.settings
-        pose = request.perch
-        target = request.target()
+    def _perch(self, request: PowerlineRequest) -> _Task:
+        s, pose, target = self.settings, request.perch, request.target()
         turn = 0.0
         if request.perception:
             q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)
@@ -152,99 +107,118 @@ class PowerlinePlanner:
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
             return guess.perch_guess(self.solver.model, request.start, pose.p_WB, pose.s3_W, s.height_min + 0.05, intervals,
-                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1)[attempt % 5], turn)
+                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn)
 
-        def end_check(times: np.ndarray, states: np.ndarray) -> tuple[Bound, ...]:
-            return certify_end(times, states, pose, s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed)
+        return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
+                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, first_guess,
+                     (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
 
-        reference = np.concatenate([pose.p_WB, pose.s3_W, pose.v_W, np.zeros(3)])
-        lines = self._relevant(request.lines, target, request.start[P], pose.p_WB)
-        return self._solve("perch", request, request.start, reference, lines, s.perch, s.duration, first_guess, end_check,
-                           np.full(6, s.end_factor))
-
-    def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> Manoeuvre:
+    def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
         s = self.settings
-        upright = PerchPose(np.asarray(hover, float), E3)
         start = start.copy()
         start[THRUST] = np.clip(start[THRUST], self.vehicle.thrust_min, s.thrust_share * self.vehicle.thrust_max)
+        margins, reduction = self._room(start, request.lines)
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
             return guess.recovery_guess(self.solver.model, start, hover, s.height_min + 0.1, intervals,
-                                        (1.2, 0.9, 1.6, 1.9, 0.7)[attempt % 5])
+                                        (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
 
-        def end_check(times: np.ndarray, states: np.ndarray) -> tuple[Bound, ...]:
-            return certify_end(times, states, upright, np.inf, s.accuracy.tilt_deg, s.accuracy.speed)
+        nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
+        pinned = np.array([1.0, 1.0, *[s.end_factor] * 4])  # upright and at rest, but not at one place
+        return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
+                     False, s.recovery, pinned, s.recovery_duration, margins, reduction, first_guess,
+                     (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
 
-        reference = np.concatenate([upright.p_WB, E3, np.zeros(6)])
-        near = min(request.lines, key=lambda line: float(line.distance(start[P]))) if request.lines else None
-        lines = self._relevant(request.lines, near, start[P], upright.p_WB)
-        return self._solve("recovery", replace(request, perception=False), start, reference, lines, s.recovery,
-                           s.recovery_duration, first_guess, end_check,
-                           np.array([1.0, 1.0, *[s.end_factor] * 4]))  # upright and at rest, but not at one place
+    def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
+        """Margins that the start of a recovery leaves, and what to take off the wires' radii for it to begin free.
 
-    def _solve(self, name, request, start, reference, lines, weights, duration, first_guess, end_check, end_factor) -> Manoeuvre:
+        Raises:
+            PlanningRefusal: the body cuts a wire by more than that.
+        """
+        margins, clearance = self.settings.margins, np.inf
+        height = min(margins.height, max(0.0, 0.5 * (start[2] - self.settings.height_min)))
+        for reduction in (0.0, RADIUS_REDUCTION):
+            thin = [replace(line, radius=max(line.radius - reduction, 1e-3)) for line in lines]
+            clearance = min((float(scaled_clearance(start[None, P], start[None, Q], line, self.vehicle.body_radii)[0])
+                             for line in thin), default=np.inf)
+            if clearance > 0:
+                share = 1.0 if np.isinf(clearance) else ((1 + clearance) ** 2 - 1) / ((1 + clearance) ** 2 + 1)
+                return replace(margins, height=height, clearance=min(margins.clearance, 0.5 * share)), reduction
+        raise PlanningRefusal("start_invalid", "clearance [P:eq14j]", clearance,
+                              f"no recovery: the body cuts a line, scaled distance {1 + clearance:.2f} < 1")
+
+    def _fly(self, task: _Task) -> Manoeuvre:
+        """Solve, fly and check until the check passes.
+
+        Raises:
+            PlanningRefusal: it does not.
+        """
         s, vehicle = self.settings, self.vehicle
-        thrust_max = max(s.thrust_share * vehicle.thrust_max, float(start[THRUST].max()))
-        margins, intervals = s.margins, s.intervals
-        solver_name = request.solver or s.solver
+        thrust_max = max(s.thrust_share * vehicle.thrust_max, float(task.start[THRUST].max()))
+        margins, intervals, lines, solver_name = task.margins, s.intervals, task.lines, task.solver
         iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, "first"
         for attempt in range(ATTEMPTS):
-            states, inputs = previous if previous is not None else first_guess(attempt, intervals)
+            if time > s.deadline:  # a refusal with its cause is worth more than being stopped
+                break
+            states, inputs = previous if previous is not None else task.guess(attempt, intervals)
             numbers = Numbers(
-                start=start, reference=reference, lines=np.array([line_parameters(line) for line in lines]).reshape(-1, 8),
-                run_weights=run_weights(weights, s.ramp, vehicle.thrust_rate_max, intervals), end_weights=end_weights(weights),
-                see_weights=see_weights(s.perception, intervals), duration=duration,
+                start=task.start, reference=np.concatenate([task.wanted.p_WB, task.wanted.s3_W, task.wanted.v_W, np.zeros(3)]),
+                lines=np.array([line_parameters(line, task.radius_reduction) for line in lines]).reshape(-1, 8),
+                run_weights=run_weights(task.weights, s.ramp, vehicle.thrust_rate_max, intervals),
+                end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
                 height_min=s.height_min + margins.height,
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
                 body_rate=vehicle.body_rate_max - margins.body_rate, clearance=margins.clearance, states=states, inputs=inputs,
                 defects=np.zeros((intervals, STATES + 1)))
-            structure = Structure(intervals, len(lines), request.perception, solver_name)
-            found = self.solver.solve(structure, numbers, numbers.end_weights * end_factor, phase)
+            structure = Structure(intervals, len(lines), task.perception, solver_name)
+            found = self.solver.solve(structure, numbers, numbers.end_weights * task.pinned, phase)
             iterations, time, cpu_time = iterations + found.iterations, time + found.time, cpu_time + found.cpu_time
             if not (found.converged and np.all(np.isfinite(found.states))):
                 previous, phase = None, "first"
-                if attempt >= 1:
-                    solver_name = "ipopt"
+                solver_name = "ipopt" if attempt >= 1 else solver_name
                 continue
             rates = vehicle.thrust_rate_max * np.clip(found.inputs, -1.0, 1.0)
-            times, flown, dense_rates = fly(self.solver.model, start, rates, found.duration)
-            bounds = certify(vehicle, times, flown, dense_rates, request.lines, s.height_min, thrust_max) + end_check(times, flown)
+            times, flown, dense_rates = fly(self.solver.model, task.start, rates, found.duration)
+            bounds = (*certify(vehicle, times, flown, dense_rates, task.known, s.height_min, thrust_max, task.radius_reduction),
+                      *certify_end(times, flown, task.wanted, *task.accuracy))
             broken = [bound for bound in bounds if not bound.holds]
             if not broken:
                 return Manoeuvre(times, flown, dense_rates, bounds, intervals, solver_name, iterations, time, cpu_time,
-                                  found.cost)
+                                 found.cost)
             worst = broken[0]
             only_end = all(bound.quantity.startswith("end_") for bound in broken)
-            margins, lines = self._tightened(margins, broken), self._joined(lines, request.lines, flown)
+            margins, lines = _tightened(margins, broken), _joined(lines, task.known, flown, max(vehicle.body_radii))
             if attempt >= 2 and not only_end:
                 intervals = int(np.ceil(1.5 * intervals))
             previous, phase = _resampled(found, intervals), "polish" if only_end else "second"
         if worst is not None:
-            raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {name} within the limits: {worst}")
-        raise PlanningRefusal("infeasible", name, -1.0,
-                              f"no {name} was found: the solver did not converge from {ATTEMPTS} guesses ({found.status}); "
+            raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {task.name} within the limits: {worst}")
+        raise PlanningRefusal("infeasible", task.name, -1.0,
+                              f"no {task.name} was found: the solver did not converge from several guesses ({found.status}); "
                               "start farther away, higher, or choose another pitch")
 
-    def _tightened(self, margins: Margins, broken: list[Bound]) -> Margins:
-        raised = {}
-        for bound in broken:
-            if bound.quantity in ("height", "clearance", "thrust", "body_rate"):
-                raised[bound.quantity] = getattr(margins, bound.quantity) + 1.5 * abs(bound.margin) + 1e-3
-        return replace(margins, **raised)
 
-    def _relevant(self, lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> list[Segment]:
-        """The target first, then the others nearest to the straight way."""
-        way = np.linspace(start, end, 20)
-        others = sorted((line for line in lines if line is not target), key=lambda line: float(line.distance(way).min()))
-        return ([target] if target is not None else []) + others[: LINES_MAX - 1]
+def _tightened(margins: Margins, broken: list[Bound]) -> Margins:
+    """Margins raised by half more than what is violated."""
+    raised = {bound.quantity: getattr(margins, bound.quantity) + 1.5 * abs(bound.margin) + 1e-3
+              for bound in broken if hasattr(margins, bound.quantity)}
+    return replace(margins, **raised)
 
-    def _joined(self, lines: list[Segment], known: tuple[Segment, ...], flown: np.ndarray) -> list[Segment]:
-        """The lines of the problem, the last replaced by one that the flight came too near to without its being there."""
-        known_ids = {line.id for line in lines}
-        for line in known:
-            if line.id not in known_ids and float(line.distance(flown[:, P]).min()) < 1.2 * max(self.vehicle.body_radii):
-                return [*lines[: LINES_MAX - 1], line]
-        return lines
+
+def _relevant(lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> tuple[Segment, ...]:
+    """The target first, then the others nearest to the straight way."""
+    way = np.linspace(start, end, 20)
+    others = sorted((line for line in lines if line is not target), key=lambda line: float(line.distance(way).min()))
+    return (*([target] if target is not None else []), *others[: LINES_MAX - 1])
+
+
+def _joined(lines: tuple[Segment, ...], known: tuple[Segment, ...], flown: np.ndarray, reach: float) -> tuple[Segment, ...]:
+    """The lines of the problem, the last replaced by one that the flight came too near to without its being there."""
+    present = {line.id for line in lines}
+    for line in known:
+        if line.id not in present and float(line.distance(flown[:, P]).min()) < 1.2 * reach:
+            return (*lines[: LINES_MAX - 1], line)
+    return lines
 
 
 def _resampled(found: Solution, intervals: int) -> tuple[np.ndarray, np.ndarray]:

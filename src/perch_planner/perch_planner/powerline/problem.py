@@ -14,7 +14,8 @@ from perch_core.errors import ConfigError
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, V, W, hover_state
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
-from perch_planner.powerline.planner import PowerlinePlan, PowerlinePlanner
+from perch_planner.powerline.plan import PowerlinePlan
+from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 

@@ -12,7 +12,7 @@ from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment
 from perch_core.rotor_model import P, V, RotorModel, hover_state
 from perch_core.vehicle import Vehicle
-from perch_planner.powerline.planner import PowerlinePlan
+from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.problem import PowerlineProblem
 from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.visibility import visibility

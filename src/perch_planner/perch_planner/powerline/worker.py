@@ -17,7 +17,7 @@ from typing import Any
 
 from perch_core.errors import PerchError, PlanningRefusal
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_planner.powerline.planner import PowerlinePlan
+from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 

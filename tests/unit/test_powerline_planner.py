@@ -1,0 +1,142 @@
+"""The planner around the solver: recoveries from anywhere, extra lines, files and reports, the search for a start."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perch_core import so3
+from perch_core.errors import ConfigError, PlanningRefusal
+from perch_core.lines import Segment
+from perch_core.rotor_model import P, Q, V
+from perch_core.vehicle import load_vehicle
+from perch_planner.powerline import problem
+from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
+from perch_planner.powerline.problem import PlannedProblem
+from perch_planner.powerline.starts import StartSearch, best_start
+
+ROOT = Path(__file__).resolve().parents[2]
+VEHICLE = load_vehicle("rpg")
+SETUP = problem.load("powerline_line_80")
+REQUEST = SETUP.request(VEHICLE)
+
+
+@pytest.fixture(scope="module")
+def planner() -> PowerlinePlanner:
+    return PowerlinePlanner(VEHICLE)
+
+
+@pytest.fixture(scope="module")
+def planned(planner: PowerlinePlanner) -> PlannedProblem:
+    return PlannedProblem(SETUP, VEHICLE, REQUEST, planner, planner.plan(REQUEST))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.8, 1.0])
+def test_an_abort_at_any_time_finds_a_recovery(planner: PowerlinePlanner, planned: PlannedProblem, share: float) -> None:
+    perch = planned.plan.perch
+    state = perch.states[int(share * (len(perch.times) - 1))]
+    plan = planner.plan(replace(REQUEST, start=state, perch=None, recovery_only=True))
+    assert plan.perch is None and all(bound.holds for bound in plan.bounds)
+    np.testing.assert_allclose(plan.recovery.states[0, :13], state[:13])
+    assert np.linalg.norm(plan.recovery.states[-1, V]) < 0.02
+    assert so3.quat_to_matrix(plan.recovery.states[-1, Q])[2, 2] > np.cos(np.radians(0.1))
+
+
+def test_a_recovery_begins_even_where_the_flight_has_eaten_the_margin(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
+    state = planned.plan.perch.states[-1].copy()
+    state[P] -= 0.028 * REQUEST.perch.s3_W  # 2 mm of air are left
+    plan = planner.plan(replace(REQUEST, start=state, perch=None, recovery_only=True))
+    assert all(bound.holds for bound in plan.bounds)
+
+
+def test_a_recovery_from_inside_a_wire_is_refused(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
+    state = planned.plan.perch.states[-1].copy()
+    state[P] -= 0.1 * REQUEST.perch.s3_W
+    with pytest.raises(PlanningRefusal, match="the body cuts a line") as refusal:
+        planner.plan(replace(REQUEST, start=state, perch=None, recovery_only=True))
+    assert refusal.value.code == "start_invalid"
+
+
+def test_more_lines_than_the_problem_holds_are_all_avoided(planner: PowerlinePlanner) -> None:
+    fence = tuple(Segment([8.0 + 0.3 * k, 0, 4.2], [0, 1, 0], 2.0, 0.03, 100 + k) for k in range(2 * LINES_MAX))
+    plan = planner.plan(replace(REQUEST, lines=REQUEST.lines + fence, with_recovery=False))
+    assert next(b for b in plan.bounds if b.quantity == "clearance").holds
+
+
+def test_a_perch_that_no_trajectory_reaches_is_refused_with_what_is_violated(planner: PowerlinePlanner) -> None:
+    # Gaps of 0.2 m: even edge on the body needs 0.24 m. (It does slip through gaps of 0.35 m.)
+    cage = tuple(Segment([2.0, 0.0, 0.5 + 0.2 * k], [0, 1, 0], 60.0, 0.03, 100 + k) for k in range(120))
+    with pytest.raises(PlanningRefusal) as refusal:
+        planner.plan(replace(REQUEST, lines=REQUEST.lines + cage, with_recovery=False))
+    assert refusal.value.code == "infeasible"
+
+
+def test_the_report_holds_what_was_planned(planned: PlannedProblem, tmp_path: Path) -> None:
+    written = problem.report(planned, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plan.csv", "plan.json", "plan.png", "visibility.png"]
+    content = json.loads((tmp_path / "plan.json").read_text())
+    assert content["perch"]["duration_s"] == planned.plan.perch.duration == written["perch"]["duration_s"]
+    assert all(certificate["holds"] for certificate in content["certificates"])
+    with (tmp_path / "plan.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    joint = min(rows, key=lambda row: abs(float(row["t"]) - planned.plan.perch.duration))
+    np.testing.assert_allclose([float(joint[f"p_{axis}"]) for axis in "xyz"], REQUEST.perch.p_WB, atol=1e-3)
+    assert float(rows[-1]["t"]) == pytest.approx(planned.plan.perch.duration + planned.plan.recovery.duration)
+
+
+def test_plan_script_plans_and_refuses(tmp_path: Path) -> None:
+    def run(*arguments: str) -> subprocess.CompletedProcess:
+        return subprocess.run([sys.executable, str(ROOT / "scripts" / "plan.py"), *arguments, "--out", str(tmp_path)],
+                              capture_output=True, text=True, check=False, timeout=300)
+
+    done = run("powerline_line_20")
+    assert done.returncode == 0 and "perch of 2." in done.stdout and (tmp_path / "plan.png").is_file(), done.stderr
+    refused = run("powerline_line_20", "--set", "height_min=4.5")
+    assert refused.returncode == 1 and "below height_min 4.5 m" in refused.stderr
+    assert run("powerline_line_20", "--set", "heigth_min=4.5").returncode == 2
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ("perch: {point: [4, 0, 4.2]}", "position and orientation, or point and pitch_deg"),
+    ("perch: {point: [4, 0, 4.2], pitch_deg: 200}", "outside"),
+    ("vehicle: [1]", "str"),
+    ("lines: [{centre: [0, 0, 1], direction: [0, 1, 0], half_length: -1}]", "half_length"),
+    ("settings: {duration: [3, 1]}", "interval"),
+    ("gripper: 3", "unknown key"),
+])
+def test_problem_files_are_read_strictly(change: str, words: str, tmp_path: Path) -> None:
+    key = change.partition(":")[0]
+    text = (ROOT / "config" / "problems" / "powerline_line_80.yaml").read_text()
+    kept, skip = [], False
+    for line in text.splitlines():
+        if not line.startswith((" ", "#")):
+            skip = line.startswith(f"{key}:")
+        if not skip:
+            kept.append(line)
+    path = tmp_path / "problem.yaml"
+    path.write_text("\n".join([*kept, change]))
+    with pytest.raises(ConfigError, match=words):
+        problem.load(path)
+
+
+def test_best_start_prefers_sight_and_short_ways(planner: PowerlinePlanner) -> None:
+    request = replace(problem.load("powerline_line_80_pa").request(VEHICLE), with_recovery=False)
+    search = StartSearch(distances=(3.0,), heights=(0.0, -4.0), bearings=(0.0,))
+    scores = best_start(request, planner.plan, VEHICLE, planner.solver.model, 0.8, search=search)
+    assert len(scores) == 2  # the present start and one candidate: the other is below the minimum height
+    assert scores[0].score <= scores[1].score < np.inf
+    for item in scores:
+        assert item.plan is not None and item.duration == item.plan.perch.duration and 0 <= item.seen_share <= 1
+
+
+def test_starts_that_are_refused_come_last_with_their_reason(planner: PowerlinePlanner) -> None:
+    search = StartSearch(distances=(0.05,), heights=(0.0,), bearings=(0.0,))
+    scores = best_start(replace(REQUEST, with_recovery=False), planner.plan, VEHICLE, planner.solver.model, 0.8, search=search)
+    assert scores[0].plan is not None and scores[1].plan is None and "nearer than the body" in scores[1].refusal
