@@ -106,7 +106,7 @@ class Pilot:
         self._spin_until(self._client.server_is_ready, check, stall, "the mission's action server does not appear")
         for node, service in SERVICES.items():
             if node in scenario.nodes:
-                self._spin_until(lambda: service in self._services(), check, PLANNER_PATIENCE, f"{node} does not offer {service}")
+                self._spin_until(lambda: self._node.count_services(self._node.resolve_service_name(service)) > 0, check, PLANNER_PATIENCE, f"{node} does not offer {service}")
         began = time.monotonic()
         sent = self._client.send_goal_async(goal_of(scenario), feedback_callback=feedback)
         self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
@@ -132,9 +132,6 @@ class Pilot:
         if cancelled and outcome == "cancelled":
             outcome = "timeout"
         return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - began)
-
-    def _services(self) -> set[str]:
-        return {name.rsplit("/", 1)[-1] for name, _ in self._node.get_service_names_and_types()}
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
