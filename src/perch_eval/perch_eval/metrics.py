@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight, States
 
 CONTACT_STATES = {0: "none", 1: "attached", 2: "bounced", 3: "collision", 4: "ground"}
+_DURATION = re.compile(r"_(ms|us)(?=_|$)")
 
 
 def _rmse(difference: np.ndarray) -> list[float]:
@@ -140,9 +142,9 @@ def rates(flight: Flight) -> dict[str, float]:
     return out
 
 
-def node_timings(flight: Flight) -> dict[str, dict[str, float]]:
-    """The last diagnostics of each node: their numbers by name."""
-    out: dict[str, dict[str, float]] = {}
+def diagnostics(flight: Flight) -> dict[str, list[dict[str, float]]]:
+    """Every diagnostics of each node, in order: their numbers by name."""
+    out: dict[str, list[dict[str, float]]] = {}
     for _, array in flight.messages("diagnostics"):
         for status in array.status:
             values = {}
@@ -151,7 +153,26 @@ def node_timings(flight: Flight) -> dict[str, dict[str, float]]:
                     values[item.key] = float(item.value)
                 except ValueError:
                     continue
-            out[status.name] = values
+            out.setdefault(status.name.strip("/"), []).append(values)
+    return out
+
+
+def node_durations(flight: Flight) -> dict[str, dict[str, float]]:
+    """What the nodes measured of themselves in `_ms` and `_us`, over the whole flight [ms].
+
+    A node reports about once per second: each figure is the median of its reports, so that the first second, in which
+    compiled functions are loaded, does not hide the others.
+    """
+    out: dict[str, dict[str, float]] = {}
+    for node, reports in diagnostics(flight).items():
+        series: dict[str, list[float]] = {}
+        for values in reports:
+            for key, value in values.items():
+                unit = _DURATION.search(key)
+                if unit is not None:
+                    series.setdefault(_DURATION.sub("_ms", key), []).append(value * (1e-3 if unit[1] == "us" else 1.0))
+        if series:
+            out[node] = {key: float(np.median(v)) for key, v in series.items()}
     return out
 
 
@@ -159,5 +180,3 @@ def tilt_degrees(q: np.ndarray) -> np.ndarray:
     """Angle of b3 from the vertical, (n, 4) -> (n,) [deg]."""
     b3 = so3.quat_rotate(q, np.array([0.0, 0.0, 1.0]))
     return np.degrees(np.arccos(np.clip(b3[:, 2], -1.0, 1.0)))
-
-

@@ -12,7 +12,7 @@ from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.flight import Flight
-from perch_eval.metrics import contact_report, flight_metrics, node_timings, perch_window, rates
+from perch_eval.metrics import contact_report, diagnostics, flight_metrics, node_durations, perch_window, rates
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -48,7 +48,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         "real_time_factor": end_time / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, vehicle, end_time),
         "flight_hash": flight.digest(end_time),
-        "rates_hz": rates(flight), "timings_ms": _timings(flight),
+        "rates_hz": rates(flight), "timings_ms": node_durations(flight),
     }
     (folder / "report.json").write_text(json.dumps(_finite(report), indent=2) + "\n")
     (folder / "report.html").write_text(_page(flight, scenario, report, vehicle))
@@ -62,12 +62,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _timings(flight: Flight) -> dict[str, dict[str, float]]:
-    """Latencies and durations that the nodes themselves report, in milliseconds."""
-    return {node.strip("/"): {k: v for k, v in values.items() if k.endswith("_ms")}
-            for node, values in node_timings(flight).items() if any(k.endswith("_ms") for k in values)}
 
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
@@ -129,7 +123,8 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
     frames = "".join(f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
                      for caption, data in plots.camera_frames(flight, moments))
     timeline = "".join(f"<tr><td>{t:.3f} s</td><td>{html.escape(text)}</td></tr>" for t, text in _timeline(flight))
-    nodes = "".join(_row(node, ", ".join(f"{k} {v:g}" for k, v in values.items())) for node, values in node_timings(flight).items())
+    nodes = "".join(_row(node, ", ".join(f"{k} {v:g}" for k, v in reports[-1].items()))
+                    for node, reports in diagnostics(flight).items())
     hz = "".join(_row(topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())
     figures = "".join(f'<h2>{title}</h2><img src="data:image/png;base64,{data}">' for title, data in images if data)
     return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{scenario.name}, seed {report["seed"]}</title><style>{_STYLE}</style>'
