@@ -19,6 +19,7 @@ from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 if TYPE_CHECKING:
+    from perch_planner.powerline.plan import Manoeuvre
     from perch_planner.powerline.problem import PlannedProblem
 
 PERCH, RECOVERY, SIGHT, WIRE = "#1f5fa8", "#d9822b", "#3a9a4b", "#b02a2a"
@@ -86,20 +87,29 @@ def draw_manoeuvre(planned: PlannedProblem, path: Path, bodies: int = 12) -> Non
     figure.savefig(path, dpi=130)
 
 
-def draw_visibility(planned: PlannedProblem, path: Path) -> None:
-    """Reprojection error and visibility of the target line over the perch, as the paper's Fig. 7."""
-    part = planned.plan.perch
+def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | None = None) -> None:
+    """Reprojection error and segment visibility of the target line over the perch, as the paper's Fig. 7.
+
+    Args:
+        planned: the plan.
+        path: of the picture.
+        without: the same perch planned without perception awareness, to compare with.
+    """
     mount = planned.vehicle.mounts[planned.problem.settings.camera]
-    seen = visibility(part.states, planned.request.target(), mount)
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True)
-    top.plot(part.times, np.where(seen.cheirality, np.minimum(seen.reprojection, 2000), np.nan), color=PERCH)
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1, sharex=True)
+    perches = [(planned.plan.perch, PERCH, "with perception awareness" if planned.request.perception else "as planned")]
+    if without is not None:
+        perches.append((without, RECOVERY, "without"))
+    for part, colour, label in perches:
+        seen = visibility(part.states, planned.request.target(), mount)
+        top.plot(part.times, np.where(seen.cheirality, np.minimum(seen.reprojection, 2000), np.nan), color=colour, label=label)
+        middle.plot(part.times, seen.in_image, color=colour)
+        bottom.plot(part.times, np.where(seen.segment & seen.cheirality, 1, 0), color=colour)
     top.set(ylabel="|reprojection| [px]", yscale="symlog", title=planned.problem.name)
-    bottom.plot(part.times, seen.in_image, color=SIGHT, label="share of the segment in the image")
-    bottom.fill_between(part.times, 0, 1, where=~(seen.segment & seen.cheirality), color=WIRE, alpha=0.2,
-                        label="segment visibility or cheirality violated")
-    bottom.set(xlabel="time [s]", ylim=(0, 1.05))
-    bottom.legend(fontsize=8)
+    top.legend(fontsize=8)
+    middle.set(ylabel="share of segment in image", ylim=(-0.05, 1.05))
+    bottom.set(xlabel="time [s]", ylabel="constraints (12), (13)", yticks=[0, 1], yticklabels=["violated", "hold"], ylim=(-0.1, 1.1))
     figure.savefig(path, dpi=130)
 
 

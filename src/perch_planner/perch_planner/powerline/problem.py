@@ -10,7 +10,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.config import choice, part, quantity, text
-from perch_core.errors import ConfigError
+from perch_core.errors import ConfigError, PlanningRefusal
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, V, W, hover_state
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
@@ -169,7 +169,17 @@ def plan(problem: PowerlineProblem, **changes: Any) -> PlannedProblem:
 
 
 def report(planned: PlannedProblem, folder: Path | str, animation: bool = False) -> dict[str, Any]:
-    """Write CSV, JSON and pictures of a plan; see `report.write_report`."""
+    """Write CSV, JSON and pictures of a plan; see `report.write_report`.
+
+    A plan with perception awareness is pictured beside the same perch without it, where there is one.
+    """
     from perch_planner.powerline.report import write_report  # matplotlib is slow to load and flights need none
 
-    return write_report(planned, Path(folder), animation)
+    without = None
+    if planned.request.perception:
+        try:
+            blind = config.replace(planned.request, perception=False, with_recovery=False)
+            without = planned.planner.plan(blind).perch
+        except PlanningRefusal:  # nothing to compare with; the plan itself stands
+            pass
+    return write_report(planned, Path(folder), animation, without)

@@ -12,6 +12,7 @@ import numpy as np
 from perch_planner.powerline.visibility import visibility
 
 if TYPE_CHECKING:
+    from perch_planner.powerline.plan import Manoeuvre
     from perch_planner.powerline.problem import PlannedProblem
 
 COLUMNS = ("t", "p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w", "v_x", "v_y", "v_z", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z",
@@ -53,8 +54,15 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def write_report(planned: PlannedProblem, folder: Path, animation: bool = False) -> dict[str, Any]:
+def write_report(planned: PlannedProblem, folder: Path, animation: bool = False, without: Manoeuvre | None = None
+                 ) -> dict[str, Any]:
     """Write `plan.csv`, `plan.json`, `plan.png`, with a perch `visibility.png`, and if wanted `plan.gif`.
+
+    Args:
+        planned: what to report.
+        folder: made where it is missing.
+        animation: also write the film.
+        without: the same perch without perception awareness, for comparison in the visibility picture.
 
     Returns:
         The content of the JSON file, with the files' names under "files".
@@ -67,7 +75,7 @@ def write_report(planned: PlannedProblem, folder: Path, animation: bool = False)
     picture.draw_manoeuvre(planned, paths[2])
     if planned.plan.perch is not None:
         paths.append(folder / "visibility.png")
-        picture.draw_visibility(planned, paths[-1])
+        picture.draw_visibility(planned, paths[-1], without)
     if animation:
         paths.append(folder / "plan.gif")
         picture.draw_animation(planned, paths[-1])
