@@ -57,7 +57,8 @@ def fly(scenario_name: str, seed: int, out: Path, composed: bool = False, realti
         print(f"{scenario.name}, seed {seed}: starting {'all nodes in one process' if composed else 'one process per node'}", flush=True)
         with stack:
             result = _pilot(scenario, stack)
-    return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time)
+    return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
+                        result.start_time)
 
 
 def _pilot(scenario: Scenario, stack: Stack) -> FlightResult:

@@ -36,12 +36,14 @@ class FlightResult:
         message: the mission's words.
         end_time: simulation time at the end [s].
         wall_time: wall-clock time from the goal to the end [s].
+        start_time: simulation time when the goal was sent [s]; None where time had not begun.
     """
 
     outcome: str
     message: str
     end_time: float
     wall_time: float
+    start_time: float | None = None
 
 
 def goal_of(scenario: Scenario) -> Perch.Goal:
@@ -107,7 +109,7 @@ class Pilot:
         for node, service in SERVICES.items():
             if node in scenario.nodes:
                 self._spin_until(lambda: self._node.count_services(self._node.resolve_service_name(service)) > 0, check, PLANNER_PATIENCE, f"{node} does not offer {service}")
-        began = time.monotonic()
+        began, started = time.monotonic(), self._time or None
         sent = self._client.send_goal_async(goal_of(scenario), feedback_callback=feedback)
         self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
         handle = sent.result()
@@ -131,7 +133,7 @@ class Pilot:
         outcome = OUTCOMES[answer.error_code]
         if cancelled and outcome == "cancelled":
             outcome = "timeout"
-        return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - began)
+        return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - began, started)
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""

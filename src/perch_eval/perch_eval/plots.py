@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
+from perch_msgs.msg import EstimatorStatus
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend must be chosen first)
@@ -152,13 +153,16 @@ def error_figure(flight: Flight) -> str:
     truth, estimate = flight.states("ground_truth/odometry"), flight.states("odometry")
     if estimate is None:
         return ""
-    messages = flight.messages("odometry")
+    running = [t for t, m in flight.messages("estimator/status") if m.state == EstimatorStatus.RUNNING]
+    began = running[0] if running else estimate.t[0]  # before, the filter knows nothing: kilometres of sigma
+    messages = [(t, m) for t, m in flight.messages("odometry") if t >= began]
+    keep = estimate.t >= began
     sigma = np.array([np.sqrt(np.maximum(0.0, np.reshape(m.pose.covariance, (6, 6)).diagonal()[:3])) for _, m in messages[::10]])
     ts = np.array([t for t, _ in messages[::10]])
     error = estimate.p - truth.at(estimate.t).p
     figure, axes = plt.subplots(1, 3, figsize=(12, 2.8), sharex=True)
     for i, (axis, name) in enumerate(zip(axes, "xyz")):
-        axis.plot(estimate.t, 100 * error[:, i], color=TRUTH, lw=1.0)
+        axis.plot(estimate.t[keep], 100 * error[keep, i], color=TRUTH, lw=1.0)
         for sign in (-3, 3):
             axis.plot(ts, sign * 100 * sigma[:, i], color=LIMIT, lw=0.7, ls="--")
         axis.set_title(f"estimate - truth, {name} [cm], with 3 sigma", fontsize=9)

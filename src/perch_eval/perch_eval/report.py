@@ -18,14 +18,15 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; } td, th { padding: 3px 12px 3px 0; text-align: left; vertical-align: top; }
+td { overflow-wrap: anywhere; } th { white-space: nowrap; padding-right: 20px; }
 th { font-weight: 600; } .good { color: #17692b; } .bad { color: #a11; } img { max-width: 100%; }
-.frames { display: flex; flex-wrap: wrap; gap: 10px; } figure { margin: 0; } figcaption { font-size: 12px; color: #555; }
+.frames { display: grid; grid-template-columns: repeat(4, 1fr); gap: 10px; } figure { margin: 0; } figcaption { font-size: 12px; color: #555; }
 code { background: #f4f4f4; padding: 0 3px; }
 """
 
 
 def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, message: str, wall_time: float,
-                 end_time: float) -> dict[str, Any]:
+                 end_time: float, start_time: float | None = None) -> dict[str, Any]:
     """Read `flight.mcap` in `folder` and write `report.json` and `report.html` beside it.
 
     Args:
@@ -36,16 +37,20 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         message: the mission's own words.
         wall_time: wall-clock duration of the flight [s].
         end_time: simulation time at which the goal ended [s].
+        start_time: simulation time at which it was sent [s]; None: the recording begins with it.
 
     Returns:
         The content of `report.json`.
     """
     vehicle = load_vehicle(scenario.vehicle)
     flight = Flight(folder / "flight.mcap")
+    if start_time is None:
+        first = flight.messages("ground_truth/odometry")
+        start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
         "outcome": outcome, "message": message, "scenario": scenario.name, "seed": seed,
         "simulated_time_s": end_time, "wall_time_s": wall_time,
-        "real_time_factor": end_time / wall_time if wall_time > 0 else math.nan,
+        "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, vehicle, end_time),
         "flight_hash": flight.digest(end_time),
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
@@ -64,8 +69,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/ControllerCommand
+
+
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
-    rows = [(t, f"controller: {m.reason}") for t, m in flight.messages("controller/command")]
+    rows = [(t, f"mission orders {COMMANDS[m.command]}: {m.reason}") for t, m in flight.messages("controller/command")]
     for t, m in flight.messages("trajectory"):
         start = m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
         length = sum(s.duration for s in m.segments) if m.segments else m.points[-1].time_from_start
@@ -102,7 +110,7 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
         _row("estimation RMSE x, y, z", _vector(report.get("estimation_rmse_m"), 100, "cm")),
         _row("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
         _row("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
-        _row("simulated / wall time", f"{report['simulated_time_s']:.2f} s / {report['wall_time_s']:.2f} s"
+        _row("ended at / wall time", f"{report['simulated_time_s']:.2f} s simulated time / {report['wall_time_s']:.2f} s"
                                       f" (real-time factor {report['real_time_factor']:.2f})"),
         _row("flight hash", report["flight_hash"][:16]),
     ]
@@ -125,10 +133,13 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
     timeline = "".join(f"<tr><td>{t:.3f} s</td><td>{html.escape(text)}</td></tr>" for t, text in _timeline(flight))
     nodes = "".join(_row(node, ", ".join(f"{k} {v:g}" for k, v in reports[-1].items()))
                     for node, reports in diagnostics(flight).items())
+    timings = "".join(_row(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
+                      for node, values in report["timings_ms"].items())
     hz = "".join(_row(topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())
     figures = "".join(f'<h2>{title}</h2><img src="data:image/png;base64,{data}">' for title, data in images if data)
     return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{scenario.name}, seed {report["seed"]}</title><style>{_STYLE}</style>'
             f'<h1>{html.escape(scenario.name)}, seed {report["seed"]}: <span class="{"good" if good else "bad"}">{report["outcome"]}</span></h1>'
             f'<table>{"".join(rows)}</table><h2>Timeline</h2><table>{timeline}</table>{figures}'
             f'<h2>What the cameras saw</h2><div class="frames">{frames or "no images recorded"}</div>'
-            f"<h2>Rates</h2><table>{hz}</table><h2>Nodes</h2><table>{nodes}</table></html>\n")
+            f"<h2>Rates</h2><table>{hz}</table><h2>Durations that the nodes measured</h2>"
+            f"<table>{timings}</table><h2>Last diagnostics</h2><table>{nodes}</table></html>\n")
