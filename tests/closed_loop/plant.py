@@ -81,7 +81,7 @@ class Plant:
             force[2] += thrust.sum()
             a = self.R @ force / mass + G
             dw = (self._levers @ thrust - cross(self.w, J * self.w)) / J
-            if self.p[2] <= self.floor + 1e-3 and a[2] < 0 and self.v[2] <= 0.3:
+            if self.p[2] <= self.floor + 1e-3 and self.v[2] + a[2] * dt <= 0.0:
                 self.impact_speed = max(self.impact_speed, -self.v[2])
                 a = np.array([0.0, 0.0, -self.v[2] / dt])
                 self.v[:2] = 0

@@ -12,6 +12,7 @@ from nav_msgs.msg import Odometry
 from perch_msgs.msg import (
     ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, Trajectory)
 from perch_msgs.srv import SetController
+from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -60,8 +61,8 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._arrivals: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
         self._missed = 0
         self._steps = 0
-        self._blind_since: float | None = None
-        self._last_odometry = time.monotonic()
+        self._unanswered: Imu | None = None  # newest IMU sample without odometry
+        self._unanswered_since = 0.0
 
         self._command = MotorCommand()
         self._command.header.frame_id = "base_link"
@@ -77,7 +78,8 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._participant.chain(Odometry, "odometry", self._receive_odometry)
         if self.params.estimator_status:
             self._participant.chain(EstimatorStatus, "estimator/status", self._receive_estimator, ESTIMATOR_STEPS)
-        self.create_subscription(Imu, "imu/data_raw", self._watch_odometry, qos.SENSOR)
+        self.create_subscription(Imu, "imu/data_raw", self._watch_imu, qos.SENSOR)
+        self.create_timer(0.5, self._watch_lockstep, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.create_service(SetController, "set_controller", self._set_controller)
         self.create_service(Trigger, "abort", self._abort)
 
@@ -135,16 +137,35 @@ class ControllerNode(PerchNode[ControllerParameters]):
         w, f = msg.angular_velocity, msg.linear_acceleration
         self._flight.imu(to_seconds(msg.header.stamp), (w.x, w.y, w.z), (f.x, f.y, f.z))
 
-    def _watch_odometry(self, msg: Imu) -> None:
-        """Odometry that has stopped altogether would stop the lockstep: then the IMU's steps are answered instead."""
-        stamp = to_seconds(msg.header.stamp)
-        if time.monotonic() - self._last_odometry > self.params.blind_after and stamp > self._flight.maneuvers.now + PERIOD / 2:
-            self._receive_imu(msg)
-            self._answer(msg.header.stamp, self._flight.step_blind(stamp))
+    def _watch_imu(self, msg: Imu) -> None:
+        """Odometry that has stopped altogether would stop the commands: then the IMU's samples are answered instead.
+
+        In lockstep the vehicle waits for the estimator, however long it takes on this machine, so only the timer may
+        conclude that it is gone; in real time the IMU goes on and shows it.
+        """
+        if to_seconds(msg.header.stamp) <= self._flight.maneuvers.now + PERIOD / 2:
+            return
+        if self._unanswered is None:
+            self._unanswered_since = time.monotonic()
+        self._unanswered = msg
+        if not self._participant.lockstep:
+            self._answer_imu(self.params.blind_after)
+
+    def _watch_lockstep(self) -> None:
+        if self._participant.lockstep:
+            self._answer_imu(self.params.blind_after_lockstep)
+
+    def _answer_imu(self, patience: float) -> None:
+        msg = self._unanswered
+        if msg is None or (time.monotonic() - self._unanswered_since < patience and not self._flight.blind):
+            return
+        self._unanswered = None
+        self._receive_imu(msg)
+        self._answer(msg.header.stamp, self._flight.step_blind(to_seconds(msg.header.stamp)))
 
     def _receive_odometry(self, msg: Odometry) -> None:
         begin = time.perf_counter()
-        self._last_odometry = time.monotonic()
+        self._unanswered = None
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
         v, w = msg.twist.twist.linear, msg.twist.twist.angular
         x, y, z, s = q.x, q.y, q.z, q.w

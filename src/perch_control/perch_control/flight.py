@@ -78,6 +78,11 @@ class FlightController:
         return self.maneuvers.state
 
     @property
+    def blind(self) -> bool:
+        """A descent without position is under way."""
+        return self.maneuvers.blind is not None
+
+    @property
     def law_name(self) -> str:
         """Name of the control law that flies, `+l1` with the augmentation."""
         return self.law.name + ("+l1" if self.compensator is not None else "")
