@@ -189,3 +189,15 @@ def value(coefficients, s):
         for i in range(k):
             work[i] = (1.0 - s) * work[i] + s * work[i + 1]
     return work[0]
+
+
+@compiled
+def derivatives_at(coefficients, duration, s, count):
+    """Time derivatives 0 to count - 1 of a segment at s, shapes (3, n + 1) -> (count, 3)."""
+    out = np.empty((count, 3))
+    for d in range(3):
+        work = coefficients[d].copy()
+        for order in range(count):
+            out[order, d] = value(work, s)
+            work = (len(work) - 1) * (work[1:] - work[:-1]) / duration
+    return out

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_core import bernstein
 from perch_core.vehicle import GRAVITY
+from perch_planner.bounds import derivatives_at
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 from perch_planner.problem import Limits, PerchProblem, contact_heading
 from perch_planner.segment_program import Cut
@@ -21,11 +21,6 @@ _INF = float("inf")
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
 _RAISE = 1.02       # cuts of the thrust from below
 _HEIGHT_ROOM = 2e-3  # [m]
-
-
-def _at(coefficients: np.ndarray, durations: np.ndarray, segment: int, place: float, order: int) -> np.ndarray:
-    """A time derivative of the position, shape (3,)."""
-    return bernstein.evaluate(bernstein.derivative(coefficients[segment], order), place) / durations[segment] ** order
 
 
 def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.ndarray, low: float, high: float,
@@ -42,11 +37,11 @@ def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.nda
     cuts = []
     for i, (_, least, least_at, _, most, most_at) in enumerate(extrema.tolist()):
         if most > high:
-            f = _at(coefficients, durations, i, most_at, 2) + _G
+            f = derivatives_at(coefficients[i], durations[i], most_at, 3)[2] + _G
             n = f / np.sqrt(f @ f)
             cuts.append(Cut(i, most_at, ((2, n),), -_INF, _KEEP * high - float(n @ _G)))
         if least < low:
-            f = _at(coefficients, durations, i, least_at, 2) + _G
+            f = derivatives_at(coefficients[i], durations[i], least_at, 3)[2] + _G
             norm = np.sqrt(f @ f)
             n = f / norm if norm > 0.5 * low else side
             cuts.append(Cut(i, least_at, ((2, n),), _RAISE * low - float(n @ _G), _INF))
@@ -73,7 +68,7 @@ def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarra
         if i < 0.0 or row not in _LIMIT_CUTS:
             continue
         segment = int(i)
-        derivatives = [_at(coefficients, durations, segment, s, order) for order in range(4)]
+        derivatives = derivatives_at(coefficients[segment], durations[segment], s, 4)
         t = float(durations[:segment].sum() + s * durations[segment])
         cuts += [Cut(segment, s, *bound) for bound in _LIMIT_CUTS[row](derivatives, t, problem, limits)]
     return cuts
@@ -92,7 +87,7 @@ def _height_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
 def _clearance_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
     """The rim's distance at the present tilt: right to first order where the tilt does not change."""
     s3, f = problem.surface.normal, derivatives[2] + _G
-    tilt = np.linalg.norm(np.cross(f, s3)) / max(np.sqrt(f @ f), 1e-9)
+    tilt = np.sqrt(max(1.0 - float(f @ s3) ** 2 / max(float(f @ f), 1e-9), 0.0))
     plane = float(s3 @ (problem.surface.p_WS + problem.target_velocity * t))
     yield ((0, s3),), plane + 1.1 * limits.extension * tilt + _HEIGHT_ROOM, _INF
 

@@ -40,7 +40,7 @@ class PerchingPlannerParameters(PerchSettings):
     """Parameters of the node: those of the planner, and the vehicle it plans for."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    contact_time: float = quantity(0.3, unit="s", low=0.0, high=10.0, doc="how long the trajectory awaits contact after its end")
+    contact_time: float = quantity(0.3, unit="s", low=0.0, high=10.0, doc="wait for contact after the end")
 
 
 class PerchingPlannerNode(PerchNode[PerchingPlannerParameters]):

@@ -15,7 +15,8 @@ from perch_core.vehicle import Vehicle
 from perch_planner.planner import PerchPlan
 from perch_planner.problem import Limits, PerchProblem
 
-COLUMNS = ("time", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "qx", "qy", "qz", "qw", "wx", "wy", "wz", "thrust")
+COLUMNS = ("time", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "qx", "qy", "qz", "qw", "wx", "wy", "wz",
+           "thrust")
 
 
 def states(plan: PerchPlan, mass: float, step: float = 0.002) -> tuple[np.ndarray, list[FlatState]]:
@@ -36,7 +37,8 @@ def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for k, state in enumerate(full):
-            row = [times[k], *at.p[k], *at.v[k], *at.a[k], at.yaw[k], *quat_from_matrix(state.R_WB), *state.w_WB_B, state.thrust]
+            row = [times[k], *at.p[k], *at.v[k], *at.a[k], at.yaw[k], *quat_from_matrix(state.R_WB), *state.w_WB_B,
+                   state.thrust]
             writer.writerow([f"{float(v):.9g}" for v in row])
 
 
@@ -79,7 +81,8 @@ def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, veh
     side.plot(x, p[:, 2], color="tab:blue")
     for k in range(0, len(times), max(len(times) // 24, 1)):
         b3 = full[k].R_WB[:, 2] * full[k].thrust / limits.thrust[1] * 0.25
-        side.annotate("", (x[k] + b3 @ along, p[k, 2] + b3[2]), (x[k], p[k, 2]), arrowprops={"arrowstyle": "->", "color": "tab:orange"})
+        side.annotate("", (x[k] + b3 @ along, p[k, 2] + b3[2]), (x[k], p[k, 2]),
+                      arrowprops={"arrowstyle": "->", "color": "tab:orange"})
     centre = problem.surface.p_WS + problem.target_velocity * plan.duration
     ends = centre + np.outer([-0.3, 0.3], problem.surface.R_WS[:, 0])
     side.plot((ends - problem.start.p) @ along, ends[:, 2], color="black", linewidth=3)

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 
 from perch_core.vehicle import GRAVITY
+from perch_planner.compilation import compiled
 from perch_planner.problem import PerchProblem, PerchSettings
 
 CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints
@@ -18,26 +19,34 @@ APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
 
-def _profile_time(distance: np.ndarray, length: float) -> np.ndarray:
-    """Times at which a trapezoidal speed profile over `length` has covered `distance`."""
-    ramp = min(CRUISE_SPEED**2 / CRUISE_ACCELERATION, length) / 2.0
-    peak = sqrt(2.0 * CRUISE_ACCELERATION * ramp)
-    total = 2.0 * peak / CRUISE_ACCELERATION + (length - 2.0 * ramp) / peak
-    d = np.minimum(distance, length - distance)
-    near = np.where(d <= ramp, np.sqrt(2.0 * d / CRUISE_ACCELERATION), peak / CRUISE_ACCELERATION + (d - ramp) / peak)
-    return np.where(distance <= length / 2.0, near, total - near)
+@compiled
+def _along_waypoints(points, extra, speed, acceleration, turn_acceleration):
+    """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns.
 
-
-def _turning_times(points: np.ndarray) -> np.ndarray:
-    """Least segment durations for the turns at the waypoints, shape (n - 1,): the speed there is v^2 = A l / turn."""
-    steps = np.diff(points, axis=0)
-    lengths = np.maximum(np.sqrt((steps**2).sum(axis=1)), 1e-6)
-    units = steps / lengths[:, None]
-    turns = np.sqrt(((units[1:] - units[:-1]) ** 2).sum(axis=1))
-    speeds = np.full(len(points), CRUISE_SPEED)
-    speeds[1:-1] = np.minimum(np.sqrt(TURN_ACCELERATION * np.minimum(lengths[1:], lengths[:-1]) / np.maximum(turns, 1e-6)),
-                              CRUISE_SPEED)
-    return 2.0 * lengths / (speeds[1:] + speeds[:-1])
+    The speed at a waypoint is bounded by v^2 = A l / turn, with the shorter leg l and the change of direction there.
+    """
+    n = len(points) - 1
+    legs = np.empty(n)
+    for i in range(n):
+        legs[i] = max(np.sqrt(((points[i + 1] - points[i]) ** 2).sum()), 1e-6)
+    length = legs.sum()
+    ramp = min(speed**2 / acceleration, length) / 2.0
+    peak = np.sqrt(2.0 * acceleration * ramp)
+    total = 2.0 * peak / acceleration + (length - 2.0 * ramp) / peak
+    out = np.empty(n)
+    reached, before, slow = 0.0, 0.0, speed
+    for i in range(n):
+        reached += legs[i]
+        d = max(min(reached, length - reached), 0.0)
+        near = np.sqrt(2.0 * d / acceleration) if d <= ramp else peak / acceleration + (d - ramp) / peak
+        now = near if reached <= 0.5 * length else total - near
+        fast = speed
+        if i < n - 1:
+            turn = np.sqrt((((points[i + 2] - points[i + 1]) / legs[i + 1] - (points[i + 1] - points[i]) / legs[i]) ** 2).sum())
+            fast = min(np.sqrt(turn_acceleration * min(legs[i], legs[i + 1]) / max(turn, 1e-6)), speed)
+        out[i] = max(now - before, 2.0 * legs[i] / (slow + fast))
+        before, slow = now, fast
+    return out * (1.0 + extra / out.sum())
 
 
 def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) -> np.ndarray:
@@ -55,13 +64,10 @@ def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) 
         durations = np.array(problem.segment_times)
     else:
         points = np.array([problem.start.p, *(w.p for w in problem.waypoints), p_end])
-        reached = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)))])
-        length = max(float(reached[-1]), 1e-3)
         closing = problem.target_velocity - problem.start.v
         extra = MANOEUVRE_TIME + sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
-        times = _profile_time(reached, length)
-        durations = np.maximum(np.diff(times), _turning_times(points))
-        durations = np.maximum(durations * (1.0 + extra / durations.sum()), SEGMENT_MIN)
+        durations = _along_waypoints(points, extra, CRUISE_SPEED, CRUISE_ACCELERATION, TURN_ACCELERATION)
+        durations = np.maximum(durations, SEGMENT_MIN)
         durations[-1] = max(durations[-1], APPROACH_TIME)
     return with_last_segment(durations, settings)
 
