@@ -106,25 +106,34 @@ class VioStep:
 
 
 def run_vio(flight: Flight, config: VioConfig = VioConfig(),
-            tamper: Callable[[float, int, np.ndarray], list[tuple[int, np.ndarray]]] | None = None) -> list[VioStep]:
+            tamper: Callable[[float, int, np.ndarray], list[tuple[int, np.ndarray]]] | None = None,
+            tamper_imu: Callable[[float, ImuSample], ImuSample | None] | None = None, begin: float = 0.0) -> list[VioStep]:
     """VIO over a flight.
 
     Args:
         flight: its data.
         config: VIO's settings.
         tamper: turns a frame (time, stamp, image) into those that arrive: none, others, several.
+        tamper_imu: turns an IMU sample into the one that arrives, or None.
+        begin: VIO is switched on there [s], and told the pose of that moment.
     """
-    start = flight.motion.sample(np.zeros(1))
+    start = flight.motion.sample(np.array([begin]))
     vio = VisualInertialOdometry(config, flight.mount, start.p_WB[0], 0.0)
-    steps, k = [], 0
+    steps, k = [], int(np.searchsorted(flight.truth.times, begin))
     for time_, stamp, image in flight.frames:
+        if time_ < begin:
+            continue
         while k < len(flight.truth.times) and flight.truth.times[k] < time_ + 0.02:
-            vio.add_imu(flight.sample(k))
+            sample = flight.sample(k)
+            if tamper_imu is not None:
+                sample = tamper_imu(float(flight.truth.times[k]), sample)
+            if sample is not None:
+                vio.add_imu(sample)
             k += 1
         for arriving, pixels in (tamper(time_, stamp, image) if tamper else [(stamp, image)]):
-            begin = time.process_time()
+            clock = time.process_time()
             result = vio.add_image(arriving, pixels)
-            cost = time.process_time() - begin
+            cost = time.process_time() - clock
             steps.append(VioStep(time_, result, cost, _vio_error(flight, result)))
     return steps
 

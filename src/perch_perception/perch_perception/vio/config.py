@@ -62,7 +62,7 @@ class StartConfig:
     rest_time: float = quantity(0.25, unit="s", above=0.05, high=5.0, doc="IMU at rest needed for a start on the ground")
     motion_time: float = quantity(0.5, unit="s", above=0.2, high=3.0, doc="frames needed for a start in motion")
     rest_gyro: float = quantity(0.05, unit="rad/s", above=0.0, doc="largest mean rate over 0.1 s at rest, bias included")
-    rest_accel: float = quantity(0.25, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
+    rest_accel: float = quantity(0.32, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
     rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
     rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
     unnoticed_velocity: float = quantity(0.02, unit="m/s", low=0.0, doc="1 sigma of a take-off that is not yet noticed")
@@ -75,7 +75,7 @@ class LossConfig:
 
     least_tracks: int = quantity(8, low=3, doc="tracks below which a frame says nothing")
     degraded_after: float = quantity(0.15, unit="s", above=0.0, doc="time without a visual update")
-    restart_position: float = quantity(1.0, unit="m", above=0.0, doc="1 sigma of the position since the start that ends a run")
+    leaving_velocity: float = quantity(0.05, unit="m/s", above=0.0, doc="1 sigma up to which a take-off may go on blind")
     restart_velocity: float = quantity(1.0, unit="m/s", above=0.0, doc="1 sigma that ends a run")
     rejected_frames: int = quantity(12, low=2, doc="frames in a row with most observations refused that end a run")
 

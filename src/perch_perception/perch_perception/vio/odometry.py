@@ -201,7 +201,11 @@ class VisualInertialOdometry:
         if why:
             return self._lose(features, why)
         blind = (exposed - self._informed) * 1e-9
-        outcome = FrameOutcome.BLIND if blind > loss.degraded_after else FrameOutcome.TRACKING
+        outcome = FrameOutcome.TRACKING
+        if blind > loss.degraded_after:
+            # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
+            leaving = self._rest_accel is not None and not self._seen and sigma[at.VELOCITY].max() < loss.leaving_velocity
+            outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 
     def _lose(self, features: Features, why: str) -> VioResult:

@@ -13,6 +13,7 @@ class FrameOutcome(enum.Enum):
 
     INITIALISING = "waiting for a start at rest or in motion"
     RESTING = "standing still on the ground"
+    LEAVING = "leaving the ground: nothing to see yet, the IMU alone is good enough"
     TRACKING = "tracked"
     BLIND = "integrating the IMU alone: nothing usable in the image"
     LOST = "lost: starting again in motion"
@@ -25,7 +26,7 @@ class FrameOutcome(enum.Enum):
     @property
     def has_pose(self) -> bool:
         """Whether a pose comes with it."""
-        return self in (FrameOutcome.RESTING, FrameOutcome.TRACKING)
+        return self in (FrameOutcome.RESTING, FrameOutcome.LEAVING, FrameOutcome.TRACKING)
 
 
 @dataclass(frozen=True)
