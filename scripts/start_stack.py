@@ -87,17 +87,20 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from perch_core import config
     from perch_core.scenario import load_scenario
+    from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs
     from perch_eval.stack import Stack
     from ros_graph.connection import visit
 
-    scenario = load_scenario(arguments.scenario)
+    source = config.find("scenarios", arguments.scenario).resolve()
+    scenario = load_scenario(source)
+    check_names(scenario, source)
     launches = node_launches(
         scenario,
         choose_nodes(scenario, arguments.only, arguments.without),
         seed=arguments.seed,
-        scenario_source=str(config.find("scenarios", arguments.scenario).resolve()),
+        scenario_source=str(source),
         lockstep=not arguments.realtime,
         overrides=parse_overrides(arguments.parameter),
     )

@@ -62,6 +62,8 @@ def check(source: str, key: str, item: Field, value: Any) -> None:
         unit = f" {meta['unit']}" if meta.get("unit") else ""
         if math.isnan(number):
             raise ConfigError(source, key, "nan is not a number")
+        if math.isinf(number) and item.default != number:
+            raise ConfigError(source, key, f"{number} is not finite")
         low, high, above = meta.get("low"), meta.get("high"), meta.get("above")
         if above is not None and not number > above:
             raise ConfigError(source, key, f"{number:g} is not > {above:g}{unit}")

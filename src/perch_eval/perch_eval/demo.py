@@ -9,9 +9,10 @@ import sys
 from pathlib import Path
 
 from perch_core import config
-from perch_core.errors import PerchError
+from perch_core.errors import ConfigError, PerchError
 from perch_core.scenario import Scenario, load_scenario
 from perch_eval.domain import reserved_domain
+from perch_eval.flyable import check_flight
 from perch_eval.nodes import programs
 from perch_eval.pilot import FlightResult, Pilot
 from perch_eval.report import build_report
@@ -43,15 +44,23 @@ def fly(scenario_name: str, seed: int, out: Path, composed: bool = False, realti
     """Fly a scenario once; the report's content is returned and written to `out`.
 
     Raises:
-        ConfigError: the scenario or a parameter is refused.
-        StackError: a node ended or did not get ready.
+        ConfigError: the scenario, the seed or the folder is refused.
+        StackError: a node refused its parameters.
     """
-    scenario = load_scenario(scenario_name)
-    out.mkdir(parents=True, exist_ok=True)
+    source = config.find("scenarios", scenario_name)
+    scenario = load_scenario(source)
+    check_flight(scenario, source)
+    if not 0 <= seed < 2**31:
+        raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "flight.mcap").unlink(missing_ok=True)  # of an earlier flight: this one may end before it records
+    except OSError as error:
+        raise ConfigError("--out", str(out), f"cannot be written: {error.strerror}") from None
     say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
     with reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        stack = Stack(programs(scenario, seed, scenario_source=str(config.find("scenarios", scenario_name)),
+        stack = Stack(programs(scenario, seed, scenario_source=str(source.resolve()),
                                composed=composed, lockstep=not realtime, record=out / "flight.mcap",
                                hold_for_goal=not realtime), out / "logs", on_line=say)
         print(f"{scenario.name}, seed {seed}: starting {'all nodes in one process' if composed else 'one process per node'}", flush=True)

@@ -1,0 +1,76 @@
+"""Refuses, before any node is started, a scenario that the nodes would refuse or that no flight could succeed in."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from perch_core import config
+from perch_core.errors import ConfigError
+from perch_core.scenario import Scenario
+from perch_core.tag_board import load_board
+from perch_core.vehicle import Vehicle, load_vehicle
+
+STEEPEST_VIEW = 80.0
+"""Between line of sight and the pad's normal [deg]; beyond, a 0.16 m tag at 1.7 m is 4 px wide."""
+
+
+def check_names(scenario: Scenario, source: str | Path) -> Vehicle:
+    """The scenario's vehicle, after making sure that everything the scenario names exists.
+
+    Args:
+        scenario: to be checked.
+        source: its file, for messages.
+
+    Raises:
+        ConfigError: no such vehicle or tag board, or one of these files is refused.
+    """
+    for key, kind, name in (("vehicle", "vehicles", scenario.vehicle), ("target.board", "boards", scenario.target.board)):
+        try:
+            config.find(kind, name)
+        except ConfigError as error:
+            raise ConfigError(str(source), key, f"{name!r}: {error.problem}") from None
+    load_board(scenario.target.board)
+    return load_vehicle(scenario.vehicle)
+
+
+def check_flight(scenario: Scenario, source: str | Path) -> None:
+    """Make sure that a flight of the scenario can begin and that its pad can be seen from the search hover.
+
+    Args:
+        scenario: to be checked.
+        source: its file, for messages.
+
+    Raises:
+        ConfigError: with the value, its place and what is allowed.
+    """
+    vehicle = check_names(scenario, source)
+    for node in ("vehicle", "estimator", "controller", "mission"):
+        if node not in scenario.nodes:
+            raise ConfigError(str(source), "nodes", f"{node!r} is missing; a flight needs it")
+    if scenario.mode == "surface":
+        _check_view(scenario, str(source), vehicle)
+
+
+def _check_view(scenario: Scenario, source: str, vehicle: Vehicle) -> None:
+    """The pad must appear in the front camera's image, and not from behind."""
+    mount = vehicle.mounts.get("front")
+    if mount is None:
+        raise ConfigError(source, "vehicle", f"{scenario.vehicle!r} has no camera 'front', which finds the pad")
+    surface, camera = scenario.surface, mount.camera
+    hover = np.array(scenario.start.position) + (0.0, 0.0, scenario.mission.takeoff_height)
+    sight = surface.p_WS - hover
+    elevation = math.degrees(math.atan2(sight[2], math.hypot(sight[0], sight[1])))
+    rays = camera.unproject(np.array([[camera.cx, 0.0], [camera.cx, camera.height - 1.0]])) @ mount.R_BC.T
+    upper, lower = (math.degrees(math.atan2(ray[2], ray[0])) for ray in rays)
+    if not lower <= elevation <= upper:
+        raise ConfigError(source, "target.height", f"{scenario.target.height:g} m puts the pad {elevation:.0f} deg above the"
+                          f" horizon of the search hover, outside [{lower:.0f}, {upper:.0f}] deg that the front camera sees")
+    cosine = float(np.clip(-sight @ surface.normal / np.linalg.norm(sight), -1.0, 1.0))
+    obliqueness = math.degrees(math.acos(cosine))
+    if obliqueness > STEEPEST_VIEW:
+        raise ConfigError(source, "target.inclination_deg",
+                          f"{scenario.target.inclination_deg:g} turns the pad {obliqueness:.0f} deg away from the search hover,"
+                          f" outside [0, {STEEPEST_VIEW:g}] deg in which its tags can be read")
