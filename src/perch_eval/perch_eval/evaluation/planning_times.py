@@ -23,7 +23,7 @@ THRUST_MAX = 4.5                                  # [N], the paper's
 PAPER = {3: (4.0, 527.0), 10: (18.0, 1253.0)}     # waypoints -> (QP+GBC, NLOPT) [ms]
 REPETITIONS = 5  # of each problem; the fastest counts, so that other work on the machine does not
 # The paper bounds the thrust alone, and stretches the time until it is kept.
-_PAPERS_LIMITS = {"cuts": False, "height_min": -50.0, "extension": 0.0, "body_rate_max": 1e3, "speed_max": 1e3, "tangential_speed_max": 10.0}
+PAPERS_LIMITS = {"cuts": False, "height_min": -50.0, "extension": 0.0, "body_rate_max": 1e3, "speed_max": 1e3, "tangential_speed_max": 10.0}
 
 
 def waypoint_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:
@@ -48,7 +48,7 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
                   f"{THRUST_MAX} N, order 14; median [range] over the problems of wall-clock times on this machine, compilation left out, "
                   f"the fastest of {REPETITIONS} for the QP. "
                   "The paper averages 5 runs of OOQP and NLopt on a board of 2018.")
-    settings, every_limit = PerchSettings(thrust_max=THRUST_MAX, **_PAPERS_LIMITS), PerchSettings(thrust_max=THRUST_MAX)
+    settings, every_limit = PerchSettings(thrust_max=THRUST_MAX, **PAPERS_LIMITS), PerchSettings(thrust_max=THRUST_MAX)
     for waypoints, (paper_qp, paper_nlp) in PAPER.items():
         problems = [waypoint_problem(np.random.default_rng(seed), waypoints) for seed in range(count)]
         plans = [_timed(p, settings, vehicle) for p in problems]
@@ -90,7 +90,7 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
                   f"the thrust stays below {THRUST_MAX} N everywhere (proved, not sampled). Without noise: no seed.")
     surface = PerchSurface.from_inclination(np.array([3.0, 0.0, 1.2]), math.radians(90.0))
     problem = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), surface, segment_times=(1.0,))
-    settings = PerchSettings(thrust_max=THRUST_MAX, **_PAPERS_LIMITS)
+    settings = PerchSettings(thrust_max=THRUST_MAX, **PAPERS_LIMITS)
     try:
         found = plan(problem, settings, vehicle)
     except PerchRefusal as refusal:

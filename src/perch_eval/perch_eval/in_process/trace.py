@@ -9,6 +9,7 @@ import numpy as np
 from perch_control.mission import Target
 from perch_core.surface import PerchSurface
 from perch_eval.in_process.piloting import FlownTrajectory
+from perch_eval.in_process.stamps import SECOND
 from perch_perception.ukf import Status, VioPose
 from perch_sim.contact_event import ContactEvent
 
@@ -62,7 +63,8 @@ class FlightTrace:
     @property
     def times(self) -> np.ndarray:
         """Time of every step [s], shape (n,)."""
-        return np.array(self.stamps) * 1e-9
+        stamps = np.array(self.stamps, dtype=np.int64)
+        return stamps // SECOND + 1e-9 * (stamps % SECOND)
 
     def part(self, which: slice) -> np.ndarray:
         """`TRUTH` or `ESTIMATE` of every step, shape (n, 13)."""

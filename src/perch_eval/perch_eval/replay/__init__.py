@@ -1,0 +1,1 @@
+"""Recorded flights as animations and plots."""

@@ -1,0 +1,115 @@
+"""Shows a recorded flight: an animation, and plots."""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from perch_core.errors import PerchError
+from perch_core.vehicle import load_vehicle
+from perch_eval import plots
+from perch_eval.flight import Flight
+from perch_eval.metrics import perch_window
+from perch_eval.replay.animation import write_animation
+from perch_eval.replay.scene import Scene, View
+
+BEFORE, AFTER = 1.0, 1.0  # shown around the perch [s]
+EXAMPLES = """examples:
+  python3 scripts/replay.py out/flight.mcap                       animation of the perch, out/flight.gif
+  python3 scripts/replay.py out/flight.mcap --speed 0.25          in slow motion
+  python3 scripts/replay.py out/flight.mcap --from 1 --to 9 --out all.mp4
+  python3 scripts/replay.py out/flight.mcap --plots plots         and the plots as PNG
+
+exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it, MP4 without ffmpeg)"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="replay.py", description=__doc__, epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out.add_argument("flight", type=Path, metavar="FLIGHT.mcap", help="recording (demo.py, recorder, a campaign's kept flight)")
+    out.add_argument("--out", type=Path, metavar="FILE", help="animation, .gif or .mp4 (default: FLIGHT.gif)")
+    out.add_argument("--plots", type=Path, metavar="DIR", help="also write the plots here, as PNG")
+    out.add_argument("--from", dest="start", type=float, metavar="S", help=f"begin (default: {BEFORE:g} s before the perch)")
+    out.add_argument("--to", dest="end", type=float, metavar="S", help=f"end (default: {AFTER:g} s after the contact)")
+    out.add_argument("--fps", type=float, default=15.0, help="frames per second (default: %(default)s)")
+    out.add_argument("--speed", type=float, default=1.0, help="1: real time, 0.25: slow motion (default: %(default)s)")
+    out.add_argument("--vehicle", default="snapdragon", help="whose rotors are drawn (default: %(default)s)")
+    out.add_argument("--namespace", default="", help="of the vehicle, where several were recorded")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    try:
+        return _show(args)
+    except (PerchError, LookupError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
+
+
+def _show(args: argparse.Namespace) -> int:
+    if not args.flight.is_file():
+        raise PerchError(f"{args.flight}: no such recording")
+    for name in ("fps", "speed"):
+        if not getattr(args, name) > 0.0:
+            raise PerchError(f"--{name} {getattr(args, name):g} is not > 0")
+    flight, vehicle = Flight(args.flight, args.namespace), load_vehicle(args.vehicle)
+    try:
+        view = View.of(flight)
+    except LookupError as error:
+        raise PerchError(f"{args.flight}: {error}") from None
+    start, end = span(flight, view, args.start, args.end)
+    path = args.out or args.flight.with_suffix(".gif")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    step = args.speed / args.fps
+    times = start + step * np.arange(max(1, round((end - start) / step)))
+    print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
+    write_animation(Scene(view, vehicle, start, end), times, args.fps, path, _progress)
+    print(f"animation: {path}")
+    if args.plots:
+        write_plots(flight, vehicle, args.plots)
+        print(f"plots: {args.plots}")
+    return 0
+
+
+def span(flight: Flight, view: View, start: float | None, end: float | None) -> tuple[float, float]:
+    """Time span to show [s]: what was asked for, or the perch with a second around it, or all.
+
+    Raises:
+        PerchError: nothing of the flight lies in it.
+    """
+    window = perch_window(flight)
+    first, last = float(view.truth.t[0]), float(view.truth.t[-1])
+    begin = start if start is not None else max(first, window[0] - BEFORE) if window else first
+    finish = end if end is not None else min(last, window[1] + AFTER) if window else last
+    if not (begin < finish and begin < last and finish > first):
+        raise PerchError(f"--from {begin:g} --to {finish:g}: the flight lasts from {first:.2f} to {last:.2f} s")
+    return max(begin, first), min(finish, last)
+
+
+def write_plots(flight: Flight, vehicle, folder: Path) -> None:
+    """The figures of the flight's report as PNG files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in (("tracking", plots.tracking_figure(flight)), ("path", plots.path_figure(flight)),
+                       ("rates", plots.rates_figure(flight)), ("thrust", plots.thrust_figure(flight, vehicle)),
+                       ("estimation_error", plots.error_figure(flight))):
+        if data:
+            (folder / f"{name}.png").write_bytes(base64.b64decode(data))
+
+
+def _progress(done: int, total: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r  {done}/{total}", end="" if done < total else "\n", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,91 @@
+"""The evaluation: verdicts, exit codes, the cable's exact figures, and the nonlinear comparison."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from perch_core import bernstein
+from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_eval.evaluation import command
+from perch_eval.evaluation.cable import cable_of_length
+from perch_eval.evaluation.nonlinear import solve
+from perch_eval.evaluation.planning_times import PAPERS_LIMITS, waypoint_problem
+from perch_eval.evaluation.sections import Section
+from perch_planner.planner import plan
+from perch_planner.problem import PerchSettings
+
+
+def part(*claims, missing=False):
+    def make(effort):
+        section = Section("s", "A table", "seeds 1 to 5")
+        for k, holds in enumerate(claims):
+            section.claim(f"claim {k}", "1 | 2", "3", holds, "smaller")
+        section.compare("a comparison", "4 cm", "3 cm", False)
+        if missing:
+            section.missing("flown", "7 cm", "no such flight yet")
+        section.data = {"x": math.nan}
+        return [section]
+
+    return make
+
+
+def broken(effort):
+    raise RuntimeError("no fuel")
+
+
+@pytest.mark.parametrize("parts, code", [
+    ({"a": part(True, True)}, 0), ({"a": part(True, False)}, 1), ({"a": part(True, missing=True)}, 3),
+    ({"a": part(False, missing=True)}, 1), ({"a": broken}, 3), ({"a": broken, "b": part(False)}, 1)])
+def test_the_exit_code_tells_failed_claims_and_missing_rows(tmp_path, monkeypatch, parts, code):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command, "PARTS", parts)
+    assert command.main(["--out", "results"]) == code
+    page = (tmp_path / "results" / "README.md").read_text()
+    content = json.loads((tmp_path / "results" / "results.json").read_text())
+    assert ("**FAILS**" in page) == (code == 1)
+    assert ("*not available*" in page) == any(row["verdict"] == "not available" for s in content["sections"] for row in s["rows"])
+    assert not [line for line in page.splitlines() if line.startswith("|") and "1 | 2" in line]  # a cell keeps its table whole
+
+
+def test_wrong_arguments_are_the_callers_mistake():
+    assert command.main(["--jobs", "0"]) == 2
+    with pytest.raises(SystemExit) as end:
+        command.main(["--quick", "--full"])
+    assert end.value.code == 2
+
+
+@pytest.mark.parametrize("share", [0.01, 0.025, 0.05])
+def test_the_cable_has_its_length_and_sag(share):
+    cable = cable_of_length(185.0, share)
+    points = cable.sample(20001)
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(185.0, abs=1e-3)
+    assert -points[:, 2].min() == pytest.approx(share * points[-1, 0], rel=1e-6)
+
+
+@pytest.mark.parametrize("waypoints", [3, 10])
+def test_the_nonlinear_program_keeps_the_thrust_bound_and_costs_no_more_than_the_cut_plan(waypoints):
+    vehicle, settings = load_vehicle("snapdragon"), PerchSettings(thrust_max=4.5, **PAPERS_LIMITS)
+    problem = waypoint_problem(np.random.default_rng(1), waypoints)
+    planned = plan(problem, settings, vehicle)
+    durations = planned.trajectory.durations
+    found = solve(problem, settings, vehicle, durations, 4.5)
+    assert found.converged and found.thrust_max <= 4.5 * 1.001
+
+    def snap(coefficients):
+        total = 0.0
+        for segment, T in zip(coefficients, durations):
+            s = np.linspace(0.0, 1.0, 2001)
+            fourth = bernstein.derivative(segment, 4) / T**4
+            values = fourth @ bernstein.basis(fourth.shape[-1] - 1, s).T
+            total += T * np.trapezoid((values**2).sum(axis=0), s)
+        return total
+
+    # The plan was stretched until its bound held by itself: there the nonlinear program has the same optimum.
+    assert snap(found.coefficients) == pytest.approx(snap(planned.trajectory.coefficients[:, :3]), rel=1e-3)
+    # An independent look at the thrust, between the samples too.
+    for segment, T in zip(found.coefficients, durations):
+        second = bernstein.derivative(segment, 2) / T**2
+        a = (second @ bernstein.basis(second.shape[-1] - 1, np.linspace(0.0, 1.0, 4001)).T).T
+        assert vehicle.mass * np.linalg.norm(a + [0.0, 0.0, GRAVITY], axis=1).max() < 4.6

@@ -1,0 +1,74 @@
+"""Replays of recorded flights: the recording written from a trace, its animation, its plots, and refusals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from perch_core.scenario import load_scenario
+from perch_eval.flight import Flight
+from perch_eval.in_process import fly
+from perch_eval.in_process.recording import TracedFlight, write
+from perch_eval.in_process.trace import TRUTH
+from perch_eval.metrics import flight_metrics
+from perch_core.vehicle import load_vehicle
+from perch_eval.replay.command import main
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A take-off and the first two seconds of flight, recorded from a trace."""
+    scenario = dataclasses.replace(load_scenario("surface_90"), time_limit=2.0)
+    trace = fly(scenario, 1)
+    path = tmp_path_factory.mktemp("replay") / "flight.mcap"
+    write(trace, path)
+    return path, trace
+
+
+def test_a_trace_is_read_back_as_it_was_flown(recorded):
+    path, trace = recorded
+    flight, traced = Flight(path), TracedFlight(trace)
+    states = flight.states("ground_truth/odometry")
+    assert np.allclose(states.p, trace.part(TRUTH)[:, 0:3], atol=1e-12)
+    assert np.allclose(states.v, trace.part(TRUTH)[:, 7:10], atol=1e-9)
+    assert [m.state for _, m in flight.messages("contact")] == [int(c.state) for c in trace.contacts]
+    vehicle = load_vehicle("snapdragon")
+    from_file, from_trace = (flight_metrics(f, vehicle, trace.end_time) for f in (flight, traced))
+    assert from_file["estimation_rmse_m"] == pytest.approx(from_trace["estimation_rmse_m"], rel=1e-6)
+    assert from_file["max_body_rate_deg_s"] == pytest.approx(from_trace["max_body_rate_deg_s"], rel=1e-9)
+
+
+def test_an_animation_has_a_frame_for_each_moment(recorded, tmp_path):
+    path, _ = recorded
+    gif = tmp_path / "f.gif"
+    assert main([str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(gif)]) == 0
+    with Image.open(gif) as image:
+        assert image.n_frames == 4
+
+
+def test_plots_are_written(recorded, tmp_path):
+    path, _ = recorded
+    assert main([str(path), "--from", "1.2", "--to", "1.4", "--fps", "10", "--out", str(tmp_path / "f.gif"),
+                 "--plots", str(tmp_path / "plots")]) == 0
+    assert {"tracking.png", "path.png", "rates.png", "thrust.png"} <= {p.name for p in (tmp_path / "plots").iterdir()}
+
+
+@pytest.mark.parametrize("options, words", [
+    (["--from", "90"], "the flight lasts"),
+    (["--fps", "0"], "--fps 0 is not > 0"),
+    (["--out", "x.avi"], "neither .gif nor .mp4"),
+    (["--vehicle", "zeppelin"], "zeppelin"),
+])
+def test_what_cannot_be_shown_is_refused_in_one_line(recorded, capsys, options, words):
+    path, _ = recorded
+    assert main([str(path), *options]) == 2
+    said = capsys.readouterr().err
+    assert words in said and len(said.splitlines()) == 1
+
+
+def test_no_recording_is_the_callers_mistake(tmp_path, capsys):
+    assert main([str(tmp_path / "none.mcap")]) == 2
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    assert main([str(tmp_path / "empty.mcap")]) == 2
+    assert "ground_truth/odometry" in capsys.readouterr().err
