@@ -52,3 +52,21 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension)
 
 
+
+
+def paper_like_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:
+    """A problem as in M-V: from hover, 40-90 degrees, 1.7-3 m, waypoints scattered about the straight way.
+
+    Args:
+        rng: source of randomness.
+        waypoints: their number.
+    """
+    heading, inclination = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(40.0, 90.0))
+    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+    p0 = np.array([0.0, 0.0, 1.5])
+    p_WS = p0 + rng.uniform(1.7, 3.0) * ahead + (0.0, 0.0, rng.uniform(-0.3, 0.3))
+    surface = PerchSurface.from_inclination(p_WS, inclination, heading)
+    before = p_WS + 0.5 * surface.normal
+    share = np.linspace(0.0, 1.0, waypoints + 2)[1:-1]
+    points = [p0 + s * (before - p0) + rng.normal(0.0, 0.36 / max(waypoints, 1), 3) for s in share]
+    return PerchProblem(StartState(p0, yaw=heading), surface, tuple(Waypoint(p) for p in points))

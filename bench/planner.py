@@ -1,0 +1,127 @@
+"""Speed bars of the perching planner: plans with certificates, the OSQP path, wrong verdicts, the nonlinear comparison."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "oracles"))
+
+import exact_sturm
+import planner_nonlinear
+from harness import Figure, figure
+from random_perches import paper_like_problem
+
+from perch_core import bernstein
+from perch_core.vehicle import load_vehicle
+from perch_planner import bounds
+from perch_planner.planner import plan
+from perch_planner.problem import PerchSettings
+from perch_planner.refusals import PerchRefusal
+
+_FIRST_PLAN = """
+import time; begin = time.perf_counter()
+from perch_planner.planner import plan
+from perch_planner.problem import PerchProblem, PerchSettings, StartState
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import load_vehicle
+vehicle = load_vehicle("snapdragon"); imported = time.perf_counter() - begin
+begin = time.perf_counter()
+plan(PerchProblem(StartState((0, 0, 1.2)), PerchSurface.from_inclination((1.7, 0, 1.2), 1.2)), PerchSettings(), vehicle)
+print(imported, time.perf_counter() - begin)
+"""
+
+
+def _plan_times(waypoints: int, settings: PerchSettings, count: int) -> tuple[np.ndarray, int]:
+    """Time of one plan for each of `count` random problems [ms], and how many were refused."""
+    vehicle, times, refused = load_vehicle("snapdragon"), [], 0
+    for seed in range(count):
+        problem = paper_like_problem(np.random.default_rng(seed), waypoints)
+        try:
+            if not seed:
+                plan(problem, settings, vehicle)
+            begin = time.perf_counter()
+            plan(problem, settings, vehicle)
+            times.append(1e3 * (time.perf_counter() - begin))
+        except PerchRefusal:
+            refused += 1
+    return np.array(times), refused
+
+
+def _wrong_verdicts(count: int) -> float:
+    """Verdicts of the bound check that the exact Sturm chain contradicts; margins from 1e-2 down to 1e-9."""
+    wrong = 0
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        force = rng.normal(0.0, rng.uniform(1.0, 8.0), (3, 13))
+        force[2] += 9.81
+        poly = bernstein.product(force, force).sum(axis=0)
+        attained, _, _ = bounds.maximum(poly, 1e-13 * np.abs(poly).max())
+        bound = attained * (1.0 + rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-9.0, -2.0))
+        verdict, _ = bounds.stays_below(poly, bound)
+        wrong += (verdict == bounds.BELOW) != exact_sturm.stays_below(poly.tolist(), bound)
+    return float(wrong)
+
+
+def _nonlinear_ratios(waypoints: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Time of SLSQP over time of the plan with its certificates, and of SLSQP alone [ms], on problems both solve."""
+    vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
+    ratios, times = [], []
+    for seed in range(count):
+        problem = paper_like_problem(np.random.default_rng(seed), waypoints)
+        try:
+            begin = time.perf_counter()
+            planned = plan(problem, settings, vehicle)
+            fast = time.perf_counter() - begin
+        except PerchRefusal:
+            continue
+        slow, converged, _ = planner_nonlinear.solve(problem, settings, vehicle, 0.95 * planned.trajectory.durations)
+        if converged:
+            ratios.append(slow / fast)
+            times.append(1e3 * slow)
+    return np.array(ratios), np.array(times)
+
+
+def _first_plan(fresh: bool) -> tuple[float, float]:
+    """Import time and time of the first plan of a new process [s]; fresh: without cached kernels."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, **({"NUMBA_CACHE_DIR": folder} if fresh else {})}
+        out = subprocess.run([sys.executable, "-c", _FIRST_PLAN], env=environment, capture_output=True, text=True, check=True)
+    imported, first = out.stdout.split()
+    return float(imported), float(first)
+
+
+def figures(quick: bool) -> list[Figure]:
+    """Measure the group."""
+    count = 60 if quick else 400
+    out = []
+    for waypoints, median, p99 in ((3, 0.5, 1.0), (10, 1.0, 2.0)):
+        times, refused = _plan_times(waypoints, PerchSettings(), count)
+        name = f"plan with certificates, {waypoints} waypoints"
+        out += [figure(name, "ms", times, median), figure(f"{name}, p99", "ms", times, p99, "p99 <="),
+                figure(f"{name}: refused of {count}", "problems", [refused])]
+    for waypoints, bar in ((3, 15.0), (10, 30.0)):
+        times, _ = _plan_times(waypoints, PerchSettings(solver="osqp"), count // 4)
+        out.append(figure(f"plan with OSQP, {waypoints} waypoints", "ms", times, bar))
+    times, _ = _plan_times(0, PerchSettings(), count)
+    out.append(figure("plan with certificates, no waypoints", "ms", times))
+    verdicts = 300 if quick else 10_000
+    out.append(figure(f"wrong verdicts of {verdicts} polynomials, margins to 1e-9", "verdicts", [_wrong_verdicts(verdicts)],
+                      0.0, "max =="))
+    for waypoints in (3, 10):
+        ratios, times = _nonlinear_ratios(waypoints, 4 if quick else 12)
+        if len(ratios):
+            out += [figure(f"SLSQP with sampled thrust, {waypoints} waypoints", "ms", times),
+                    figure(f"SLSQP / plan, {waypoints} waypoints", "x", ratios, 50.0, "median >=")]
+    imported, first = _first_plan(fresh=False)
+    out += [figure("import", "s", [imported]), figure("first plan of a process, kernels cached", "s", [first])]
+    if not quick:
+        out.append(figure("first plan of a checkout, kernels compiled", "s", [_first_plan(fresh=True)[1]]))
+    return out

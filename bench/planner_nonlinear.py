@@ -1,0 +1,80 @@
+"""Table I of M: the thrust bound enforced at every sample by NLopt's SLSQP, in the planner's own reduced coordinates."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from perch_core.vehicle import GRAVITY, Vehicle
+from perch_planner import reduced_qp
+from perch_planner.contact_constraints import Contact
+from perch_planner.problem import Limits, PerchProblem, PerchSettings
+from perch_planner.solvers import least_norm
+
+SAMPLE = 0.01  # [s], the paper's dt
+
+
+def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, durations: np.ndarray,
+          time_limit: float = 20.0) -> tuple[float, bool, float]:
+    """Minimise the same cost with the thrust bounded at every 10 ms as a nonlinear constraint. [M:V, Table I]
+
+    Args:
+        problem, settings, vehicle: as for the planner.
+        durations: fixed segment durations [s].
+        time_limit: of the solver [s].
+
+    Returns:
+        wall-clock time [s], whether the solver converged within the bounds, greatest sampled thrust [N].
+    """
+    import nlopt
+
+    contact = Contact(problem, settings, vehicle.perch_offset)
+    linear = contact.constraints(durations)
+    bubbles = contact.bubbles(durations, linear, everywhere=False)
+    times = np.arange(0.0, durations.sum(), SAMPLE)
+    edges = np.concatenate([[0.0], np.cumsum(durations)])
+    segments = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(durations) - 1)
+    places = (times - edges[segments]) / durations[segments]
+    begin = time.perf_counter()
+    program = reduced_qp.assemble(durations, *contact.knots(durations), bubbles, np.append(linear.segments, segments),
+                                  np.append(linear.places, places), np.append(linear.orders, np.full(len(times), 2)), 4)
+    rows, low, high = reduced_qp.constraint_rows(program, linear.functional, linear.direction, linear.lower, linear.upper)
+    count = len(linear.segments)
+    columns, constant = program.whitened[:, count:].T, program.constant[count:] + (0.0, 0.0, GRAVITY)
+    size = program.whitened.shape[0]
+    limit = Limits.of(settings, vehicle).thrust[1] / vehicle.mass
+
+    def cost(w, gradient):
+        if gradient.size:
+            gradient[:] = 2.0 * w
+        return float(w @ w)
+
+    def within_rows(result, w, gradient):
+        value = rows @ w
+        result[:] = np.concatenate([value - high, low - value])
+        if gradient.size:
+            gradient[:] = np.vstack([rows, -rows])
+
+    def within_thrust(result, w, gradient):
+        force = constant + columns @ w.reshape(3, size).T
+        result[:] = (force**2).sum(axis=1) / limit**2 - 1.0
+        if gradient.size:
+            for d in range(3):
+                gradient[:, d * size:(d + 1) * size] = 2.0 * force[:, d:d + 1] * columns / limit**2
+
+    solver = nlopt.opt(nlopt.LD_SLSQP, 3 * size)
+    solver.set_min_objective(cost)
+    solver.add_inequality_mconstraint(within_rows, np.full(2 * len(low), 1e-8))
+    solver.add_inequality_mconstraint(within_thrust, np.full(len(times), 1e-6))
+    solver.set_ftol_rel(1e-6)
+    solver.set_maxtime(time_limit)
+    try:
+        w = solver.optimize(least_norm(rows, low, high).w)
+        converged = solver.last_optimize_result() in (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
+    except (nlopt.RoundoffLimited, RuntimeError):
+        w, converged = np.zeros(3 * size), False
+    elapsed = time.perf_counter() - begin
+    force = constant + columns @ w.reshape(3, size).T
+    peak = float(np.sqrt((force**2).sum(axis=1)).max())
+    return elapsed, bool(converged and peak <= 1.001 * limit), peak * vehicle.mass
