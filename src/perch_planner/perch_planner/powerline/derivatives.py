@@ -159,7 +159,7 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
     take("step", f["step_hess"].map(N)(X[:, :N], U, 1.0 / N, -lam_step), STRIDE, 0, N)
     turn = f["turn_hess"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate, lam_g[at.turn.tolist()].T)
     take("turn", turn, STRIDE, 0, N)
-    take("run", f["run_hess"].map(N)(X[:, :N], U, p.run, lam_f), STRIDE, 0, N)
+    take("run", f["run_hess"].map(N)(X[:, :N], U, 1.0 / N, p.run, lam_f), STRIDE, 0, N)
     if perception:
         take("see", f["see_hess"].map(N)(X[:, :N], p.lines[0], p.see, lam_f), STAGE_STATES, 0, N)
     for i, (name, parameter) in enumerate(path):

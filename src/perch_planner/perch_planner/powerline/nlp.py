@@ -42,7 +42,7 @@ class Numbers:
         start: x_init [P:eq14b], shape (17,).
         reference: wanted end: p (3), s3 (3), v (3), w (3), shape (12,).
         lines: rows of centre, direction, radius, half length, shape (lines, 8).
-        run_weights: thrust, body rate, ramp, shape (3,); see `stage_functions`.
+        run_weights: thrust, body rate, ramp, body rate between nodes, shape (4,); see `stage_functions`.
         end_weights: horizontal position, height, tilt, velocity, body rate, thrust, shape (6,).
         see_weights: reprojection, cheirality, segment visibility of every node, shape (N, 3).
         duration: bounds of T [s]. [P:eq14c]
@@ -122,7 +122,7 @@ class Problem:
         parameters = Parameters(lines, body_rate, reference, run, end, ca.reshape(see, SEE_WEIGHTS, N))
         X, U = split(x, N)
 
-        cost = ca.sum2(f["run"].map(N)(X[:, :N], U, run)) + f["end"](X[:, N], reference, end)
+        cost = ca.sum2(f["run"].map(N)(X[:, :N], U, 1.0 / N, run)) + f["end"](X[:, N], reference, end)
         if self.structure.perception:
             cost += ca.sum2(f["see"].map(N)(X[:, :N], lines[0], parameters.see))
         gaps = X[:, 1:] - f["step"].map(N)(X[:, :N], U, 1.0 / N) - ca.reshape(defects, STAGE_STATES, N)

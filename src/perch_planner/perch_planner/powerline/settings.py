@@ -13,7 +13,8 @@ class PerchWeights:
     """Cost weights of a perch [P:eq15]; the defaults are the authors'."""
 
     thrust: float = quantity(0.02, low=0.0, doc="rotor impulse")
-    rate: float = quantity(0.3, low=0.0, doc="body rate on the way")
+    rate: float = quantity(0.3, low=0.0, doc="body rate at the nodes")
+    rate_between: float = quantity(0.3, low=0.0, doc="body rate in the middle between the nodes; the authors have 0")
     xy_end: float = quantity(3000.0, low=0.0, doc="horizontal position at the end")
     z_end: float = quantity(3000.0, low=0.0, doc="height at the end")
     tilt_end: float = quantity(3000.0, low=0.0, doc="direction of b3 at the end")

@@ -85,12 +85,13 @@ class Solver:
 
 
 def run_weights(weights: PerchWeights, ramp: float, thrust_rate_max: float, intervals: int) -> np.ndarray:
-    """Running weights for the stage functions, shape (3,).
+    """Running weights for the stage functions, shape (4,).
 
     Sums over nodes grow with N; the weights are the authors' for N = 30 and are scaled to mean the same for every N.
     """
     share = 30.0 / intervals
-    return np.array([weights.thrust * share, weights.rate * share, ramp or thrust_rate_max / (2 * intervals)])
+    return np.array([weights.thrust * share, weights.rate * share, ramp or thrust_rate_max / (2 * intervals),
+                     weights.rate_between * share])
 
 
 def end_weights(weights: PerchWeights) -> np.ndarray:

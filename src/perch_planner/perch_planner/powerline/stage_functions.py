@@ -23,7 +23,7 @@ STAGE_STATES = STATES + 1  # the duration T rides along as a constant state
 SUB_STEPS = 2  # one RK4 step per T/30 drifts up to 22 mm when re-integrated; two stay below 0.7 mm
 LINE_SIZE = 8  # centre (3), direction (3), radius, half length
 SEGMENT_AIM = 0.5  # share of the segment's half length within which the soft constraint wants the centred point
-RUN_WEIGHTS, SEE_WEIGHTS, END_WEIGHTS, REFERENCE = 3, 3, 6, 12
+RUN_WEIGHTS, SEE_WEIGHTS, END_WEIGHTS, REFERENCE = 4, 3, 6, 12
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,23 @@ def _step(model: StageModel, x: Vector, u: Vector, unit_step: Scalar) -> Vector:
     return (*state, x[STATES])
 
 
-def _run(model: StageModel, x: Vector, u: Vector, weights: Vector) -> Scalar:
+def _halfway(model: StageModel, x: Vector, u: Vector, unit_step: Scalar) -> Vector:
+    """State in the middle of the interval that starts at a node."""
+    rates = tuple(model.thrust_rate_max * value for value in u)
+    return rotor_model.rk4(model.rotor, x[:STATES], rates, x[STATES] * unit_step / 2)
+
+
+def _run(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, weights: Vector) -> Scalar:
     """Running cost of thrust and body rate. [P:eq15]
 
-    weights: thrust, body rate, ramp. The impulse is N times the paper's gamma T / N + u T^2 / (2 N^2), that is
+    weights: thrust, body rate, ramp, body rate in the middle of the interval. The paper counts the body rate at the nodes
+    alone; a light body then swings between them, where nothing counts. The impulse is N times the paper's gamma T / N + u T^2 / (2 N^2), that is
     gamma T + ramp mu T^2 with ramp = thrust_rate_max / (2 N); the authors' code has ramp = 1/2 in its place.
     """
     T = x[STATES]
     impulse = tuple(gamma * T + weights[2] * mu * T * T for gamma, mu in zip(x[THRUST], u))
-    return weights[0] * dot(impulse, impulse) + weights[1] * dot(x[W], x[W])
+    half = _halfway(model, x, u, unit_step)[W]
+    return weights[0] * dot(impulse, impulse) + weights[1] * dot(x[W], x[W]) + weights[3] * dot(half, half)
 
 
 def _hinge_squared(h: Scalar) -> Scalar:
@@ -143,9 +151,7 @@ def _turn(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, limit: Sca
     A light body may reach its greatest rate between two nodes and stop at both: 5000 rad/s^3 are within its torque.
     Body rate and thrusts do not depend on the rest of the state, so that this costs little.
     """
-    rates = tuple(model.thrust_rate_max * value for value in u)
-    half = rotor_model.rk4(model.rotor, x[:STATES], rates, x[STATES] * unit_step / 2)
-    return _spin(half, limit)
+    return _spin(_halfway(model, x, u, unit_step), limit)
 
 
 @dataclass(frozen=True)
@@ -153,7 +159,7 @@ class StageFunctions:
     """The functions of one stage with their derivatives as flat vectors of nonzeros, and where these belong.
 
     Attributes:
-        functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, weights)`, `see(x, line, weights)`,
+        functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, 1/N, weights)`, `see(x, line, weights)`,
             `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint, with x of 18 values (17 states, T) and u
             of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f
             and then the nonzeros of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
@@ -180,7 +186,7 @@ def stage_functions(model: StageModel) -> StageFunctions:
     rw, sw, ew = map(components, (run, see, end))
     expressions = {
         "step": ([x, u], [unit_step], ca.vertcat(*_step(model, xs, us, unit_step))),
-        "run": ([x, u], [run], _run(model, xs, us, rw)),
+        "run": ([x, u], [unit_step, run], _run(model, xs, us, unit_step, rw)),
         "see": ([x], [line, see], _see(model, xs, ls, sw)),
         "end": ([x], [reference, end], _end(model, xs, rs, ew)),
         "clear": ([x], [line], _clear(model, xs, ls)),

@@ -115,6 +115,7 @@ class PowerlineWorker:
         try:
             return self._pipe.recv()
         except (EOFError, OSError):
+            self.close()  # the next plan starts another
             return Refusal("solver", "worker", -1.0, "the planning process ended unexpectedly")
 
     def plan(self, request: PowerlineRequest, deadline: float | None = None) -> PowerlinePlan:
