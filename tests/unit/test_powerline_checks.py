@@ -134,6 +134,12 @@ def test_neighbouring_pieces_of_one_cable_do_not_cross() -> None:
     check_request(request(lines=pieces), VEHICLE, PowerlineSettings())
 
 
+def test_two_estimates_of_one_cable_do_not_cross() -> None:
+    again = Segment([4.02, 0.5, 4.18], [0.02, 1, 0.01], 2.0, 0.03, 7)
+    pose = PerchPose.on_line(LINE, LINE.centre, np.radians(80), 0.18, np.array([0.0, 0, 4.3]))
+    check_request(request(lines=(LINE, OTHER, again), perch=pose), VEHICLE, PowerlineSettings())
+
+
 def test_fast_turning_and_overdriven_starts_are_refused() -> None:
     fast, overdriven = request().start.copy(), request().start.copy()
     fast[11], overdriven[13] = 9.0, 12.0
