@@ -44,6 +44,7 @@ class Estimator:
         self._nis = 0.0
         self._broken = False
         self._message = "waiting for the IMU"
+        self._compile()
 
     def add_imu(self, sample: ImuSample) -> ImuOutcome:
         """Move the estimate to the sample's stamp. Bad samples are bridged or refused; the outcome says which."""
@@ -113,6 +114,13 @@ class Estimator:
             lost = position > self.config.diverged_position or attitude > self.config.diverged_attitude
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
         return Status(health, age, self._accepted, self._rejected, self._nis, position, attitude, self._message)
+
+    def _compile(self) -> None:
+        """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
+        belief = start.before_vio(0, np.array([0.0, 0.0, 9.81]))
+        row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
+        self._transform.predict(belief, row, 2_000_000)
+        kernels.advance(belief.x.copy(), *map(float, row[0, 1:7]), 0.002)
 
     def _timing(self, pose: VioPose) -> VioOutcome | None:
         """Why the stamp cannot be applied now, or None."""

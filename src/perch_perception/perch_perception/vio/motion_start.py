@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.vehicle import GRAVITY
 

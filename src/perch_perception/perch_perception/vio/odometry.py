@@ -22,6 +22,7 @@ from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.result import FrameOutcome, VioPoseEstimate, VioResult
 from perch_perception.vio.start import KnownPose
 from perch_perception.vio.tracker import Features, Tracker
+from perch_perception.vio.triangulation import triangulate
 
 _FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 
@@ -55,6 +56,7 @@ class VisualInertialOdometry:
         self._last_exposed: int | None = None
         self._informed = 0              # when vision or rest last updated the filter
         self._bad_frames = 0
+        _compile()
 
     @property
     def time_offset(self) -> float:
@@ -226,6 +228,14 @@ class VisualInertialOdometry:
                                    pose_covariance(s), velocity_covariance(s)) if outcome.has_pose else None
         return VioResult(outcome, estimate, len(features.ids), report.used, report.refused, report.nis,
                          report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
+
+
+def _compile() -> None:
+    """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
+    row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
+    preintegrate(row, np.zeros(3), np.zeros(3))
+    rays = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -0.8]])
+    triangulate(np.array([[0.0, 0.0, 1.0], [0.75, 0.0, 1.0]]), rays, 0.1, 0.01)
 
 
 def pose_covariance(state: at.State) -> np.ndarray:
