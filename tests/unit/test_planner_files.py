@@ -1,0 +1,67 @@
+"""Problem files and the script that plans them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perch_core import config
+from perch_core.errors import ConfigError
+from perch_planner.planner import plan
+from perch_planner.problem_file import read_problem
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ("surface_90", "surface_60_waypoints", "ceiling", "moving_pad")
+
+
+def mapping(name: str = "surface_90") -> dict:
+    return config.read_yaml(config.find("problems", name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_example_has_a_plan(name):
+    problem, settings, vehicle = read_problem(mapping(name), name)
+    assert all(c.holds for c in plan(problem, settings, vehicle).certificates)
+
+
+@pytest.mark.parametrize("change, words", [
+    ({"strat": {}}, "strat"), ({"target": {"position": [0, 0, 1], "inclination_deg": 200.0}}, "inclination_deg: 200"),
+    ({"start": {"position": [0, 0]}}, "start.position"), ({"settings": {"solver": "ooqp"}}, "settings.solver"),
+    ({"segment_times": [1.0, 1.0]}, "segment_times"), ({"start": {"position": [0, 0, ".nan"]}}, "start.position")])
+def test_mistakes_are_named_with_their_file(change, words):
+    with pytest.raises(ConfigError) as caught:
+        read_problem({**mapping(), **change}, "my.yaml")
+    assert "my.yaml" in str(caught.value) and words in str(caught.value)
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, str(ROOT / "scripts" / "plan.py"), *arguments], capture_output=True, text=True)
+
+
+def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
+    done = run("surface_90", "--out", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    written = json.loads((tmp_path / "plan.json").read_text())
+    assert all(c["holds"] for c in written["certificates"])
+    with (tmp_path / "plan.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    t = np.array([float(row["time"]) for row in rows])
+    z, vz = (np.array([float(row[key]) for row in rows]) for key in ("z", "vz"))
+    assert t[-1] == pytest.approx(written["duration"])
+    assert np.gradient(z, t)[5:-5] == pytest.approx(vz[5:-5], abs=2e-3)
+    assert float(rows[-1]["z"]) == pytest.approx(1.2) and float(rows[-1]["x"]) == pytest.approx(1.66)
+    assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("arguments, code, words", [
+    (("surface_90", "--set", "thrust_max=2.6"), 1, "thrust_floor"), (("no_such_problem",), 2, "no_such_problem"),
+    (("surface_90", "--set", "solver=x"), 2, "settings.solver"), ((), 2, "problem is needed")])
+def test_the_script_says_what_is_wrong_by_word_and_exit_code(arguments, code, words, tmp_path):
+    done = run(*arguments, "--out", str(tmp_path / "never"))
+    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "never").exists()

@@ -1,0 +1,90 @@
+"""The independent verifier finds planted faults, and the two builds of the kernels agree."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import load_vehicle
+from perch_planner.planner import plan
+from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
+from perch_planner.verifier import verify
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "bench"))
+from random_perches import requirements  # noqa: E402
+
+VEHICLE = load_vehicle("snapdragon")
+PROBLEM = PerchProblem(StartState((0.0, 0.0, 1.5)), PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), np.radians(70.0)),
+                       (Waypoint((0.7, 0.1, 1.4)),))
+PLAN = plan(PROBLEM, PerchSettings(), VEHICLE)
+NEED = requirements(PROBLEM, PerchSettings(), VEHICLE)
+
+
+def findings(coefficients=None, durations=None, **changes):
+    found = verify(PLAN.trajectory.durations if durations is None else durations,
+                   PLAN.trajectory.coefficients if coefficients is None else coefficients,
+                   dataclasses.replace(NEED, **changes), step=1e-3)
+    return " ".join(f.requirement for f in found)
+
+
+def test_the_untouched_plan_is_accepted():
+    assert findings() == ""
+
+
+@pytest.mark.parametrize("changes, words", [
+    ({"thrust": (0.5, 3.0)}, "thrust, greatest"), ({"thrust": (2.0, 4.5)}, "thrust, least"), ({"body_rate": 1.0}, "body rate"),
+    ({"speed": 0.5}, "speed"), ({"height": (1.49, 3.0)}, "height, least"), ({"height": (0.0, 1.3)}, "height, greatest"),
+    ({"extension": 2.0}, "clearance"), ({"tube": (0.15, 0.01, 0.001, 0.001)}, "tube"), ({"impact_speed": (0.7, 0.8)}, "impact speed, least"),
+    ({"impact_speed": (0.1, 0.2)}, "impact speed, greatest"), ({"tangential_speed": 1e-3}, "tangential"),
+    ({"impact_acceleration": 3.31}, "acceleration at contact"), ({"perch_offset": 0.05}, "position at contact"),
+    ({"v_S": np.array([0.01, 0.0, 0.0])}, "position at contact"), ({"waypoints": np.array([[0.7, 0.1, 1.41]])}, "waypoint 0"),
+    ({"start": np.array([[0.0, 0.0, 1.5], [0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3])}, "start, derivative 1"),
+    ({"start_yaw": (0.1, 0.0)}, "start yaw")])
+def test_a_broken_requirement_is_found(changes, words):
+    assert words in findings(**changes)
+
+
+def test_a_tampered_coefficient_or_duration_is_found():
+    for segment, row in ((0, 0), (1, 2)):
+        rows = PLAN.trajectory.coefficients.copy()
+        rows[segment, row, 7] += 0.02
+        durations = PLAN.trajectory.durations.copy()
+        durations[segment] *= 0.9
+        assert "continuity" in findings(durations=durations)
+        rows[segment, row, -1] += 1e-6
+        assert "continuity" in findings(rows)
+
+
+_PLAN_BY_INTERPRETER = """
+import json
+import numpy as np
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import load_vehicle
+from perch_planner.compilation import COMPILED
+from perch_planner.planner import plan
+from perch_planner.problem import PerchProblem, PerchSettings, StartState
+surface = PerchSurface.from_inclination(np.array([1.7, 0.2, 1.5]), 1.2, 0.1)
+answer = plan(PerchProblem(StartState((0.0, 0.0, 1.5), v=(0.2, 0.0, 0.0)), surface), PerchSettings(), load_vehicle("snapdragon"))
+print(json.dumps([COMPILED, answer.trajectory.durations.tolist(), answer.trajectory.coefficients.tolist(),
+                  [[c.minimum, c.maximum] for c in answer.certificates if c.quantity != "clearance"]]))
+"""
+
+
+def test_the_plan_is_the_same_without_numba():
+    answers = []
+    for switch in ("1", "0"):
+        out = subprocess.run([sys.executable, "-c", _PLAN_BY_INTERPRETER], capture_output=True, text=True, check=True,
+                             env={**os.environ, "PERCH_NUMBA": switch})
+        answers.append(json.loads(out.stdout))
+    compiled, interpreted = answers
+    assert compiled[0] and not interpreted[0]
+    for one, other in zip(compiled[1:], interpreted[1:]):
+        assert np.array(one) == pytest.approx(np.array(other), abs=1e-8)
