@@ -211,7 +211,8 @@ def test_abort_brakes_to_a_hover(vehicle):
     assert answer.success and "abort" in answer.message
     vehicle.step(500)
     assert vehicle.state() == ControllerStatus.HOVERING and np.linalg.norm(vehicle.plant.v) < 0.05
-    assert vehicle.plant.p[0] < 1.9
+    # From the 2.2 m/s of mid-way, braking at 4 m/s^2 at the peak takes 1.2 m.
+    assert vehicle.plant.p[0] < 2.6
 
 
 def test_unusable_odometry_still_gets_its_answer(vehicle):

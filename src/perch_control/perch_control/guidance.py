@@ -124,7 +124,7 @@ class Blend:
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s] of the reference."""
         x = self.source.setpoint(t)
-        if t <= self.start or (t - self.start >= self.offset.duration and not self.lasting):
+        if t < self.start or (t - self.start >= self.offset.duration and not self.lasting):
             return x
         d = self.offset.setpoint(t - self.start)
         return Setpoint(*(tuple(m + n for m, n in zip(getattr(x, k), getattr(d, k))) for k in ("p", "v", "a", "j", "s")),

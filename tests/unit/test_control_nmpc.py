@@ -1,0 +1,268 @@
+"""The predictive controller: condensing and its QP against second implementations, the model against the rigid body, and
+closed loop; the L1 augmentation."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from closed_loop.loop import fly_to_contact, make_loop, perch
+from closed_loop.plant import Disturbances
+from perch_control.geometric import GeometricController
+from perch_control.l1 import L1Augmentation, L1Settings
+from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings
+from perch_control.nmpc.condensing import condense_loops, condense_matrices, expand_loops, expand_matrices
+from perch_control.nmpc.linearisation import Linearisation
+from perch_control.nmpc.model import StageLayout, stage
+from perch_control.nmpc.qp import solve, solve_osqp
+from perch_control.settings import GeometricGains
+from perch_core import rigid_body
+from perch_core.lines import Segment, scaled_clearance
+from perch_core.trajectory import rest_to_rest
+from perch_core.vehicle import load_vehicle
+
+SNAPDRAGON, RPG = load_vehicle("snapdragon"), load_vehicle("rpg")
+
+
+def controller(vehicle=SNAPDRAGON, **settings):
+    return NmpcController(vehicle, NmpcSettings(**settings), GeometricController(vehicle, GeometricGains()))
+
+
+def argument(layout, rng):
+    """A stage argument whose quaternions are of unit length."""
+    z = rng.normal(size=layout.arguments) * 0.3
+    n = layout.states
+    for k in (3, n + 4 + 3):
+        z[k:k + 4] = Rotation.random(random_state=rng.integers(1000)).as_quat()
+    z[n:n + 4] = rng.uniform(0.3, 1.0, 4)
+    if n == 17:
+        z[13:17] = rng.uniform(0.3, 1.0, 4)
+    w = n + 4 + 17 + 6
+    z[w:w + 13] = rng.uniform(0.5, 2.0, 13)
+    if layout.with_lines:
+        for k in range(3):
+            z[w + 13 + 8 * k:w + 13 + 8 * k + 8] = (*rng.normal(size=3) * 2, 0, 1, 0, 3.0, 0.03)
+        z[-4:] = 1.0, 1.0, 1.0, 0.3
+    return z
+
+
+@pytest.mark.parametrize("states", [13, 17])
+def test_dynamics_of_a_stage_are_the_rigid_bodys(states):
+    """Independent integration of perch_core.rigid_body with drag, in small steps. [P:eq1]"""
+    layout, step, rng = StageLayout(states, False), 0.05, np.random.default_rng(1)
+    z = argument(layout, rng)
+    z[states + 4 + 17:states + 4 + 23] = rng.normal(size=6) * 0.5
+    following = np.array(stage(SNAPDRAGON, step, layout)(z)).ravel()[:states]
+    p, R, v, w = z[0:3], Rotation.from_quat(z[3:7]), z[7:10], z[10:13]
+    u, d = z[states:states + 4], z[states + 21:states + 27]
+    n = 4000
+    for k in range(n):
+        h = step / n
+        f = z[13:17] + u * step * (k + 0.5) / n if states == 17 else u
+        drag = -np.array(SNAPDRAGON.drag) * R.inv().apply(v)
+        a, dw = rigid_body.accelerations(SNAPDRAGON, R.as_matrix(), w, f, drag)
+        a, dw = a + d[:3], dw + d[3:]
+        p, v, R, w = p + v * h + a * h * h / 2, v + a * h, R * Rotation.from_rotvec((w + dw * h / 2) * h), w + dw * h
+    np.testing.assert_allclose(following[0:3], p, atol=1e-4)
+    np.testing.assert_allclose(following[7:10], v, atol=2e-3)
+    np.testing.assert_allclose(following[10:13], w, atol=1e-2)
+    q = following[3:7] / np.linalg.norm(following[3:7])
+    assert (Rotation.from_quat(q).inv() * R).magnitude() < 1e-3
+
+
+@pytest.mark.parametrize("states, with_lines", [(13, False), (17, False), (13, True)])
+def test_compiled_linearisation_and_finite_differences_agree(states, with_lines):
+    layout, rng = StageLayout(states, with_lines), np.random.default_rng(2)
+    function = stage(RPG, 0.05, layout)
+    stages = Linearisation(RPG, 0.05, layout, 3)
+    for k in range(3):
+        stages.arguments[k] = argument(layout, rng)
+    results = stages.evaluate().copy()
+    n, h = states, 1e-6
+    for z, out in zip(stages.arguments, results):
+        np.testing.assert_allclose(out, np.array(function(z)).ravel(), rtol=1e-9, atol=1e-9)
+        J = np.column_stack([(np.array(function(z + h * e)).ravel()[:n] - np.array(function(z - h * e)).ravel()[:n]) / (2 * h)
+                             for e in np.eye(layout.arguments)[:n + 4]])
+        np.testing.assert_allclose(out[n:n + n * n].reshape(n, n).T, J[:, :n], atol=1e-5)
+        np.testing.assert_allclose(out[n + n * n:n + n * n + 4 * n].reshape(4, n).T, J[:, n:], atol=1e-5)
+        Q = out[-n - n * n:-n].reshape(n, n)
+        np.testing.assert_allclose(Q, Q.T, atol=1e-9)
+        assert np.linalg.eigvalsh(Q).min() > -1e-9
+
+
+def random_stages(rng, N=6, n=13):
+    A = np.eye(n) + 0.1 * rng.normal(size=(N, n, n))
+    L = rng.normal(size=(N + 1, n, n))
+    return (A, 0.3 * rng.normal(size=(N, n, 4)), 0.1 * rng.normal(size=(N, n)), L @ L.transpose(0, 2, 1),
+            rng.normal(size=(N + 1, n)), rng.normal(size=(N, 4)), 0.7, rng.normal(size=n))
+
+
+def test_condensed_cost_is_the_stage_costs_sum():
+    """Against the definition: simulate the linear system for a given du and add the stage costs up."""
+    rng = np.random.default_rng(0)
+    A, B, c, Q, q, r, R, dx0 = random_stages(rng)
+    N, n = c.shape
+    H, h = np.zeros((4 * N, 4 * N)), np.zeros(4 * N)
+    condense_loops(A, B, c, Q, q, r, R, dx0, H, h, np.zeros((N + 1, n)), np.zeros((N, N + 1, n, 4)))
+
+    def cost(du):
+        x, total = dx0, 0.0
+        for k in range(N):
+            u = du[4 * k:4 * k + 4]
+            total += 0.5 * R * u @ u + r[k] @ u
+            x = A[k] @ x + B[k] @ u + c[k]
+            total += 0.5 * x @ Q[k + 1] @ x + q[k + 1] @ x
+        return total
+
+    base = cost(np.zeros(4 * N))
+    for _ in range(5):
+        du = rng.normal(size=4 * N)
+        assert cost(du) - base == pytest.approx(0.5 * du @ H @ du + h @ du, rel=1e-9)
+
+
+def test_loops_and_matrices_condense_and_expand_alike():
+    rng = np.random.default_rng(1)
+    stages = random_stages(rng)
+    N, n = stages[2].shape
+    out = []
+    for condense, expand in ((condense_loops, expand_loops), (condense_matrices, expand_matrices)):
+        H, h, xi, G = np.zeros((4 * N,) * 2), np.zeros(4 * N), np.zeros((N + 1, n)), np.zeros((N, N + 1, n, 4))
+        condense(*stages, H, h, xi, G)
+        X, U = np.ones((N + 1, n)), np.ones((N, 4))
+        expand(*stages[:3], stages[-1], np.linspace(-1, 1, 4 * N), X, U)
+        out.append((H, h, xi, G, X, U))
+    for a, b in zip(*out):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("with_rows", [False, True])
+def test_qp_solvers_agree(with_rows):
+    rng = np.random.default_rng(3)
+    n = 12
+    L = rng.normal(size=(n, n))
+    H, h = L @ L.T + np.eye(n), 5 * rng.normal(size=n)
+    rows = rng.normal(size=(3, n)) if with_rows else np.zeros((0, n))
+    args = H, h, np.full(n, -0.3), np.full(n, 0.4), rows, np.full(len(rows), -0.5), np.full(len(rows), 0.5), np.zeros(len(rows), bool)
+    x = solve(*args)
+    np.testing.assert_allclose(x, solve_osqp(*args), atol=1e-4)
+    bounds = [(-0.3, 0.4)] * n
+    constraints = [{"type": "ineq", "fun": lambda y: 0.5 - rows @ y}, {"type": "ineq", "fun": lambda y: 0.5 + rows @ y}] if with_rows else []
+    peer = minimize(lambda y: 0.5 * y @ H @ y + h @ y, np.zeros(n), jac=lambda y: H @ y + h, bounds=bounds,
+                    constraints=constraints, method="SLSQP", options={"ftol": 1e-12, "maxiter": 500})
+    np.testing.assert_allclose(x, peer.x, atol=1e-4)
+
+
+@pytest.mark.parametrize("thrust_states", [False, True])
+def test_perch_in_closed_loop_needs_no_rehearsal(thrust_states):
+    arrival, _ = fly_to_contact(perch("surface_90_1.7m"), law=controller(thrust_states=thrust_states))
+    assert arrival.holds, arrival
+    assert np.all(arrival.rmse < 0.02)
+
+
+def test_perch_with_estimation_errors():
+    arrival, _ = fly_to_contact(perch("surface_90_3m"), law=controller(), noise_seed=1)
+    assert arrival.holds, arrival
+
+
+def test_rotor_thrusts_and_body_rates_keep_their_limits():
+    law = controller(rate_max=3.0)
+    loop = make_loop(law=law)
+    loop.begin_in_hover()
+    loop.plant.v = np.array([2.0, 0.0, 0.0])  # far from the reference: the limits act
+    w, f = [], []
+
+    def watch(x):
+        w.append(np.abs(x.plant.w).max())
+        f.append(x.plant.vehicle.thrust_coefficient * x.plant.speed**2)
+        return False
+
+    loop.run(0.6, until=watch)
+    assert max(w) < 3.4, "soft limit of 3 rad/s"
+    assert np.min(f) >= SNAPDRAGON.thrust_min - 1e-9 and np.max(f) <= SNAPDRAGON.thrust_max + 1e-9
+    assert law.failures == 0
+
+
+def test_laws_switch_in_flight_without_a_jump():
+    loop = make_loop()
+    loop.begin_in_hover()
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [2, 0, 0.5], 0, 0.4, 2.0))
+    loop.run(0.8)
+    flight, law = loop.controller, controller()
+    for following in (law, GeometricController(SNAPDRAGON, GeometricGains()), law):
+        before = np.array(flight.maneuvers.rotors.command)
+        flight.use(following, flight.maneuvers.gains, flight.settings)
+        loop.run(0.002)
+        after = np.array(flight.maneuvers.rotors.command)
+        assert np.abs(after - before).max() < 0.15 * before.max()
+        loop.run(0.2)
+    loop.run(1.5)
+    assert np.all(loop.rmse < 0.03)
+
+
+@pytest.mark.parametrize("law", ["geometric", "nmpc"])
+def test_l1_cuts_the_error_under_wind_and_mass(law):
+    """Issue 6: position RMSE under 5 m/s wind and +20 % mass at least 60 % smaller than without."""
+    rmse = {}
+    for adaptive in (False, True):
+        flown = controller() if law == "nmpc" else GeometricController(SNAPDRAGON, GeometricGains())
+        loop = make_loop(law=flown, disturbances=Disturbances(mass_factor=1.2, wind=(5.0, 0.0, 0.0)))
+        if adaptive:
+            loop.controller.compensator = L1Augmentation(SNAPDRAGON, L1Settings())
+        loop.begin_in_hover()
+        loop.run(1.0)
+        hover = loop.references[-1]
+        loop.states.clear(), loop.references.clear()
+        loop.follow(rest_to_rest(hover, hover + [2, 1, 0.5], 0, 0.5, 2.0))
+        loop.run(2.4)
+        rmse[adaptive] = np.linalg.norm(loop.rmse)
+    assert rmse[True] < 0.4 * rmse[False], rmse
+
+
+def test_l1_finds_the_disturbance_that_acts():
+    factors = (0.85, 1.0, 1.0, 1.0)
+    loop = make_loop(disturbances=Disturbances(rotor_factor=factors, wind=(3.0, 0.0, 0.0)))
+    loop.controller.compensator = L1Augmentation(SNAPDRAGON, L1Settings())
+    loop.begin_in_hover()
+    loop.run(2.0)
+    k, vehicle = SNAPDRAGON.thrust_coefficient, SNAPDRAGON
+    lost = k * loop.plant.speed**2 * (np.array(factors) - 1.0)
+    wrench = vehicle.allocation @ lost
+    a = loop.plant.R @ ((0, 0, wrench[0]) + np.array(vehicle.drag) * (loop.plant.R.T @ (3.0, 0.0, 0.0))) / vehicle.mass
+    expected = (*a, *(wrench[1:] / vehicle.inertia))
+    np.testing.assert_allclose(loop.controller.compensator.disturbance, expected, rtol=0.05, atol=0.1)
+
+
+def test_line_terms_lead_around_a_wire_that_the_reference_cuts():
+    """[P:VI-A]: the reference flies through a wire; with the collision term the vehicle does not."""
+    wire = Segment.between(np.array([1.5, -3.0, 1.25]), np.array([1.5, 3.0, 1.25]), 0.03)
+    closest = {}
+    for weight in (0.0, 2000.0):
+        law = controller(RPG, lines=LineWeights(collision=weight, perception=1e-6, ramp_time=0.5), rate_max=5.0)
+        law.lines(((*wire.centre, *wire.direction, wire.half_length, wire.radius),))
+        loop = make_loop(vehicle=RPG, law=law)
+        loop.begin_in_hover()
+        p = loop.plant.p.copy()
+        loop.follow(rest_to_rest(p, p + [3.0, 0, 0], 0, 0, 4.0))
+        loop.run(4.3)
+        states = np.array(loop.states)
+        closest[weight] = scaled_clearance(states[:, :3], states[:, 6:10], wire, RPG.body_radii).min()
+        assert law.failures == 0
+    assert closest[0.0] < -0.3 and closest[2000.0] > 0.1, closest
+
+
+def test_interpreted_linearisation_flies_the_same(monkeypatch):
+    monkeypatch.setenv("PERCH_COMPILE", "0")
+    slow = controller()
+    monkeypatch.delenv("PERCH_COMPILE")
+    fast = controller()
+    assert not slow.compiled and (fast.compiled or ca.__version__)
+    speeds = []
+    for law in (slow, fast):
+        loop = make_loop(law=law)
+        loop.begin_in_hover()
+        speeds.append(loop.controller.maneuvers.rotors.command)
+    np.testing.assert_allclose(speeds[0], speeds[1], rtol=1e-6)

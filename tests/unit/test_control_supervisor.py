@@ -1,0 +1,209 @@
+"""Orders, refusals, odometry judgement and each rule of the supervisor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from closed_loop.loop import make_loop, perch
+from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints
+from perch_control.flight_settings import FlightSettings
+from perch_control.guidance import Hold, blended, brake
+from perch_control.modes import Command, CommandRefused, State
+from perch_control.odometry_gate import OdometryGate, OdometryLimits
+from perch_control.reference import FlatReference, SampledReference
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
+
+REST = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def hovering(**options):
+    loop = make_loop(**options)
+    loop.begin_in_hover()
+    return loop
+
+
+def moved(state, **parts):
+    out = list(state)
+    for key, value in parts.items():
+        k = {"p": 0, "v": 3, "q": 6, "w": 10}[key]
+        out[k:k + len(value)] = value
+    return tuple(float(x) for x in out)
+
+
+@pytest.mark.parametrize("change, word", [
+    (dict(p=(np.nan, 0, 0)), "finite"), (dict(v=(np.inf, 0, 0)), "finite"), (dict(q=(0, 0, 0, 0.9)), "norm 0.900"),
+    (dict(p=(0.5, 0, 1)), "position jumped by 0.50 m"), (dict(v=(3, 0, 0)), "velocity jumped by 3.00 m/s"),
+    (dict(q=(0, 0, np.sin(0.5), np.cos(0.5))), "attitude jumped by 57 deg"),
+])
+def test_gate_names_what_it_refuses(change, word):
+    gate = OdometryGate(OdometryLimits())
+    assert gate.check(1.0, REST).usable
+    verdict = gate.check(1.002, moved(REST, **change))
+    assert not verdict.usable and word in verdict.reason
+    assert gate.check(1.004, REST).usable, "the next good sample is taken again"
+
+
+def test_gate_takes_a_jump_that_stays_and_refuses_old_stamps():
+    gate = OdometryGate(OdometryLimits(confirm=0.03))
+    gate.check(1.0, REST)
+    assert "not after" in gate.check(1.0, REST).reason
+    there = moved(REST, p=(1, 0, 1))
+    verdicts = [gate.check(1.0 + 0.002 * k, there) for k in range(1, 20)]
+    first = next(k for k, v in enumerate(verdicts) if v.usable)
+    assert verdicts[first].jumped and first == 15
+    assert not any(v.jumped for v in verdicts[first + 1:])
+
+
+def test_gate_lets_fast_flight_pass():
+    gate = OdometryGate(OdometryLimits())
+    for k in range(100):
+        t = 0.002 * k
+        half = 6.0 * t
+        assert gate.check(t, moved(REST, p=(8 * t, 0, 1), v=(8, 0, 0), q=(0, np.sin(half), 0, np.cos(half)), w=(0, 12, 0))).usable
+
+
+def test_orders_are_refused_where_they_make_no_sense():
+    loop = make_loop()
+    with pytest.raises(CommandRefused, match="no usable odometry"):
+        loop.controller.command(Command.ARM)
+    loop.run(0.02)
+    for command in (Command.HOVER, Command.LAND):
+        with pytest.raises(CommandRefused, match="not flying"):
+            loop.controller.command(command)
+    with pytest.raises(TrajectoryRefused, match="disarmed"):
+        loop.follow(rest_to_rest(np.zeros(3), np.array([0, 0, 1.0]), 0, 0, 2.0))
+    loop.controller.command(Command.ARM)
+    assert loop.controller.state is State.ARMED
+    loop.controller.command(Command.DISARM)
+    assert loop.controller.state is State.DISARMED
+
+
+def test_arming_is_refused_on_the_side():
+    loop = make_loop()
+    loop.odometry = lambda plant: moved(plant.state, q=(np.sin(0.7), 0, 0, np.cos(0.7)))
+    loop.run(0.02)
+    with pytest.raises(CommandRefused, match="tilted"):
+        loop.controller.command(Command.ARM)
+
+
+def test_attached_stops_the_motors_and_arming_again_recovers():
+    plan = perch("surface_90_1.7m")
+    loop = hovering(floor=-10.0)
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(plan.trajectory.duration + 0.04)
+    loop.controller.command(Command.ATTACHED, "test")
+    loop.run(0.05)
+    assert loop.controller.state is State.DISARMED and np.all(np.array(loop.controller.maneuvers.rotors.command) == 0)
+    loop.controller.command(Command.ARM)
+    assert loop.controller.state is State.RECOVERING
+    assert loop.run(4.0, until=lambda x: x.controller.state is State.HOVERING), loop.events
+
+
+def segment(**changes):
+    base = rest_to_rest(np.array([0, 0, 1.2]), np.array([1, 0, 1.2]), 0, 0, 2.0)
+    c = base.coefficients.copy()
+    return FlatTrajectory(np.array([2.0, 1.0]), np.concatenate([c, np.repeat(c[:, :, -1:], 10, axis=-1) + changes.get("step", 0.0)]))
+
+
+def test_trajectories_that_jump_inside_are_refused():
+    check_joints(segment(), 0.02)
+    with pytest.raises(TrajectoryRefused, match="jumps by 0.*at 2.000 s"):
+        check_joints(segment(step=0.1), 0.02)
+    times = np.linspace(0, 1, 11)
+    good = dict(times=times, p=np.outer(times, (1, 0, 0)), q=np.tile((0, 0, 0, 1.0), (11, 1)), v=np.tile((1.0, 0, 0), (11, 1)),
+                w=np.zeros((11, 3)), a=np.zeros((11, 3)), dw=np.zeros((11, 3)), rotor_thrust=np.full((11, 4), 0.6))
+    check_joints(SampledTrajectory(**good), 0.02)
+    bad = good | {"p": good["p"] + np.where(np.arange(11) > 5, 0.3, 0.0)[:, None]}
+    with pytest.raises(TrajectoryRefused, match="position jumps"):
+        check_joints(SampledTrajectory(**bad), 0.02)
+
+
+def test_sampled_trajectory_is_flown():
+    trajectory = rest_to_rest(np.array([0, 0, 1.2]), np.array([1.5, 0.5, 1.4]), 0, 0, 1.5)
+    from perch_core.flatness import flat_to_state
+    from perch_core.so3 import quat_from_matrix
+
+    loop = hovering()
+    times = np.linspace(0, 1.5, 151)
+    s = [flat_to_state(x.p, x.v, x.a, x.j, x.s, x.yaw, x.yaw_rate, x.yaw_acc, 0.25) for x in map(trajectory.sample, times)]
+    sampled = SampledTrajectory(times, np.array([x.p_WB for x in s]), quat_from_matrix(np.array([x.R_WB for x in s])),
+                                np.array([x.v_WB for x in s]), np.array([x.w_WB_B for x in s]), trajectory.sample_many(times).a,
+                                np.array([x.dw_WB_B for x in s]), np.array([np.full(4, x.thrust / 4) for x in s]))
+    loop.states.clear(), loop.references.clear()
+    loop.controller.follow(Order(4, SampledReference(sampled, 0.25), loop.time + 0.04))
+    loop.run(2.0)
+    assert np.all(loop.rmse < 0.02) and loop.controller.state is State.HOVERING
+
+
+def test_replacing_a_trajectory_keeps_the_reference_continuous():
+    loop = hovering()
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [2, 0, 0], 0, 0, 2.0), id=1)
+    loop.run(1.0)
+    x = loop.controller.maneuvers.setpoint(0.04)
+    # The new plan starts a little beside the running reference, as a re-plan on an estimate does.
+    c = brake(np.array(x.p) + [0.05, 0.1, 0], x.v, x.a, x.h)._trajectory
+    loop.references.clear()
+    loop.follow(c, id=2)
+    loop.run(0.8)
+    r = np.array(loop.references)
+    velocity = np.diff(r, axis=0) / 0.002
+    assert np.abs(np.diff(velocity, axis=0) / 0.002).max() < 12.0
+    assert loop.controller.maneuvers.trajectory_id == 2
+
+
+def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
+    old = Hold.at((0.2, 0.1, 1.0), (0, 1, 0)).setpoint(0)
+    new = FlatReference(rest_to_rest(np.zeros(3), np.array([1, 0, 0]), 0, 0, 2.0))
+    mixed = blended(old, new, 0.0)
+    np.testing.assert_allclose(mixed.setpoint(0.0).p, old.p, atol=1e-12)
+    np.testing.assert_allclose(mixed.setpoint(1.0).p, new.setpoint(1.0).p, atol=1e-12)
+
+
+def test_brake_meets_state_and_rest():
+    b = brake((1, 2, 3), (2, -1, 0.5), (1, 0, -2), (0, 1, 0))
+    x, y = b.setpoint(0.0), b.setpoint(b.duration + 1.0)
+    np.testing.assert_allclose((*x.p, *x.v, *x.a), (1, 2, 3, 2, -1, 0.5, 1, 0, -2), atol=1e-12)
+    np.testing.assert_allclose((*y.v, *y.a), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("fault, expected, word", [
+    ("fence", State.HOVERING, "geofence"), ("far", State.LANDING, "outside the geofence"), ("tilt", State.RECOVERING, "tilt"),
+    ("rate", State.RECOVERING, "body rate"), ("error", State.RECOVERING, "away from the reference"),
+    ("margin", State.LANDING, "limit"), ("silence", State.LANDING, "no order"), ("coasting", State.HOVERING, "no VIO"),
+    ("lost", State.LANDING, "no VIO"), ("diverged", State.LANDING, "diverged"),
+])
+def test_each_fault_leads_to_its_answer(fault, expected, word):
+    settings = FlightSettings(fence_high=(1.0, 20.0, 20.0), silence_time=0.5 if fault == "silence" else 60.0,
+                              margin_time=0.3, fence_slack=0.3 if fault == "far" else 5.0)
+    loop = hovering(settings=settings)
+    m, p = loop.controller.maneuvers, loop.plant.p.copy()
+    if fault in ("fence", "far", "coasting", "lost"):
+        loop.follow(rest_to_rest(p, p + [3, 0, 0], 0, 0, 3.0))
+        loop.run(0.5)
+    if fault == "tilt":
+        loop.plant.w = np.array([0.0, 18.0, 0.0])
+    elif fault == "rate":
+        loop.plant.w = np.array([0.0, 0.0, 60.0])
+    elif fault == "error":
+        m.run(Hold.at(p + [1.5, 0, 0], (0, 1, 0)))
+    elif fault == "margin":
+        loop.plant.disturbances.mass_factor = 2.2
+    elif fault == "coasting":
+        loop.controller.supervisor.estimator(2, 1.2, "")
+    elif fault == "lost":
+        loop.controller.supervisor.estimator(2, 3.2, "")
+    elif fault == "diverged":
+        loop.controller.supervisor.estimator(3, 0.1, "covariance")
+    reached = loop.controller.state is expected and word in m.message
+    reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in m.message)
+    assert reached, (loop.controller.state, m.message, loop.events)
+
+
+def test_at_rest_and_tilted_stops_the_motors():
+    loop = hovering()
+    tilted = moved(loop.plant.state, q=(np.sin(0.75), 0, 0, np.cos(0.75)), v=(0, 0, 0), w=(0, 0, 0))
+    loop.odometry = lambda plant: tilted
+    assert loop.run(3.0, until=lambda x: x.controller.state is State.FAILED), loop.events
+    assert not loop.controller.step(loop.time, tilted).armed
