@@ -14,9 +14,10 @@ import tempfile
 import numpy as np
 from harness import Figure, figure
 
+from perch_core import compiled
 from perch_core.errors import PlanningRefusal
 from perch_core.vehicle import load_vehicle
-from perch_planner.powerline import compiled, problem
+from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.solving import Solver
 from perch_planner.powerline.starts import random_start

@@ -1,45 +1,14 @@
-"""Stage functions as machine code, compiled once per machine and kept in a cache.
-
-The cache is `$PERCH_CACHE` or `~/.cache/perch`. A library's name is the hash of its C source, the compiler and its flags,
-so that a change of the model, of CasADi or of the compiler makes a new one. It is written under a temporary name and
-renamed, so that two processes may do it at once. Without a compiler, or with PERCH_COMPILE=0, the functions stay
-interpreted: about five times slower, the same results.
-"""
+"""Stage functions as machine code, from the machine's cache of compiled libraries (`perch_core.compiled`)."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-import platform
-import shutil
-import subprocess
-import tempfile
-from functools import lru_cache
-from pathlib import Path
-
 import casadi as ca
 
+from perch_core import compiled
 from perch_planner.powerline.stage_functions import StageFunctions
 
-# -O1 halves the compile time of -O3 for straight-line code of this kind, and the code runs as fast.
+# -O1 halves the compile time of -O2 for straight-line code of this kind, and the code runs as fast.
 FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared")
-
-
-def cache_folder() -> Path:
-    """Where compiled functions are kept."""
-    return Path(os.environ.get("PERCH_CACHE") or Path.home() / ".cache" / "perch")
-
-
-@lru_cache(maxsize=1)
-def compiler() -> tuple[str, str] | None:
-    """Path and version of the C compiler ($CC, gcc, cc or clang), or None."""
-    for name in (os.environ.get("CC"), "gcc", "cc", "clang"):
-        path = shutil.which(name) if name else None
-        if path:
-            answer = subprocess.run([path, "--version"], capture_output=True, text=True, check=False)
-            if answer.returncode == 0:
-                return path, answer.stdout.splitlines()[0]
-    return None
 
 
 def _source(functions: dict[str, ca.Function]) -> str:
@@ -52,51 +21,18 @@ def _source(functions: dict[str, ca.Function]) -> str:
     return generator.dump()
 
 
-def build(functions: dict[str, ca.Function]) -> Path | None:
-    """Compile functions, or find them compiled.
+def load(stages: StageFunctions) -> tuple[StageFunctions, bool]:
+    """Stage functions with compiled bodies, or as they are where there is no compiler or PERCH_COMPILE is 0.
+
+    Interpreted they are about five times slower, with the same results.
 
     Returns:
-        The shared library, or None where there is no compiler or it is not wanted.
+        The functions, and whether they are compiled.
 
     Raises:
         RuntimeError: the compiler failed; its first lines are in the message.
     """
-    found = None if os.environ.get("PERCH_COMPILE") == "0" else compiler()
-    if found is None:
-        return None
-    source = _source(functions)
-    key = "\n".join((source, *found, *FLAGS, platform.processor(), platform.machine(), _cpu_flags()))
-    library = cache_folder() / f"stages_{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
-    if library.is_file():
-        return library
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        code, product = Path(folder, "stages.c"), Path(folder, "stages.so")
-        code.write_text(source)
-        answer = subprocess.run([found[0], *FLAGS, str(code), "-o", str(product), "-lm"],
-                                capture_output=True, text=True, check=False)
-        if answer.returncode:
-            raise RuntimeError(f"{found[0]} cannot compile the stage functions: {answer.stderr[:500]}")
-        os.replace(product, library)
-    return library
-
-
-def _cpu_flags() -> str:
-    """What -march=native depends on: a cache on a shared disk must not serve another processor."""
-    try:
-        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as info:
-            return next((line for line in info if line.startswith(("flags", "Features"))), "")
-    except OSError:
-        return ""
-
-
-def load(stages: StageFunctions) -> tuple[StageFunctions, bool]:
-    """Stage functions with compiled bodies, or as they are where there is no compiler.
-
-    Returns:
-        The functions, and whether they are compiled.
-    """
-    library = build(stages.functions)
+    library = compiled.library("powerline", _source(stages.functions), FLAGS)
     if library is None:
         return stages, False
     return stages.with_functions({
