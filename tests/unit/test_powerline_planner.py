@@ -20,6 +20,7 @@ from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
+from perch_planner.powerline.request import PerchPose
 from perch_planner.powerline.starts import StartSearch, best_start
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,6 +69,23 @@ def test_more_lines_than_the_problem_holds_are_all_avoided(planner: PowerlinePla
     fence = tuple(Segment([8.0 + 0.3 * k, 0, 4.2], [0, 1, 0], 2.0, 0.03, 100 + k) for k in range(2 * LINES_MAX))
     plan = planner.plan(replace(REQUEST, lines=REQUEST.lines + fence, with_recovery=False))
     assert next(b for b in plan.bounds if b.quantity == "clearance").holds
+
+
+def test_the_end_velocity_is_free_to_choose(planner: PowerlinePlanner) -> None:
+    wanted = np.array([0.2, 0.1, -0.3])
+    plan = planner.plan(replace(REQUEST, perch=replace(REQUEST.perch, v_W=wanted)))
+    np.testing.assert_allclose(plan.perch.states[-1, V], wanted, atol=0.02)
+    assert all(bound.holds for bound in plan.bounds)
+
+
+@pytest.mark.parametrize("point", [[4.0, 0.0, 4.2], [4.0, 2.0, 4.2]])
+def test_a_sagging_cable_of_segments_is_gripped_in_the_middle_and_at_a_joint(planner: PowerlinePlanner, point: list[float]) -> None:
+    y = np.linspace(-10, 10, 6)
+    knots = np.stack([np.full(6, 4.0), y, 4.2 + 0.5 * (y / 10) ** 2 - 0.02], axis=1)
+    cable = tuple(Segment.between(a, b, 0.02, i) for i, (a, b) in enumerate(zip(knots, knots[1:])))
+    pose = PerchPose.on_line(cable[2], np.array(point), np.radians(120), VEHICLE.perch_offset, REQUEST.start[P])
+    plan = planner.plan(replace(REQUEST, lines=cable, target_line=2, perch=pose))
+    assert all(bound.holds for bound in plan.bounds)
 
 
 def test_a_perch_that_no_trajectory_reaches_is_refused_with_what_is_violated(planner: PowerlinePlanner) -> None:
