@@ -141,8 +141,8 @@ class MissionNode(PerchNode[MissionParameters]):
                             math.sqrt(max(0.0, np.linalg.eigvalsh(np.reshape(m.covariance, (3, 3)))[-1])), m.direction_sigma)
                  for m in self._map.lines]
         return powerline_target(
-            to_seconds(self._map.header.stamp), lines, self._map.degenerate, self._map.message, self._goal.perch_point,
-            self._goal.perch_pitch, to_array(self._odometry.pose.pose.position), self._map.lines)
+            to_seconds(self._map.header.stamp), lines, self._goal.perch_point, self._goal.perch_pitch,
+            to_array(self._odometry.pose.pose.position), self._map.lines)
 
     def _act(self, now: float, outputs: Outputs) -> None:
         stamp = to_stamp(float(now))

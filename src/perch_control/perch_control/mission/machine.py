@@ -228,8 +228,6 @@ class MissionMachine:
         settings = self.settings
         if target is None or target.time < self._entered_search:
             return False, "no tags seen" if self._goal.mode is Mode.SURFACE else "no lines mapped"
-        if target.weakness:
-            return False, target.weakness
         if target.position_sigma > settings.target_position_sigma:
             return False, f"position uncertain by {target.position_sigma:.3f} m"
         if target.attitude_sigma > math.radians(settings.target_attitude_sigma_deg):

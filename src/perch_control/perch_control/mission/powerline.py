@@ -55,15 +55,13 @@ def perch_attitude(line: MappedLine, p: np.ndarray, p_WB: np.ndarray, pitch: flo
     return so3.quat_from_matrix(np.stack([np.cross(along, b3), along, b3], axis=1))
 
 
-def powerline_target(time: float, lines: Sequence[MappedLine], degenerate: bool, message: str, perch_point: np.ndarray,
-                     perch_pitch: float, p_WB: np.ndarray, raw: Any, reach: float = 1.5) -> Target | None:
+def powerline_target(time: float, lines: Sequence[MappedLine], perch_point: np.ndarray, perch_pitch: float,
+                     p_WB: np.ndarray, raw: Any, reach: float = 0.4) -> Target | None:
     """The target on the line that passes nearest to a rough point.
 
     Args:
         time: stamp of the map [s].
         lines: mapped segments.
-        degenerate: the motion so far does not determine them.
-        message: the mapper's words.
         perch_point: rough place [m], shape (3,).
         perch_pitch: wanted tilt [rad].
         p_WB: position of the vehicle [m], shape (3,).
@@ -79,5 +77,4 @@ def powerline_target(time: float, lines: Sequence[MappedLine], degenerate: bool,
         return None
     _, line = min(near, key=lambda item: item[0])
     p = line.closest(perch_point)
-    return Target(time, p, perch_attitude(line, p, p_WB, perch_pitch), line.sigma, line.direction_sigma, lines=raw,
-                  line=line.id, weakness=message or "lines not determined by the motion so far" if degenerate else "")
+    return Target(time, p, perch_attitude(line, p, p_WB, perch_pitch), line.sigma, line.direction_sigma, lines=raw, line=line.id)

@@ -99,7 +99,6 @@ class Target:
         attitude_sigma: largest 1-sigma of the attitude [rad].
         lines: the map of powerlines that the target belongs to (opaque to the mission); None for a pad.
         line: id of the target's line in that map.
-        weakness: why the target is not to be planned on yet, or nothing.
     """
 
     time: float
@@ -109,7 +108,6 @@ class Target:
     attitude_sigma: float
     lines: Any = None
     line: int = 0
-    weakness: str = ""
 
 
 @dataclass(frozen=True)

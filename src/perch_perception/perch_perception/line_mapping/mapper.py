@@ -100,7 +100,7 @@ class LineMapper:
 
         Args:
             time: of the exposure [s].
-            body: state of the body then; its covariance is the odometry's share of the map's.
+            body: state of the body then; the covariance of its attitude is the odometry's share of the map's.
             seen: the sightings, placed with this state.
         """
         self._body = body
@@ -221,10 +221,13 @@ class LineMapper:
         return lines
 
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
-        """Of the point at s, from the sightings, the calibration and the odometry, shape (3, 3) [m^2]."""
+        """Of the point at s relative to the vehicle, from the sightings, the calibration and the attitude, shape (3, 3) [m^2].
+
+        The odometry's position is left out: its drift moves vehicle and wires together.
+        """
         lever = so3.hat(estimate.curve.at(np.array(s)) - self._body.p_WB)
         turned = self._body.covariance[3:, 3:] + np.radians(self.settings.rotation_sigma) ** 2 * np.eye(3)
-        return estimate.point_covariance(s) + lever @ turned @ lever.T + self._body.covariance[:3, :3]
+        return estimate.point_covariance(s) + lever @ turned @ lever.T
 
     def _direction_sigma(self, estimate: WireEstimate) -> float:
         attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1] + np.radians(self.settings.rotation_sigma) ** 2
