@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -158,3 +159,10 @@ def test_starts_that_are_refused_come_last_with_their_reason(planner: PowerlineP
     search = StartSearch(distances=(0.05,), heights=(0.0,), bearings=(0.0,))
     scores = best_start(replace(REQUEST, with_recovery=False), planner.plan, VEHICLE, planner.solver.model, 0.8, search=search)
     assert scores[0].plan is not None and scores[1].plan is None and "nearer than the body" in scores[1].refusal
+
+
+def test_the_example_of_the_documentation_runs(capsys: pytest.CaptureFixture) -> None:
+    text = (ROOT / "docs" / "powerline.md").read_text()
+    example = re.search(r"```python\n(.*?)```", text, re.S).group(1)
+    exec(compile(example, "docs/powerline.md", "exec"), {})
+    assert len(capsys.readouterr().out.splitlines()) == 3
