@@ -65,10 +65,11 @@ def check(source: str, key: str, item: Field, value: Any) -> None:
         if math.isinf(number) and item.default != number:
             raise ConfigError(source, key, f"{number} is not finite")
         low, high, above = meta.get("low"), meta.get("high"), meta.get("above")
-        if above is not None and not number > above:
+        if above is not None and high is None and not number > above:
             raise ConfigError(source, key, f"{number:g} is not > {above:g}{unit}")
-        if (low is not None and number < low) or (high is not None and number > high):
-            span = f"[{'-inf' if low is None else format(low, 'g')}, {'inf' if high is None else format(high, 'g')}]"
+        if (low is not None and number < low) or (high is not None and number > high) or (above is not None and not number > above):
+            begin = f"({above:g}" if above is not None else "[-inf" if low is None else f"[{low:g}"
+            span = f"{begin}, {'inf' if high is None else format(high, 'g')}]"
             raise ConfigError(source, key, f"{number:g} is outside {span}{unit}")
 
 

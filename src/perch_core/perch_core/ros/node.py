@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from typing import Any, Callable, Generic, NoReturn, TypeVar
+from typing import Any, Callable, Generic, NoReturn, Sequence, TypeVar
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # one core per node; must be set before numpy is imported
@@ -93,6 +93,7 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
     """Run one node until SIGINT or SIGTERM; exits the process with 0, or 2 when the caller's parameters are refused."""
     stop = StopSignal()
     try:
+        _check_parameter_files(sys.argv if args is None else args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = create()
     except (ConfigError, rclpy.exceptions.InvalidParameterValueException) as error:
@@ -110,6 +111,13 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
         node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(0)
+
+
+def _check_parameter_files(arguments: Sequence[str]) -> None:
+    """rcl's own complaint about a missing file names a line of its C code too."""
+    for option, file in zip(arguments, arguments[1:]):
+        if option == "--params-file" and not os.path.isfile(file):
+            raise ConfigError(option, file, "no such file")
 
 
 def _refuse(problem: str) -> NoReturn:
