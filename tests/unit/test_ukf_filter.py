@@ -1,5 +1,9 @@
 """The UKF's transforms against independent forms: numpy, filterpy's UKF, a finite-difference EKF, exact motion."""
 
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
@@ -69,6 +73,34 @@ def test_compiled_prediction_equals_the_vectorised_one():
         x, P = transform.predict_vectorised(belief.x, belief.P, run)
         np.testing.assert_allclose(predicted.x, x, atol=1e-11)
         np.testing.assert_allclose(predicted.P - transform.process_noise(run), P, atol=1e-11)
+
+
+FLY = """
+import sys, json, numpy as np
+if sys.argv[1] == "plain":
+    sys.modules["numba"] = None  # as on a machine without it
+from perch_perception.ukf import Estimator, ImuSample, VioPose
+from perch_perception.ukf.compiled import COMPILED
+from perch_perception.vio.preintegration import preintegrate
+assert COMPILED == (sys.argv[1] != "plain")
+rng, estimator = np.random.default_rng(1), Estimator()
+for k in range(300):
+    estimator.add_imu(ImuSample(k * 2_000_000, tuple(rng.normal(0.2, 0.01, 3)), tuple(rng.normal(0, 0.3, 3) + [0, 0, 9.81])))
+    if k > 150 and k % 17 == 0:
+        estimator.add_vio(VioPose((k - 20) * 2_000_000, rng.normal(0, 0.001, 3), np.array([0, 0, 0, 1.0]), np.eye(6) * 1e-6))
+e = estimator.estimate
+rows = np.column_stack([np.full(15, 0.002), rng.normal(0, 3, (15, 3)), rng.normal(0, 9, (15, 3)), np.full((15, 2), 0.01)])
+pre = preintegrate(rows, np.full(3, 0.01), np.full(3, 0.1))
+print(json.dumps([*e.p_WB, *e.v_WB, *e.q_WB, *e.P.ravel(), *pre.dR.ravel(), *pre.dv, *pre.dp, *pre.J.ravel(), *pre.Q.ravel()]))
+"""
+
+
+def test_without_numba_everything_comes_out_the_same():
+    def fly(how):
+        out = subprocess.run([sys.executable, "-c", FLY, how], capture_output=True, text=True, check=True)
+        return np.array(json.loads(out.stdout))
+
+    np.testing.assert_allclose(fly("plain"), fly("compiled"), rtol=1e-7, atol=1e-11)
 
 
 def test_prediction_is_that_of_a_linearised_filter_for_small_covariances():

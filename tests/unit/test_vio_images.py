@@ -126,6 +126,24 @@ def test_a_covered_camera_is_reported_and_survived():
     assert healths[3.2] is Health.RUNNING and healths[3.7] is Health.COASTING and healths[4.3] is Health.RUNNING
 
 
+def test_a_blurred_frame_does_no_harm():
+    blurred = []
+
+    def tamper(t, stamp, image):
+        if HOVER <= t < HOVER + 0.04:
+            blurred.append(stamp)
+            image = cv2.GaussianBlur(image, (0, 0), 12.0)
+        return [(stamp, image)]
+
+    steps = flights.run_vio(until(4.2), tamper=tamper)
+    assert blurred
+    assert_sane(steps)
+    clean = {s.time: s for s in undisturbed()}
+    assert steps[-1].result.outcome is FrameOutcome.TRACKING
+    assert np.linalg.norm(steps[-1].error[:3] - clean[steps[-1].time].error[:3]) < 0.04
+    assert position_sigma(steps[-1]) >= position_sigma(clean[steps[-1].time])
+
+
 def test_dropped_frames_cost_little():
     counter = iter(range(10_000))
     steps = flights.run_vio(until(4.5), tamper=lambda t, stamp, image: [] if next(counter) % 3 == 0 else [(stamp, image)])
