@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -119,3 +120,25 @@ def test_a_planner_that_cannot_start_says_why(tmp_path: Path) -> None:
 def test_a_deadline_that_is_none_is_refused(worker: PowerlineWorker, deadline: float) -> None:
     with pytest.raises(PlanningRefusal, match="deadline"):
         worker.plan(REQUEST, deadline=deadline)
+
+
+def test_the_planning_processes_end_with_a_caller_that_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "hanging.py"
+    script.write_text(HANGING.format(answers="nothing"))
+    caller = tmp_path / "caller.py"
+    caller.write_text(f"""
+import os, signal, sys
+from perch_core.vehicle import load_vehicle
+from perch_planner.powerline.worker import PowerlineWorker
+if __name__ == "__main__":
+    worker = PowerlineWorker(load_vehicle("rpg"), command=(sys.executable, {str(script)!r}))
+    worker.wait_ready()
+    print(worker.pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+""")
+    pid = int(subprocess.run([sys.executable, str(caller)], capture_output=True, text=True, check=False, timeout=120).stdout)
+    for _ in range(400):
+        if not alive(pid):
+            return
+        time.sleep(0.05)
+    pytest.fail("the planning processes outlived their caller")

@@ -105,7 +105,7 @@ def supervise(upstream: Connection, make: Callable[..., PowerlinePlanner] = Powe
 def main(make: Callable[..., PowerlinePlanner] = PowerlinePlanner) -> None:
     """Serve the pipe whose number is the last argument of the command line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
-    _die_with_parent()
+    # No parent-death signal here: Linux sends it when the *thread* that started this process ends. The pipe's end is enough.
     supervise(Connection(int(sys.argv[-1])), make)
 
 
