@@ -14,6 +14,7 @@ INSET = 1e-7
 """Bounds are tightened by this [SI], so that a solver's residual (1e-9 of a row) cannot leave the true ones."""
 
 _FACETS = 4  # the tangential speed stays inside a regular octagon
+_OCTAGON = np.array([[cos(k * pi / _FACETS), sin(k * pi / _FACETS)] for k in range(_FACETS)])
 
 
 class LinearConstraints(NamedTuple):
@@ -36,22 +37,32 @@ class LinearConstraints(NamedTuple):
 
 
 @compiled
-def _locate(durations, times):
-    """Segment and place of each time; times before the start are dropped."""
-    segments = np.empty(len(times), np.int64)
-    places = np.empty(len(times))
-    count = 0
-    for t in times:
-        if t < -1e-12:
-            continue
-        begin, i = 0.0, 0
-        while i < len(durations) - 1 and t + 1e-12 >= begin + durations[i]:
+def _rows(durations, times, tube_lower, tube_upper, window, window_lower, window_upper):
+    """Tube rows for each instant and axis, then the window's rows; instants before the start are dropped."""
+    last = len(durations) - 1
+    first = 0
+    while first < len(times) and times[first] < -1e-12:
+        first += 1
+    count = len(times) - first
+    total = 3 * count + len(window)
+    segments, places, orders = np.empty(count + 1, np.int64), np.empty(count + 1), np.empty(count + 1, np.int64)
+    functional, direction = np.empty(total, np.int64), np.zeros((total, 3))
+    lower, upper = np.empty(total), np.empty(total)
+    for q in range(count):
+        t, begin, i = times[first + q], 0.0, 0
+        while i < last and t + 1e-12 >= begin + durations[i]:
             begin += durations[i]
             i += 1
-        segments[count] = i
-        places[count] = min(max((t - begin) / durations[i], 0.0), 1.0)
-        count += 1
-    return segments[:count], places[:count]
+        segments[q], places[q], orders[q] = i, min(max((t - begin) / durations[i], 0.0), 1.0), 2
+        for d in range(3):
+            r = 3 * q + d
+            functional[r], direction[r, d], lower[r], upper[r] = q, 1.0, tube_lower[d], tube_upper[d]
+    segments[count], places[count], orders[count] = last, 1.0, 1
+    for k in range(len(window)):
+        r = 3 * count + k
+        functional[r], lower[r], upper[r] = count, window_lower[k], window_upper[k]
+        direction[r] = window[k]
+    return segments, places, orders, functional, direction, lower, upper
 
 
 def tube_bounds(end_acceleration: np.ndarray, settings: PerchSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +89,7 @@ class Contact:
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float) -> None:
         surface = problem.surface
-        self.settings, self.velocity = settings, problem.target_velocity
+        self.velocity = problem.target_velocity
         self.p_contact = surface.p_WS + perch_offset * surface.normal
         self.acceleration = contact_acceleration(surface, settings.impact_acceleration)
         knots = len(problem.waypoints) + 2
@@ -94,19 +105,16 @@ class Contact:
         self._values[-1, 2] = self.acceleration
 
         lower, upper = tube_bounds(self.acceleration, settings)
-        count = len(tube_times(0.0, settings))
-        s1, s2, s3 = surface.R_WS.T
+        self._tube_lower, self._tube_upper = lower + INSET, upper - INSET
+        self._tube_times = tube_times(0.0, settings)
+        self._window = np.concatenate([-surface.normal[None], _OCTAGON @ surface.R_WS[:, :2].T])
         tangential = settings.tangential_speed_max * cos(pi / (2 * _FACETS)) - INSET
-        window = [-s3, *(cos(k * pi / _FACETS) * s1 + sin(k * pi / _FACETS) * s2 for k in range(_FACETS))]
-        least = [settings.impact_speed_min + INSET] + [-tangential] * _FACETS
-        most = [settings.impact_speed_max - INSET] + [tangential] * _FACETS
-        self._window = np.array(window)
+        least, most = settings.impact_speed_min + INSET, settings.impact_speed_max - INSET
+        if least > most:
+            least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
         shift = self._window @ self.velocity
-        if least[0] > most[0]:
-            least[0] = most[0] = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
-        self._window_lower, self._window_upper = np.array(least) + shift, np.array(most) + shift
-        self._tube_direction = np.tile(np.eye(3), (count, 1))
-        self._tube_lower, self._tube_upper = np.tile(lower + INSET, count), np.tile(upper - INSET, count)
+        self._window_lower = np.array([least] + _FACETS * [-tangential]) + shift
+        self._window_upper = np.array([most] + _FACETS * [tangential]) + shift
 
     def knots(self, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]
@@ -129,18 +137,9 @@ class Contact:
         The approach runs along -s3, the *outward* normal, so [M:eq14] reads v_min <= -v(t_f) . s3 <= v_max; all
         velocities are relative to the surface.
         """
-        segments, places = _locate(durations, tube_times(float(durations.sum()), self.settings))
-        count = len(segments)
-        skipped = len(self._tube_lower) // 3 - count
-        return LinearConstraints(
-            segments=np.append(segments, len(durations) - 1),
-            places=np.append(places, 1.0),
-            orders=np.append(np.full(count, 2), 1),
-            functional=np.concatenate([np.repeat(np.arange(count), 3), np.full(len(self._window), count)]),
-            direction=np.concatenate([self._tube_direction[3 * skipped:], self._window]),
-            lower=np.concatenate([self._tube_lower[3 * skipped:], self._window_lower]),
-            upper=np.concatenate([self._tube_upper[3 * skipped:], self._window_upper]),
-        )
+        times = float(durations.sum()) + self._tube_times
+        return LinearConstraints(*_rows(durations, times, self._tube_lower, self._tube_upper, self._window,
+                                        self._window_lower, self._window_upper))
 
     def bubbles(self, durations: np.ndarray, constraints: LinearConstraints, everywhere: bool) -> np.ndarray:
         """Segments with bubbles: those of the tube, and those after a knot whose derivatives are all given."""

@@ -20,8 +20,8 @@ NAMES = ("thrust", "speed", "height", "clearance", "body_rate")
 MINIMUM, MINIMUM_AT, MAXIMUM, MAXIMUM_AT, HOLDS = range(5)
 """Columns of the results: proved bounds, the times of the samples nearest to them, and whether the limits hold."""
 
-_PLACES = np.linspace(0.0, 1.0, 13)
-_AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES) for n in (11, 12, 13, 14))  # where clearance and rate are sampled
+_PLACES = np.linspace(0.0, 1.0, 13)  # where clearance and rate are sampled
+_AT11, _AT12, _AT13, _AT14 = (np.ascontiguousarray(bernstein.basis(n, _PLACES).T) for n in (11, 12, 13, 14))
 
 _RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
 _RATE_ROUNDS = 8
@@ -91,8 +91,6 @@ def _rim_clears(distance, force, s3, extension, gap):
     sin(tilt) = |f x s3| / |f|: so (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
     """
     reduced = distance - gap
-    if reduced.min() > extension:
-        return True, 0.0
     verdict, place = stays_below(-reduced, _CLEARANCE_SLACK)
     if verdict != BELOW:
         return False, place
@@ -109,21 +107,21 @@ def _rim_clears(distance, force, s3, extension, gap):
 def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
     """Least clearance and greatest body rate over fixed places of a segment: (gap, place, rate, place)."""
     gap, gap_at, rate, rate_at_ = np.inf, 0.0, 0.0, 0.0
-    count = _AT14.shape[0]
+    f, j = force @ _AT12, jerk @ _AT11
+    dist, heading, turn = distance @ _AT14, yaw @ _AT14, yaw_rate @ _AT13
+    count = _AT14.shape[1]
     for k in range(count):
-        f_x, f_y, f_z = (force[0] * _AT12[k]).sum(), (force[1] * _AT12[k]).sum(), (force[2] * _AT12[k]).sum()
-        j_x, j_y, j_z = (jerk[0] * _AT11[k]).sum(), (jerk[1] * _AT11[k]).sum(), (jerk[2] * _AT11[k]).sum()
-        heading, turn = (yaw * _AT14[k]).sum(), (yaw_rate * _AT13[k]).sum()
+        f_x, f_y, f_z, j_x, j_y, j_z = f[0, k], f[1, k], f[2, k], j[0, k], j[1, k], j[2, k]
         f2 = max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12)
         along = f_x * s3[0] + f_y * s3[1] + f_z * s3[2]
-        here = (distance * _AT14[k]).sum() - extension * sqrt(max(1.0 - along * along / f2, 0.0))
+        here = dist[k] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
         if here < gap:
             gap, gap_at = here, k / (count - 1)
         x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
-        d_x, d_y = -sin(heading), cos(heading)
+        d_x, d_y = -sin(heading[k]), cos(heading[k])
         lean = d_x * f_x + d_y * f_y
         across = max(f2 - lean * lean, 1e-12)
-        spin = (turn * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
+        spin = (turn[k] * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
         here = (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
         if here > rate:
             rate, rate_at_ = here, k / (count - 1)
@@ -139,7 +137,7 @@ def _widen(out, row, minimum, at_minimum, maximum_, at_maximum):
 
 
 @compiled
-def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, speed, low_height, high_height,
+def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_thrust, speed, low_height, high_height,
           extension, clearance, rate):
     """Prove every limit of a plan, or find where it fails.
 
@@ -147,6 +145,7 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
         yaw: of the heading, shape (f, 15) [rad].
         durations: shape (f,) [s].
+        thrust: of `thrust_extrema`.
         p_S, v_S, s3: point of the surface at time 0 [m], its velocity [m/s], outward normal, each shape (3,).
         low_thrust, high_thrust: limits of the specific thrust [m/s^2].
         speed: limit [m/s].
@@ -166,7 +165,6 @@ def check(coefficients, yaw, durations, p_S, v_S, s3, low_thrust, high_thrust, s
     where = np.full((5, 2), -1.0)
     gap_wanted, rate_wanted = np.inf, 1e-3
     begin = 0.0
-    thrust = thrust_extrema(coefficients, durations, low_thrust, high_thrust)
     parts = np.empty((f, 11, 49))
     for i in range(f):
         T, c = durations[i], coefficients[i]
@@ -219,7 +217,9 @@ def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extensio
         begin, failed, place = 0.0, -1, 0.0
         for i in range(len(durations)):
             distance = surface_distance(coefficients[i], durations[i], begin, p_S, v_S, s3)
-            clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
+            clears = distance.min() > gap + extension
+            if not clears:
+                clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
             if not clears:
                 failed = i
                 break
@@ -235,7 +235,7 @@ def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extensio
 def _prove_rate(out, where, parts, durations, limit, sampled):
     """Prove a body rate near the greatest that is attained, or else that the limit holds, or else where it fails."""
     out[4, 0], out[4, 2] = 0.0, np.inf
-    attained, slack = sampled, 1.02
+    attained, slack = sampled, 1.04
     for k in range(_RATE_ROUNDS):
         bound = slack * attained
         if not bound < limit or k == _RATE_ROUNDS - 1:

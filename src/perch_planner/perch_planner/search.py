@@ -103,7 +103,7 @@ class Search:
             if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
                 return outcome
             if not outcome or rounds and outcome.margin > -_NEAR * self.limits.thrust[1]:
-                results, where = self._check(coefficients, yaw, durations)
+                results, where = self._check(coefficients, yaw, durations, extrema)
                 if results[:, plan_checks.HOLDS].all():
                     return Outcome(coefficients, yaw, results)
                 cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits)
@@ -139,9 +139,9 @@ class Search:
         name = [n for n, row in zip(plan_checks.NAMES, results) if not row[plan_checks.HOLDS]][-1]
         return Outcome(coefficients, yaw, results, name, self._margin(results, name))
 
-    def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray):
+    def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
         surface, limits = self.problem.surface, self.limits
-        return plan_checks.check(coefficients, yaw, durations, surface.p_WS, self.problem.target_velocity,
+        return plan_checks.check(coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity,
                                  np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed,
                                  limits.height[0], limits.height[1], limits.extension, limits.clearance,
                                  limits.body_rate)

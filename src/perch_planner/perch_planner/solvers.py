@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_planner.compilation import compiled
+
 FEASIBILITY = 1e-6
 """Largest violation of a row of unit length that counts as solved."""
 
@@ -33,10 +35,25 @@ class Solution:
     status: str
 
 
-def _residual(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, w: np.ndarray) -> float:
+@compiled
+def _residual(rows, lower, upper, w):
+    """Largest violation of a row; infinite where the answer is not finite."""
     value = rows @ w
-    worst = max((lower - value).max(initial=0.0), (value - upper).max(initial=0.0))
-    return float(worst) if worst == worst else np.inf
+    worst = 0.0
+    for k in range(len(value)):
+        excess = max(lower[k] - value[k], value[k] - upper[k])
+        if not np.isfinite(value[k]):
+            return np.inf
+        worst = max(worst, excess)
+    return worst
+
+
+@compiled
+def _contains_zero(lower, upper):
+    for k in range(len(lower)):
+        if lower[k] > 0.0 or upper[k] < 0.0:
+            return False
+    return True
 
 
 def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
@@ -74,6 +91,7 @@ def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
 _SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp, "piqp": _piqp}
 _MODULES = {"daqp": "daqp", "osqp": "osqp", "piqp": "piqp"}
 NAMES = tuple(_SOLVERS)
+_SOLVED = ("solved", "status.piqp_solved", "piqp_solved")
 _UNITS: dict[int, np.ndarray] = {}
 
 
@@ -98,12 +116,11 @@ def least_norm(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: s
         lower, upper: bounds, infinite where there is none, shape (r,).
         solver: `daqp`, `osqp` or `piqp`.
     """
-    if ((lower <= 0.0) & (upper >= 0.0)).all():
+    if _contains_zero(lower, upper):
         return Solution(np.zeros(rows.shape[1]), True, 0.0, "unconstrained optimum")
     w, status = _SOLVERS[solver](rows, lower, upper)
-    if w.shape != rows.shape[1:] or not np.isfinite(w).all():
+    residual = _residual(rows, lower, upper, w) if w.shape == rows.shape[1:] else np.inf
+    if residual == np.inf:
         return Solution(np.zeros(rows.shape[1]), False, np.inf, status)
-    residual = _residual(rows, lower, upper, w)
     # A solver that says "infeasible" is not overruled by a residual; one that says "solved" is.
-    return Solution(w, status.lower().startswith(("solved", "status.piqp_solved", "piqp_solved")) and residual <= FEASIBILITY,
-                    residual, status)
+    return Solution(w, status.lower() in _SOLVED and residual <= FEASIBILITY, residual, status)
