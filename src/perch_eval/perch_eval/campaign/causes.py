@@ -55,8 +55,10 @@ def _bounce(touch: ContactEvent, adhesion: Adhesion) -> str:
 
 
 def _holds(contacts: Sequence[ContactEvent]) -> bool:
-    state = False
+    holder = ""  # pad or cable
     for c in contacts:
-        if c.body == "pad":
-            state = c.state is ContactState.ATTACHED
-    return state
+        if c.state is ContactState.ATTACHED:
+            holder = c.body
+        elif c.body == holder:
+            holder = ""
+    return bool(holder)

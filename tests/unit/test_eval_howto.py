@@ -1,0 +1,63 @@
+"""What the how-to guides show is valid: files load, commands are accepted, the Python example flies."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from perch_core.scenario import load_scenario
+from perch_core.tag_board import load_board
+from perch_eval import demo
+from perch_eval.campaign import command as campaign
+from perch_eval.campaign.specification import load_campaign
+from perch_eval.evaluation import command as evaluation
+from perch_eval.replay import command as replay
+
+GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
+LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
+PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser}
+
+
+def blocks(language):
+    return list(_blocks(language))
+
+
+def _blocks(language):
+    for guide in GUIDES:
+        for k, text in enumerate(re.findall(rf"```{language}\n(.*?)```", guide.read_text(), re.S)):
+            yield pytest.param(text, id=f"{guide.stem}-{k}")
+
+
+@pytest.mark.parametrize("text", blocks("yaml"))
+def test_files_load(text, tmp_path):
+    kind, name = re.match(r"# (\w+) (\S+)", text).groups()
+    file = tmp_path / name
+    file.write_text(text)
+    LOADERS[kind](file)
+
+
+@pytest.mark.parametrize("text", blocks("bash"))
+def test_commands_are_accepted(text):
+    for line in text.strip().splitlines():
+        interpreter, script, *arguments = shlex.split(line)
+        assert interpreter == "python3" and script.startswith("scripts/")
+        PARSERS[Path(script).name]().parse_args(arguments)
+
+
+@pytest.mark.parametrize("text", blocks("python"))
+def test_python_runs(text, tmp_path, monkeypatch, capsys):
+    guide = next(g for g in GUIDES if text in g.read_text())
+    for yaml in re.findall(r"```yaml\n(.*?)```", guide.read_text(), re.S):
+        (tmp_path / re.match(r"# \w+ (\S+)", yaml).group(1)).write_text(yaml)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(text, guide.name, "exec"), {})
+    assert capsys.readouterr().out.split()[0] in ("perched", "missed")
+
+
+def test_links_lead_somewhere():
+    root = Path(__file__).resolve().parents[2]
+    for guide in GUIDES:
+        for link in re.findall(r"\]\(([^)#]+)\)", guide.read_text()):
+            target = (guide.parent / link).resolve()
+            assert target.exists() or target.is_relative_to(root / "docs" / "results"), f"{guide.name}: {link}"
