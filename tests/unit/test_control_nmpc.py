@@ -106,7 +106,7 @@ def test_condensed_cost_is_the_stage_costs_sum():
     A, B, c, Q, q, r, R, dx0 = random_stages(rng)
     N, n = c.shape
     H, h = np.zeros((4 * N, 4 * N)), np.zeros(4 * N)
-    condense_loops(A, B, c, Q, q, r, R, dx0, H, h, np.zeros((N + 1, n)), np.zeros((N, N + 1, n, 4)))
+    condense_loops(A, B, c, Q, q, r, R, dx0, H, h, np.zeros((N + 1, n)), np.zeros((N + 1, n, 4 * N)))
 
     def cost(du):
         x, total = dx0, 0.0
@@ -129,7 +129,7 @@ def test_loops_and_matrices_condense_and_expand_alike():
     N, n = stages[2].shape
     out = []
     for condense, expand in ((condense_loops, expand_loops), (condense_matrices, expand_matrices)):
-        H, h, xi, G = np.zeros((4 * N,) * 2), np.zeros(4 * N), np.zeros((N + 1, n)), np.zeros((N, N + 1, n, 4))
+        H, h, xi, G = np.zeros((4 * N,) * 2), np.zeros(4 * N), np.zeros((N + 1, n)), np.zeros((N + 1, n, 4 * N))
         condense(*stages, H, h, xi, G)
         X, U = np.ones((N + 1, n)), np.ones((N, 4))
         expand(*stages[:3], stages[-1], np.linspace(-1, 1, 4 * N), X, U)

@@ -1,7 +1,7 @@
 """From linearised stages to a dense QP in the inputs alone (condensing), and back to states (expansion).
 
 With the defects c_k, `dx_{k+1} = A_k dx_k + B_k du_k + c_k`, and the stage cost `dx' Q dx / 2 + q' dx + R |du|^2 / 2 + r' du`,
-eliminating dx leaves `du' H du / 2 + h' du`. Backward recursions give H block by block in O(N^2) [ref. 16 of P].
+eliminating dx leaves `du' H du / 2 + h' du`. A forward recursion gives the input-to-state matrices, a backward one H, row block by row block in O(N^2).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def condense_loops(A, B, c, Q, q, r, R, dx0, H, h, xi, G):
         dx0: deviation of the initial state, shape (n,).
         H, h: results, shapes (4N, 4N), (4N,).
         xi: response to dx0 and c alone, shape (N + 1, n).
-        G: G[j, k] = d x_k / d u_j, shape (N, N + 1, n, 4).
+        G: G[k] = d x_k / d u, shape (N + 1, n, 4N); zero at k = 0 and right of the diagonal when it comes in.
     """
     N, n = c.shape
     for i in range(n):
@@ -81,54 +81,48 @@ def condense_loops(A, B, c, Q, q, r, R, dx0, H, h, xi, G):
                 tmp[i] = s
             for i in range(n):
                 lam[i] = tmp[i]
-    W, W2 = np.zeros((n, 4)), np.zeros((n, 4))
-    for j in range(N):
-        Gj = G[j]
+    # The innermost loops run along rows of G, W and H, so that the compiler can vectorise them.
+    for k in range(N):
+        m = 4 * k
         for i in range(n):
+            for j in range(m):
+                G[k + 1, i, j] = 0.0
+            for l in range(n):
+                x = A[k, i, l]
+                for j in range(m):
+                    G[k + 1, i, j] += x * G[k, l, j]
             for a in range(4):
-                Gj[j + 1, i, a] = B[j, i, a]
-        for k in range(j + 1, N):
-            for i in range(n):
-                s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-                for l in range(n):
-                    x = A[k, i, l]
-                    s0 += x * Gj[k, l, 0]
-                    s1 += x * Gj[k, l, 1]
-                    s2 += x * Gj[k, l, 2]
-                    s3 += x * Gj[k, l, 3]
-                Gj[k + 1, i, 0], Gj[k + 1, i, 1], Gj[k + 1, i, 2], Gj[k + 1, i, 3] = s0, s1, s2, s3
+                G[k + 1, i, m + a] = B[k, i, a]
+    W, W2 = np.zeros((n, 4 * N)), np.zeros((n, 4 * N))
+    for k in range(N, 0, -1):
+        m = 4 * k
         for i in range(n):
-            for a in range(4):
-                W[i, a] = 0.0
-        for k in range(N, j, -1):
-            for i in range(n):
-                s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+            for j in range(m):
+                W2[i, j] = 0.0
+            for l in range(n):
+                x = Q[k, i, l]
+                for j in range(m):
+                    W2[i, j] += x * G[k, l, j]
+            if k < N:
                 for l in range(n):
-                    x = Q[k, i, l]
-                    s0 += x * Gj[k, l, 0]
-                    s1 += x * Gj[k, l, 1]
-                    s2 += x * Gj[k, l, 2]
-                    s3 += x * Gj[k, l, 3]
-                if k < N:
-                    for l in range(n):
-                        x = A[k, l, i]
-                        s0 += x * W[l, 0]
-                        s1 += x * W[l, 1]
-                        s2 += x * W[l, 2]
-                        s3 += x * W[l, 3]
-                W2[i, 0], W2[i, 1], W2[i, 2], W2[i, 3] = s0, s1, s2, s3
-            for i in range(n):
-                for a in range(4):
-                    W[i, a] = W2[i, a]
-            for a in range(4):
-                for b in range(4):
-                    s = 0.0
-                    for i in range(n):
-                        s += B[k - 1, i, a] * W[i, b]
-                    H[4 * (k - 1) + a, 4 * j + b] = s
-                    H[4 * j + b, 4 * (k - 1) + a] = s
+                    x = A[k, l, i]
+                    for j in range(m):
+                        W2[i, j] += x * W[l, j]
+        for i in range(n):
+            for j in range(m):
+                W[i, j] = W2[i, j]
         for a in range(4):
-            H[4 * j + a, 4 * j + a] += R
+            row = m - 4 + a
+            for j in range(m):
+                H[row, j] = 0.0
+            for i in range(n):
+                x = B[k - 1, i, a]
+                for j in range(m):
+                    H[row, j] += x * W[i, j]
+    for i in range(4 * N):
+        H[i, i] += R
+        for j in range(i):
+            H[j, i] = H[i, j]
 
 
 def condense_matrices(A, B, c, Q, q, r, R, dx0, H, h, xi, G) -> None:
@@ -138,12 +132,11 @@ def condense_matrices(A, B, c, Q, q, r, R, dx0, H, h, xi, G) -> None:
     for k in range(N):
         xi[k + 1] = A[k] @ xi[k] + c[k]
     G[:] = 0.0
-    for j in range(N):
-        G[j, j + 1] = B[j]
-        for k in range(j + 1, N):
-            G[j, k + 1] = A[k] @ G[j, k]
-    stacked = np.concatenate([G[j, 1:].reshape(N * n, 4) for j in range(N)], axis=1)
-    weighted = np.einsum("kij,kjm->kim", Q[1:], stacked.reshape(N, n, 4 * N)).reshape(N * n, 4 * N)
+    for k in range(N):
+        G[k + 1] = A[k] @ G[k]
+        G[k + 1][:, 4 * k:4 * k + 4] += B[k]
+    stacked = G[1:].reshape(N * n, 4 * N)
+    weighted = (Q[1:] @ G[1:]).reshape(N * n, 4 * N)
     H[:] = stacked.T @ weighted + R * np.eye(4 * N)
     gradient = q[1:] + np.einsum("kij,kj->ki", Q[1:], xi[1:])
     h[:] = stacked.T @ gradient.ravel() + r.ravel()

@@ -46,7 +46,7 @@ class NmpcController:
         self._A, self._B, self._c = np.zeros((N, n, n)), np.zeros((N, n, INPUTS)), np.zeros((N, n))
         self._Q, self._q = np.zeros((N + 1, n, n)), np.zeros((N + 1, n))
         self._H, self._h = np.zeros((INPUTS * N,) * 2), np.zeros(INPUTS * N)
-        self._xi, self._G = np.zeros((N + 1, n)), np.zeros((N, N + 1, n, INPUTS))
+        self._xi, self._G = np.zeros((N + 1, n)), np.zeros((N + 1, n, INPUTS * N))
         self._sums = self._dt * np.kron(np.tril(np.ones((N, N))), np.eye(INPUTS))  # inputs -> thrust states
         self._warm = False
         self._line_time = 0.0
@@ -192,7 +192,7 @@ class NmpcController:
             high.append(self.vehicle.thrust_max - thrust)
         if len(near):
             k, axis = near[:, 0] + 1, near[:, 1]
-            rows.append(self._G[:, k, 10 + axis, :].transpose(1, 0, 2).reshape(len(near), INPUTS * N))
+            rows.append(self._G[k, 10 + axis])
             now = free[k, 10 + axis]
             low.append(-self._rate_max - now)
             high.append(self._rate_max - now)
