@@ -10,14 +10,16 @@ from ros_graph.commands import add_spin_time, main, parser
 
 EXAMPLES = """examples:
   python3 scripts/param.py list /controller
-  python3 scripts/param.py get /controller position_gain
-  python3 scripts/param.py set /controller position_gain '[6.0, 6.0, 7.0]'
+  python3 scripts/param.py describe /controller
+  python3 scripts/param.py get /controller snapdragon.position
+  python3 scripts/param.py set /controller snapdragon.position '[8.0, 8.0, 10.0]'
   python3 scripts/param.py dump /controller > controller.yaml
 """
 HANDLERS = {
     "list": "parameters:list_parameters",
     "get": "parameters:get_parameter",
     "set": "parameters:set_parameter",
+    "describe": "parameters:describe_parameters",
     "dump": "parameters:dump_parameters",
 }
 
@@ -32,6 +34,9 @@ def command_line() -> argparse.ArgumentParser:
         command.add_argument("node")
         if name != "dump":
             command.add_argument("parameter")
+    description = commands.add_parser("describe", help="unit, range and meaning, of one parameter or of all")
+    description.add_argument("node")
+    description.add_argument("parameter", nargs="?")
     commands.choices["set"].add_argument("value", help="in YAML")
     for command in commands.choices.values():
         add_spin_time(command)

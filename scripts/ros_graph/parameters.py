@@ -37,6 +37,24 @@ def get_parameter(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def describe_parameters(arguments: argparse.Namespace) -> int:
+    """`param.py describe`: what each parameter means, in which unit, and what is allowed."""
+    with visit() as graph:
+        node = graph.absolute(arguments.node)
+        client = _client(graph, node, arguments.spin_time)
+        names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
+        values = _values(graph, client, node, names)
+        found = graph.answer(client.describe_parameters(names), node).descriptors
+    for name, value, descriptor in zip(names, values, found):
+        if value.type == ParameterType.PARAMETER_NOT_SET and not descriptor.description:
+            raise GraphError(f"{node} has no parameter {name!r}; 'param.py list {node}' shows all")
+        fixed = " (fixed after the start)" if descriptor.read_only else ""
+        print(f"{name}: {_plain(parameter_value_to_python(value))!r}{fixed}")
+        if descriptor.description:
+            print(f"    {descriptor.description}")
+    return 0
+
+
 def set_parameter(arguments: argparse.Namespace) -> int:
     """`param.py set`: 1 where the node refuses the value."""
     try:
