@@ -26,6 +26,6 @@ class GeometricGains:
     thrust_floor: float = quantity(0.8, unit="m/s^2", above=0.0, high=5.0, doc="specific thrust below which a direction is noise")
     feedback_rate: float = quantity(0.0, unit="-", low=0.0, high=1.0, doc="share of the feedback's own derivative in the commanded rates")
     rehearse: bool = quantity(True, doc="fly a contact trajectory on the model first, and offset it so that it ends as planned")
-    contact_speed: float = quantity(0.5, unit="m/s", low=0.0, high=2.0, doc="least speed into the surface that the rehearsal aims at")
-    contact_overshoot: float = quantity(0.025, unit="m", low=0.0, high=0.2, doc="the rehearsal aims so far behind the surface")
+    contact_speed: float = quantity(0.65, unit="m/s", low=0.0, high=2.0, doc="least speed into the surface that the rehearsal aims at")
+    contact_overshoot: float = quantity(0.02, unit="m", low=0.0, high=0.2, doc="the rehearsal aims so far behind the surface")
     acceleration_max: float = quantity(250.0, unit="rad/s^2", above=0.0, high=5000.0, doc="bound of the commanded angular acceleration")
