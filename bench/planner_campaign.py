@@ -1,15 +1,18 @@
 #!/usr/bin/env python3
-"""Plan thousands of random perches and check every answer: plans by the independent verifier, refusals by relaxing what they name.
+"""Plan thousands of random perches and check every answer.
+
+Plans are checked by the independent verifier, refusals by planning again without the limits that they name.
 
     nice -n 10 python3 bench/planner_campaign.py --count 10000 --out docs/results/planner/campaign.json
 
-Takes about 0.1 s per problem; it can be stopped at any time with Ctrl-C and still writes what it has.
+Takes about 0.1 s per problem; it can be stopped at any time (Ctrl-C, kill) and still writes what it has.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import time
 from collections import Counter
@@ -27,8 +30,10 @@ from perch_planner.problem import PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.verifier import verify
 
-_RELAXED = {"thrust": {"thrust_min": 1e-3, "thrust_max": 1e3}, "body_rate": {"body_rate_max": 1e3},
-            "speed": {"speed_max": 1e3}, "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3}}
+_RELAXED = {
+    "thrust": {"thrust_min": 1e-3, "thrust_max": 1e3}, "body_rate": {"body_rate_max": 1e3}, "speed": {"speed_max": 1e3},
+    "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3},
+}
 
 
 def confirmed(problem, refusal: PerchRefusal, settings: PerchSettings, vehicle) -> bool:
@@ -51,6 +56,8 @@ def main() -> int:
     parser.add_argument("--step", type=float, default=1e-4, help="sampling of the verifier [s] (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     arguments = parser.parse_args()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
     codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
     begin = time.time()

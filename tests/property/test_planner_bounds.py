@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from perch_core import bernstein
 from perch_core.flatness import flat_to_state
 from perch_planner import bounds, sturm
-from perch_planner.body_rate_bound import rate_at, rate_parts, rate_stays_below
+from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
 from perch_planner.plan_checks import specific_force
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "oracles"))
@@ -131,3 +131,12 @@ def test_body_rate_is_that_of_flatness_and_its_bound_is_one(seed):
         assert rate_by_flatness(coefficients, yaw, duration, place) >= 1.05 * worst * (1 - 1e-9)
     else:
         assert verdict == bounds.BELOW
+
+
+@given(seeds)
+@settings(max_examples=40)
+def test_the_coarse_bound_of_the_body_rate_is_one(seed):
+    coefficients, yaw, duration = motion(seed)
+    jerk = bernstein.derivative(coefficients, 3) / duration**3
+    coarse = rate_coarse_bound(specific_force(coefficients, duration), jerk, yaw, duration)
+    assert coarse >= max(rate_by_flatness(coefficients, yaw, duration, s) for s in np.linspace(0.0, 1.0, 41))

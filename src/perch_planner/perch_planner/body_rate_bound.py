@@ -68,6 +68,29 @@ def rate_parts(force, jerk, yaw, duration):
 
 
 @compiled
+def rate_coarse_bound(force, jerk, yaw, duration):
+    """A quick upper bound of |omega| on a segment from |x| <= |f| |j|; infinite where it is of no use.
+
+    Args:
+        force, jerk, yaw, duration: as for `rate_parts`.
+    """
+    squared = dot(force, force)
+    least, most = squared.min(), squared.max()
+    if least <= 0.0:
+        return np.inf
+    low, high = yaw.min(), yaw.max()
+    middle = 0.5 * (low + high)
+    lean = np.abs(cos(middle) * force[1] - sin(middle) * force[0]).max() + 0.5 * (high - low) * sqrt(most)
+    across = least - lean * lean
+    if across <= 0.0:
+        return np.inf
+    j = sqrt(max(dot(jerk, jerk).max(), 0.0))
+    turn = np.abs(derivative(yaw, 1)).max() / duration
+    spin = (turn * np.abs(force[2]).max() * sqrt(most) + lean * j) / across
+    return sqrt(j * j / least + spin * spin)
+
+
+@compiled
 def _squared_rate(parts):
     """|omega|^2 where the parts begin."""
     f_z, yaw, yaw_rate = parts[5, 0], parts[9, 0], parts[10, 0]

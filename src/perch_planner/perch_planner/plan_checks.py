@@ -8,7 +8,7 @@ import numpy as np
 
 from perch_core import bernstein
 from perch_core.vehicle import GRAVITY
-from perch_planner.body_rate_bound import rate_at, rate_parts, rate_stays_below
+from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
 from perch_planner.bounds import BELOW, VIOLATED, cross, derivative, dot, maximum, product, stays_below
 from perch_planner.compilation import compiled
 
@@ -165,7 +165,7 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
     where = np.full((5, 2), -1.0)
     gap_wanted, rate_wanted = np.inf, 1e-3
     begin = 0.0
-    parts = np.empty((f, 11, 49))
+    coarse = np.empty(f)
     for i in range(f):
         T, c = durations[i], coefficients[i]
         _widen(out, 0, thrust[i, 1], begin + T * thrust[i, 2], thrust[i, 4], begin + T * thrust[i, 5])
@@ -191,7 +191,7 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
         gap, gap_at, sampled, rate_at_ = _sample(distance, force, jerk, yaw[i], derivative(yaw[i], 1) / T, s3, extension)
         if gap < gap_wanted:
             gap_wanted, out[3, 1] = gap, begin + T * gap_at
-        parts[i] = rate_parts(force, jerk, yaw[i], T)
+        coarse[i] = rate_coarse_bound(force, jerk, yaw[i], T)
         if sampled > rate_wanted:
             rate_wanted, out[4, 3] = sampled, begin + T * rate_at_
         if thrust[i, 1] < low_thrust and where[0, 0] < 0.0:
@@ -200,7 +200,7 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
             where[0, 0], where[0, 1] = i, thrust[i, 5]
         begin += T
     _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, clearance, gap_wanted)
-    _prove_rate(out, where, parts, durations, rate, rate_wanted)
+    _prove_rate(out, where, coefficients, yaw, durations, coarse, rate, rate_wanted)
     for k in range(5):
         if where[k, 0] >= 0.0:
             out[k, 4] = 0.0
@@ -232,16 +232,26 @@ def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extensio
 
 
 @compiled
-def _prove_rate(out, where, parts, durations, limit, sampled):
+def _prove_rate(out, where, coefficients, yaw, durations, coarse, limit, sampled):
     """Prove a body rate near the greatest that is attained, or else that the limit holds, or else where it fails."""
     out[4, 0], out[4, 2] = 0.0, np.inf
     attained, slack = sampled, 1.04
+    parts = np.empty((len(durations), 11, 49))
+    known = np.zeros(len(durations), np.bool_)
     for k in range(_RATE_ROUNDS):
         bound = slack * attained
         if not bound < limit or k == _RATE_ROUNDS - 1:
             bound = limit
         failed, verdict, place = -1, BELOW, 0.0
         for i in range(len(durations)):
+            if coarse[i] < bound:
+                continue
+            if not known[i]:
+                jerk = np.empty((3, 12))
+                for d in range(3):
+                    jerk[d] = derivative(coefficients[i, d], 3) / durations[i]**3
+                parts[i] = rate_parts(specific_force(coefficients[i], durations[i]), jerk, yaw[i], durations[i])
+                known[i] = True
             verdict, place = rate_stays_below(parts[i], bound)
             if verdict != BELOW:
                 failed = i

@@ -95,16 +95,18 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
 
 def _refusal(search: Search, best: Outcome) -> PerchRefusal:
     """Find out what stands in the way: limits are taken away, the most often violated first, until there is a plan."""
-    limits, taken = search.limits, []
+    limits, taken, failures = search.limits, [], search.failures
     proofs = () if best.results is None else certificates(best.results, search.limits, search.vehicle.mass)
     tried = f"{search.iterations} programs up to {search.attempts[-1].duration:.2f} s"
-    for name, _ in search.failures.most_common():
-        if name not in plan_checks.NAMES:
-            continue
+    while True:
+        name = next((n for n, _ in failures.most_common() if n in plan_checks.NAMES and n not in taken), None)
+        if name is None:
+            break
         taken.append(name)
         limits = limits.without(name)
         relaxed = Search(search.problem, search.settings, search.vehicle, limits)
         _, outcome = relaxed.run()
+        failures = relaxed.failures
         if outcome.proved:
             needed = certificates(outcome.results, search.limits, search.vehicle.mass)
             margin, words = _needed(needed, taken, search.limits)

@@ -65,7 +65,8 @@ class StartState:
             ConfigError: the time is outside the trajectory.
         """
         if not 0.0 <= t <= trajectory.duration:
-            raise ConfigError("start", "time", f"{t:g} s is outside the current trajectory [0, {trajectory.duration:g}] s")
+            span = f"[0, {trajectory.duration:g}] s"
+            raise ConfigError("start", "time", f"{t:g} s is outside the current trajectory {span}")
         at = trajectory.sample(t)
         return cls(at.p, at.v, at.a, at.j, at.yaw, at.yaw_rate, at.yaw_acc)
 
@@ -144,7 +145,7 @@ class PerchSettings:
     height_min: float = quantity(0.15, unit="m", low=-1e4, high=1e4, doc="floor for the centre of mass")
     height_max: float = quantity(1e3, unit="m", low=-1e4, high=1e4, doc="ceiling for the centre of mass")
     extension: float = quantity(-1.0, unit="m", high=2.0, doc="rim radius that clears the surface; negative: the vehicle's")
-    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of that rim from the surface's plane")
+    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of that rim from the surface")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
     formulation: str = choice("reduced", options=("reduced", "full"), doc="reduced QP, or order 14 as in [M:eq5-8, M:eq17]")
     bubbles: str = choice("tube", options=("tube", "everywhere"),

@@ -42,7 +42,8 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
     low, high = limits.thrust
     contact = vehicle.mass * settings.impact_acceleration
     if low > high:
-        raise PerchRefusal(BAD_INPUT, "tau_min <= tau_max [M:eq16]", high - low, f"thrust limits [{low:g}, {high:g}] N are empty")
+        raise PerchRefusal(BAD_INPUT, "tau_min <= tau_max [M:eq16]", high - low,
+                           f"thrust limits [{low:g}, {high:g}] N are empty")
     if not low < contact < high:
         margin = min(contact - low, high - contact)
         raise PerchRefusal(
@@ -62,7 +63,8 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
                            f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N",
                            limits=("thrust",))
     p_contact = problem.surface.p_WS + vehicle.perch_offset * problem.surface.normal
-    for name, p in (("start", start.p), ("contact", p_contact), *((f"waypoint {k}", w.p) for k, w in enumerate(problem.waypoints))):
+    waypoints = ((f"waypoint {k}", w.p) for k, w in enumerate(problem.waypoints))
+    for name, p in (("start", start.p), ("contact", p_contact), *waypoints):
         margin = min(p[2] - limits.height[0], limits.height[1] - p[2])
         if margin < 0.0 and not (name == "contact" and problem.target_velocity[2]):
             raise PerchRefusal(BOX, f"height of the {name}", margin,
@@ -79,7 +81,7 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
     distance = float((start.p - surface.p_WS) @ surface.normal)
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
-                           f"the start is {distance:.3f} m in front of the surface's plane; the vehicle's rim needs {rim:.3f} m",
+                           f"the start is {distance:.3f} m in front of the surface's plane; the rim needs {rim:.3f} m",
                            limits=("clearance",))
     for k, waypoint in enumerate(problem.waypoints):
         distance = float((waypoint.p - surface.p_WS) @ surface.normal)

@@ -73,7 +73,10 @@ def _sign_changes(chain, degrees, x):
 
 @compiled
 def count_roots(powers, low, high):
-    """STURM(F, t_0, t_f): number of distinct roots in (low, high]. [M:eq18]"""
+    """STURM(F, t_0, t_f): number of distinct roots in (low, high]. [M:eq18]
+
+    The appendix' example t^4 + t^3 - t - 1 has one in (0, 2] [M:eq19].
+    """
     chain, degrees = sturm_chain(powers)
     return _sign_changes(chain, degrees, low) - _sign_changes(chain, degrees, high)
 
