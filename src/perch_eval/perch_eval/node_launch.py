@@ -171,13 +171,14 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
     """What the scenario as a whole means for single nodes."""
     participants = [node for node in PARTICIPANTS if node in nodes]
     vehicle = {"vehicle": scenario.vehicle}
+    every_step = [topic for node, topic in (("estimator", "odometry"), ("controller", "motor_command")) if node in nodes]
     return {
+        "recorder": {"every_step": every_step if lockstep and every_step else [""]},
         "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants or [""]},
-        "vio": vehicle, "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,
+        "vio": vehicle | {"start_position": list(scenario.start.position), "start_yaw_deg": scenario.start.yaw_deg},
+        "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,
         "target_localizer": vehicle | {"board": scenario.target.board},
-        "perching_planner": vehicle, "powerline_planner": vehicle,
-        # In lockstep a busy machine stops time for everybody: only much longer silence means that odometry is gone.
-        "controller": vehicle | ({"blind_after": 8.0} if lockstep else {}),
+        "perching_planner": vehicle, "powerline_planner": vehicle, "controller": vehicle,
         "mission": {"mission.planner_latency": scenario.latency.perching_planner,
                     "mission.powerline_latency": scenario.latency.powerline_planner},
     }
