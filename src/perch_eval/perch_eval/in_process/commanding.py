@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from perch_control.admission import AtEnd
@@ -63,7 +61,7 @@ class Commanding:
             answer, self._pending = self._pending[1], None
         e, estimator = odometry.estimate, self._estimator
         outputs = self._machine.tick(Inputs(
-            time=time, state=State(e.p_WB, e.q_WB, e.v_WB, e.w_WB_B),
+            time=time, state=State(e.p_WB, e.q_WB, odometry.v_WB, e.w_WB_B),
             estimator_ready=estimator is not None and estimator.health is Health.RUNNING,
             controller=ControllerState(status.state), controller_message=status.message,
             trajectory_id=status.trajectory_id, trajectory_time=status.trajectory_time, target=self._target,
@@ -88,8 +86,3 @@ class Commanding:
         now = (self._machine.phase.value, self._machine.message)
         if not self.phases or self.phases[-1][1:] != now:
             self.phases.append((time, *now))
-
-    @property
-    def end_of_plan(self) -> float:
-        """Time that is left to the planned contact [s]; nan without a plan."""
-        return self._machine.time_to_contact if math.isfinite(self._machine.time_to_contact) else math.nan

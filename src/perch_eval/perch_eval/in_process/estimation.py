@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_eval.in_process.wire import Wire
 from perch_perception.pose_buffer import BodyState
 from perch_perception.ukf import Estimate, Estimator, ImuSample, Status, UkfConfig, VioPose
 from perch_perception.ukf.odometry import covariances
@@ -15,21 +16,28 @@ STATUS_STEPS = 50
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """What `odometry` carries at a step: the estimate, and the pose covariance in W that was computed last."""
+    """What `odometry` carries at a step.
+
+    Attributes:
+        estimate: the state.
+        covariance: of the pose in W, as computed last, shape (6, 6).
+        v_WB: the velocity as receivers read it [m/s], shape (3,).
+    """
 
     estimate: Estimate
     covariance: np.ndarray
+    v_WB: np.ndarray
 
     def body(self, time: float) -> BodyState:
         """As those who look back in time keep it."""
         e = self.estimate
-        return BodyState(time, e.p_WB, e.q_WB, e.v_WB, e.w_WB_B, self.covariance)
+        return BodyState(time, e.p_WB, e.q_WB, self.v_WB, e.w_WB_B, self.covariance)
 
     @property
     def sample(self) -> tuple[float, ...]:
         """As the controller takes it: p_WB, v_WB, q_WB, w_WB_B, 13 floats."""
         e = self.estimate
-        return (*e.p_WB.tolist(), *e.v_WB.tolist(), *e.q_WB.tolist(), *e.w_WB_B.tolist())
+        return (*e.p_WB.tolist(), *self.v_WB.tolist(), *e.q_WB.tolist(), *e.w_WB_B.tolist())
 
 
 class Estimation:
@@ -38,7 +46,7 @@ class Estimation:
     def __init__(self, config: UkfConfig) -> None:
         self._config, self._estimator = config, Estimator(config)
         self._steps, self._covariance_step = 0, -config.covariance_stride
-        self._covariance = np.zeros((6, 6))
+        self._covariance, self._wire = np.zeros((6, 6)), Wire()
 
     def add_vio(self, pose: VioPose) -> None:
         """A VIO pose that counts from this step on."""
@@ -53,7 +61,8 @@ class Estimation:
             self._covariance, _ = covariances(estimate, self._config.imu.gyro_noise)
             self._covariance_step = self._steps
         self._steps += 1
-        return Odometry(estimate, self._covariance)
+        v_WB = self._wire.velocity(estimate.p_WB, estimate.q_WB, estimate.v_WB, estimate.w_WB_B)
+        return Odometry(estimate, self._covariance, v_WB)
 
     @property
     def status(self) -> Status:
