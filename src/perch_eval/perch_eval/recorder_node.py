@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from nav_msgs.msg import Odometry
 from perch_msgs.msg import (
     Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RotorState,
     Step, TargetDetection, Trajectory)
+from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image, Imu
@@ -31,8 +33,10 @@ TOPICS = {
     "trajectory": Trajectory, "controller/command": ControllerCommand, "controller/status": ControllerStatus,
     "controller/reference": ControlReference, "/diagnostics": DiagnosticArray,
 }
-LATCHED = {"ground_truth/target", "target/pose", "trajectory", "powerlines", "controller/command", "contact"}
+NOT_LATCHED = {"/diagnostics"}
+TRUTH = "ground_truth/odometry"
 TICK_STEPS = 50
+PATIENCE = 5.0  # [s] wall clock; messages that were sent long ago and have not come in this time never will
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +45,7 @@ class RecorderParameters:
 
     file: str = text("flight.mcap", doc="where to write")
     image_rate: float = quantity(6.0, unit="Hz", low=0.0, high=60.0, doc="images kept per second and camera, 0: none")
+    every_step: tuple[str, ...] = quantity((), doc="topics with a message at every step: the flight does not go on before they are on file")
     image_quality: int = quantity(80, unit="%", low=10, high=100, doc="JPEG quality")
 
 
@@ -53,15 +58,17 @@ class RecorderNode(PerchNode[RecorderParameters]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("recorder", RecorderParameters, **kwargs)
         self._log = McapLog(Path(self.params.file))
-        self._truth_steps = 0
+        self._counts = {topic: 0 for topic in (TRUTH, *self.params.every_step) if topic}
         self._waiting: Step | None = None
+        self._waiting_since = 0.0
         self._next_image: dict[str, int] = {}
         for topic, msg_type in TOPICS.items():
-            durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in LATCHED else DurabilityPolicy.VOLATILE
+            # Latched, because discovery may find a publisher only after its first messages.
+            durability = DurabilityPolicy.VOLATILE if topic in NOT_LATCHED else DurabilityPolicy.TRANSIENT_LOCAL
             profile = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
             resolved = self.resolve_topic_name(topic)
             self._log.add_topic(resolved, type_name(msg_type))
-            self.create_subscription(msg_type, topic, self._writer(resolved), profile, raw=True)
+            self.create_subscription(msg_type, topic, self._writer(topic, resolved), profile, raw=True)
         if self.params.image_rate > 0.0:
             for camera in ("down", "front"):
                 name = self.resolve_topic_name(f"camera_{camera}/image_raw/compressed")
@@ -70,14 +77,15 @@ class RecorderNode(PerchNode[RecorderParameters]):
                                          QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE), raw=True)
         self._participant = Participant(self, self._on_step)
         self._participant.greet()
+        self.create_timer(1.0, self._lose_patience, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _writer(self, topic: str):
-        is_truth = topic.endswith("ground_truth/odometry")
+    def _writer(self, topic: str, resolved: str):
+        counted = topic in self._counts
 
         def write(data: bytes) -> None:
-            self._log.write(topic, data, stamp_of(data))
-            if is_truth:
-                self._truth_steps += 1
+            self._log.write(resolved, data, stamp_of(data))
+            if counted and topic in self._counts:
+                self._counts[topic] += 1
                 self._report()
 
         return write
@@ -103,14 +111,22 @@ class RecorderNode(PerchNode[RecorderParameters]):
 
     def _on_step(self, step: Step) -> None:
         if step.lockstep and step.index % TICK_STEPS == 0:
-            self._waiting = step
+            self._waiting, self._waiting_since = step, time.monotonic()
             self._report()
 
     def _report(self) -> None:
-        """Report the tick once the truth of its step is on file."""
-        if self._waiting is not None and self._truth_steps > self._waiting.index:
+        """Report the tick once the truth of its step is on file, and what the nodes sent in all steps before."""
+        if self._waiting is not None and self._counts[TRUTH] > self._waiting.index and min(self._counts.values()) >= self._waiting.index:
             step, self._waiting = self._waiting, None
             self._participant.report(step.stamp)
+
+    def _lose_patience(self) -> None:
+        """A node that has fallen silent must not stop the flight, which may yet end safely without it."""
+        if self._waiting is None or time.monotonic() - self._waiting_since < PATIENCE or self._counts[TRUTH] <= self._waiting.index:
+            return
+        for topic in [topic for topic, count in self._counts.items() if count < self._waiting.index]:
+            self.get_logger().warning(f"{topic} is incomplete: {self._counts.pop(topic)} messages in {self._waiting.index} steps")
+        self._report()
 
     def close(self) -> None:
         """Finish the file."""

@@ -1,0 +1,104 @@
+"""A whole perch on a wall on the real nodes: what the report says of it, and that a seed is a flight."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from perch_eval import demo
+from perch_eval.flight import HASHED, Flight
+
+SCENARIO, SEED = "surface_90", 1
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory) -> tuple[dict, Path]:
+    """The report and the folder of a flight with all nodes in one process."""
+    folder = tmp_path_factory.mktemp("composed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", "0")  # the demo chooses its own and must not leave it behind
+        return demo.fly(SCENARIO, SEED, folder, composed=True), folder
+
+
+def test_it_perches_as_the_paper_does(flight):
+    report, _ = flight
+    assert report["outcome"] == "perched", report["message"]
+    assert max(report["tracking_rmse_m"]) <= 0.11        # [M:Table II], each axis
+    assert report["max_body_rate_deg_s"] >= 400.0
+    assert report["contact"]["state"] == "attached" and report["contact"]["body"] == "pad"
+    assert 0.2 <= report["contact"]["normal_speed_m_s"] <= 1.0 and report["contact"]["tangential_speed_m_s"] <= 0.6
+    assert report["contact"]["tilt_error_deg"] <= 15.0 and report["contact"]["offset_m"] <= 0.3
+
+
+def test_the_report_has_every_figure(flight):
+    report, folder = flight
+    written = json.loads((folder / "report.json").read_text())
+    for key in ("outcome", "scenario", "seed", "tracking_rmse_m", "estimation_rmse_m", "max_body_rate_deg_s", "max_acceleration_m_s2",
+                "contact", "real_time_factor", "flight_hash", "timings_ms"):
+        assert written[key] is not None, key
+    assert (written["scenario"], written["seed"]) == (SCENARIO, SEED)
+    assert len(written["estimation_rmse_m"]) == 3 and all(0.0 < v < 1.0 for v in written["estimation_rmse_m"])
+    assert re.fullmatch("[0-9a-f]{64}", written["flight_hash"])
+    assert written["real_time_factor"] > 0.0
+    for node in ("vio", "estimator", "target_localizer", "controller"):
+        durations = written["timings_ms"][node]
+        assert durations and all(math.isfinite(v) for v in durations.values())
+
+
+def test_the_nodes_hold_their_rates(flight):
+    rates = flight[0]["rates_hz"]
+    for topic, rate in (("imu/data_raw", 500.0), ("odometry", 500.0), ("motor_command", 500.0), ("ground_truth/odometry", 500.0),
+                        ("rotor_state", 100.0), ("controller/status", 50.0), ("estimator/status", 10.0)):
+        assert rates[topic] == pytest.approx(rate, rel=0.05), topic
+    assert 25.0 < rates["vio/odometry"] < 31.0  # 30 Hz, but nothing of the frames in which it is blind at the wall
+
+
+def test_the_recording_opens_as_ros_2_messages(flight):
+    _, folder = flight
+    with (folder / "flight.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary.statistics.message_count > 10_000
+    schemas = {channel.topic: summary.schemas[channel.schema_id] for channel in summary.channels.values()}
+    assert all(schema.encoding == "ros2msg" and schema.data for schema in schemas.values())
+    assert schemas["/odometry"].name == "nav_msgs/msg/Odometry"
+    assert b"MSG: geometry_msgs/Quaternion" in schemas["/odometry"].data
+    assert {"/camera_front/image_raw/compressed", "/trajectory", "/target/pose", "/diagnostics"} <= set(schemas)
+
+
+def test_the_page_is_complete(flight):
+    report, folder = flight
+    page = (folder / "report.html").read_text()
+    for title in ("Timeline", "Tracking and estimation", "Body rates", "Thrust against its bounds", "What the cameras saw", "Rates", "Durations"):
+        assert f"<h2>{title}" in page
+    assert page.count("data:image/png;base64,") == 5 and page.count("data:image/jpeg;base64,") == 8
+    assert report["flight_hash"][:16] in page and "attached to pad" in page
+    assert not re.search(r"\bnan\b|None", re.sub(r'src="[^"]*"', "", page))
+
+
+def test_one_process_per_node_and_a_busy_core_give_the_same_flight(flight, tmp_path):
+    report, folder = flight
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        again = demo.fly(SCENARIO, SEED, tmp_path)
+    finally:
+        busy.kill()
+        busy.wait()
+    assert again["outcome"] == report["outcome"]
+    if again["flight_hash"] != report["flight_hash"]:
+        pytest.fail(first_difference(Flight(folder / "flight.mcap"), Flight(tmp_path / "flight.mcap")))
+
+
+def first_difference(a: Flight, b: Flight) -> str:
+    """Where two recordings part, topic by topic."""
+    lines = []
+    for topic in HASHED:
+        one, other = a.messages(topic), b.messages(topic)
+        parted = next((t for (t, x), (_, y) in zip(one, other) if x != y), None)
+        lines.append(f"{topic}: {len(one)} and {len(other)} messages, " + ("equal" if parted is None else f"different from {parted:.3f} s on"))
+    return "\n".join(lines)
