@@ -42,7 +42,7 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--domain", type=int, metavar="N", help="ROS domain id, 0 to 101 (default: $ROS_DOMAIN_ID)")
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
     parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>)")
-    parser.add_argument("--ready-timeout", type=float, default=30.0, metavar="S", help="default: 30 s")
+    parser.add_argument("--ready-timeout", type=float, default=180.0, metavar="S", help="how long nodes may take to come up (default: %(default)g s)")
     parser.add_argument(
         "-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE", help="over every file; repeatable"
     )
