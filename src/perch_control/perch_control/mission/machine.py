@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from perch_core import so3
-from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_control.mission.adhesion import AdhesionMonitor
+from perch_control.mission.moves import Moves, Place, place_of
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import (
-    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
+    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
 
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
@@ -32,8 +32,6 @@ class MissionMachine:
         self._adhesion = AdhesionMonitor(settings.adhesion)
         self._goal: Goal | None = None
         self._next_id = 1
-        self._home: tuple[np.ndarray, float] | None = None   # where the vehicle stood when it was armed
-        self._hover: tuple[np.ndarray, float] | None = None  # where the last move of the mission's own ends
         self._asked_target: Target | None = None             # the target of the newest plan query
         self._replanned_at = -math.inf
 
@@ -42,7 +40,8 @@ class MissionMachine:
     def start(self, goal: Goal, time: float) -> None:
         """Take a goal; the machine must be idle."""
         self._goal, self._attempts_left = goal, goal.attempts
-        self.target, self._failure, self._hover = None, None, None
+        self.target, self._failure = None, None
+        self._moves = Moves(self.settings)
         self._perch: PlanAnswer | None = None
         self._perch_id = 0
         self._contact_time = float("nan")
@@ -74,13 +73,13 @@ class MissionMachine:
 
     def _arming(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.controller in _FLYING:
-            self._hover = self._hold_point(inputs.state)
+            self._moves.hover = place_of(inputs.state)
             self._enter(Phase.TAKE_OFF, inputs.time, "already flying: going to the search place")
-            self._go(inputs, outputs, *self._search_place(inputs.state))
+            self._go(inputs, outputs, self._moves.search_place(self._goal, inputs.state))
         elif inputs.controller is ControllerState.ARMED:
-            self._hover = self._hold_point(inputs.state)
+            self._moves.hover = place_of(inputs.state)
             self._enter(Phase.TAKE_OFF, inputs.time, "taking off")
-            self._go(inputs, outputs, *self._search_place(inputs.state))
+            self._go(inputs, outputs, self._moves.search_place(self._goal, inputs.state))
         elif self._elapsed(inputs) > self.settings.arming_timeout:
             outputs.commands.append((Command.DISARM, "arming took too long"))
             why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
@@ -92,8 +91,8 @@ class MissionMachine:
     def _take_off(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._lost(inputs, outputs):
             return
-        if self._arrived(inputs):
-            self._pattern = self._search_pattern()
+        if self._moves.arrived(inputs.time, inputs.state):
+            self._pattern = self._moves.pattern(self._goal)
             self._enter(Phase.SEARCHING, inputs.time, "looking for the target")
 
     def _searching(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -105,17 +104,17 @@ class MissionMachine:
             if self._seen_since is None:
                 self._seen_since = inputs.time
                 self.message = "target in view"
-            if inputs.time - self._seen_since >= self.settings.target_settle and self._arrived(inputs):
+            if inputs.time - self._seen_since >= self.settings.target_settle and self._moves.arrived(inputs.time, inputs.state):
                 self._ask_plan(inputs, outputs, target)
             return
         if self._elapsed(inputs) > self._goal.search_timeout:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
             return
-        if self._arrived(inputs) and inputs.time - self._moved_at > self._travel + self.settings.search_dwell:
+        if self._moves.arrived(inputs.time, inputs.state) and self._moves.dwelt(inputs.time):
             offset, turn = self._pattern[self._place % len(self._pattern)]
             self._place += 1
-            p, yaw = self._search_place(inputs.state)
-            self._go(inputs, outputs, p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn)
+            p, yaw = self._moves.search_place(self._goal, inputs.state)
+            self._go(inputs, outputs, (p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn))
             self.message = f"looking for the target ({why})"
 
     def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -165,7 +164,7 @@ class MissionMachine:
             self._end(outputs, Result.PERCHED, "perched", contact_time=self._contact_time)
 
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
-        resting = inputs.controller is ControllerState.HOVERING and self._slow(inputs.state)
+        resting = inputs.controller is ControllerState.HOVERING and self._moves.slow(inputs.state)
         if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
             self._end(outputs, Result.CANCELLED if self._cancelled else Result.CRASHED, f"{self._failure}; on the ground or descending")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
@@ -176,9 +175,9 @@ class MissionMachine:
             if self._cancelled:
                 self._end(outputs, Result.CANCELLED, "cancelled; hovering")
             elif self._attempts_left > 0:
-                self._hover = self._hold_point(inputs.state)
+                self._moves.hover = place_of(inputs.state)
                 self._enter(Phase.TAKE_OFF, inputs.time, f"{self._failure}; {self._attempts_left} attempts left")
-                self._go(inputs, outputs, *self._search_place(inputs.state))
+                self._go(inputs, outputs, self._moves.search_place(self._goal, inputs.state))
             else:
                 self._end(outputs, Result.MISSED, f"{self._failure}; recovered to a hover")
 
@@ -187,7 +186,7 @@ class MissionMachine:
     def _ask_plan(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
         self.target = target
         zero = np.zeros(3)
-        p, yaw = self._hover
+        p, yaw = self._moves.hover
         outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target, self._goal)
         self._enter(Phase.PLANNING, inputs.time, "planning")
 
@@ -240,51 +239,8 @@ class MissionMachine:
                 return False, f"inclination {math.degrees(inclination):.0f} deg, expected {math.degrees(hint):.0f} deg"
         return True, ""
 
-    # -- moving ------------------------------------------------------------------------------------------------------
-
-    def _search_place(self, state: State) -> tuple[np.ndarray, float]:
-        goal = self._goal
-        if self._home is None:
-            self._home = self._hold_point(state)
-        p, yaw = self._home
-        if goal.search_position is not None:
-            return goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
-        return p + np.array([0.0, 0.0, goal.takeoff_height]), yaw
-
-    def _search_pattern(self) -> list[tuple[np.ndarray, float]]:
-        """Places around the search hover (forward, left, up [m], turn [rad]).
-
-        A pad may be out of view: the vehicle turns and rises. Lines have to be seen from different places: it moves
-        up and down, and a little to the sides.
-        """
-        rise, turn = self.settings.search_rise, math.radians(self.settings.search_yaw_deg)
-        if self._goal.mode is Mode.POWERLINE:
-            reach = self.settings.mapping_reach
-            return [(np.array(v), 0.0) for v in ((0, 0, reach), (0, reach / 2, 0), (0, -reach / 2, reach), (0, 0, 0))]
-        return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
-                (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
-
-    def _go(self, inputs: Inputs, outputs: Outputs, p: np.ndarray, yaw: float) -> None:
-        """Fly from the present hover to another, at rest at both ends."""
-        p0, yaw0 = self._hover
-        turn = math.remainder(yaw - yaw0, 2 * math.pi)
-        duration = max(1.0, float(np.linalg.norm(p - p0)) / self.settings.transit_speed, abs(turn) / 0.6)
-        start = inputs.time + 0.04  # after the controller has it: the mission's own latency
-        outputs.reference = rest_to_rest(p0, p, yaw0, yaw0 + turn, duration, start_time=start)
-        outputs.trajectory_id = self._new_id()
-        self._hover = (np.asarray(p, float), yaw0 + turn)
-        self._moved_at, self._travel = inputs.time, duration + 0.04
-
-    def _arrived(self, inputs: Inputs) -> bool:
-        done = inputs.time > self._moved_at + self._travel + self.settings.settle_time
-        return done and self._slow(inputs.state)
-
-    def _slow(self, state: State) -> bool:
-        return float(np.linalg.norm(state.v_WB)) < self.settings.settle_speed
-
-    @staticmethod
-    def _hold_point(state: State) -> tuple[np.ndarray, float]:
-        return np.array(state.p_WB), float(so3.yaw_of(so3.quat_to_matrix(state.q_WB)))
+    def _go(self, inputs: Inputs, outputs: Outputs, place: Place) -> None:
+        outputs.reference, outputs.trajectory_id = self._moves.go(inputs.time, place), self._new_id()
 
     # -- endings -----------------------------------------------------------------------------------------------------
 
@@ -325,7 +281,7 @@ class MissionMachine:
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         self.phase, self.message, self._since = phase, message, time
         if phase is Phase.ARMING:
-            self._asked, self._home, self._entered_search = False, None, time
+            self._asked, self._entered_search = False, time
         if phase is Phase.SEARCHING:
             self._seen_since, self._place, self._entered_search = None, 0, time
 
