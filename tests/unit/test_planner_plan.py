@@ -52,18 +52,18 @@ def test_every_inclination_is_reached(inclination):
     assert state.thrust == pytest.approx(VEHICLE.mass * 3.3)
 
 
-@pytest.mark.parametrize("heading", [-150.0, -60.0, 45.0, 170.0])
+@pytest.mark.parametrize("heading", [-90.0, 90.0, 180.0])
 def test_plans_turn_with_the_world(heading):
-    """Turning the whole problem about the vertical turns the plan, but for the tube, whose box [M:eq15] does not turn."""
+    """Turning the whole problem turns the plan; by right angles, because the tube is a box along the axes [M:eq15]."""
     reference = checked(PerchProblem(HOVER, surface(75.0)))
     angle = np.radians(heading)
     c, s = np.cos(angle), np.sin(angle)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     target = PerchSurface.from_inclination(R @ [1.7, 0.0, 1.5], np.radians(75.0), angle)
     turned = checked(PerchProblem(StartState(HOVER.p, yaw=angle), target))
-    assert turned.duration == pytest.approx(reference.duration, rel=0.1)
+    assert turned.duration == pytest.approx(reference.duration)
     for t in np.linspace(0.0, reference.duration, 7):
-        assert turned.trajectory.sample(t).p == pytest.approx(R @ reference.trajectory.sample(t).p, abs=0.03)
+        assert turned.trajectory.sample(t).p == pytest.approx(R @ reference.trajectory.sample(t).p, abs=1e-5)
 
 
 def test_both_sides_of_a_surface_can_be_approached():

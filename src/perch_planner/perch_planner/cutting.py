@@ -19,6 +19,9 @@ _UP = np.array([0.0, 0.0, 1.0])
 _G = GRAVITY * _UP
 _INF = float("inf")
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
+_KEEP_AHEAD = 0.985  # of the limit, for cuts that are set ahead
+_PREVENTED = ((-1, 0.6), (-1, 0.8), (0, 0.0), (0, 0.15))  # segments from the last, places
+_LEAN = (0.980, 0.199)  # the thrust leans 11 degrees back where it is greatest
 _RAISE = 1.02       # cuts of the thrust from below
 _HEIGHT_ROOM = 2e-3  # [m]
 
@@ -45,6 +48,25 @@ def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.nda
             norm = np.sqrt(f @ f)
             n = f / norm if norm > 0.5 * low else side
             cuts.append(Cut(i, least_at, ((2, n),), _RAISE * low - float(n @ _G), _INF))
+    return cuts
+
+
+def preventive_cuts(durations: np.ndarray, high: float, side: np.ndarray) -> list[Cut]:
+    """Upper thrust bounds where a perch nearly always meets them, before the first program is solved. [M:eq16]
+
+    They hold for every plan that keeps the bound, whatever the direction, and save one round in most plans.
+
+    Args:
+        durations: shape (f,) [s].
+        high: limit of the specific thrust [m/s^2].
+        side: of `turning_side`, shape (3,).
+    """
+    last = len(durations) - 1
+    cuts = []
+    for segment, place in _PREVENTED:
+        for direction in (_UP, _LEAN[0] * _UP + _LEAN[1] * side):
+            if last + segment >= 0:
+                cuts.append(Cut(last + segment, place, ((2, direction),), -_INF, _KEEP_AHEAD * high - float(direction @ _G)))
     return cuts
 
 

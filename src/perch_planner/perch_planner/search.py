@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks
 from perch_planner.contact_constraints import Contact
-from perch_planner.cutting import limit_cuts, thrust_cuts, turning_side
+from perch_planner.cutting import limit_cuts, preventive_cuts, thrust_cuts, turning_side
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.segment_program import COST_ORDER, FORMULATIONS
 from perch_planner.time_allocation import allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
@@ -90,6 +90,8 @@ class Search:
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
         best, count = None, 0
+        if settings.cuts and len(durations) > 1:
+            program.add(preventive_cuts(durations, self.high, turning_side(self.problem)))
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= settings.iterations_max:
                 break

@@ -15,6 +15,7 @@ CRUISE_ACCELERATION = 2.8  # [m/s^2]
 TURN_ACCELERATION = 1.2    # [m/s^2]
 MANOEUVRE_TIME = 0.45     # [s] for the rotation before contact, on top of the way
 FINAL_TIME = 0.5          # [s] of the last piece, where the rotation happens
+PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
@@ -90,7 +91,9 @@ def split_last(durations: np.ndarray) -> np.ndarray:
         return durations
     if last < 5.0 * FINAL_TIME:
         return np.concatenate([durations[:-1], [last - FINAL_TIME, FINAL_TIME]])
-    return np.concatenate([durations[:-1], [last - 2.5 * FINAL_TIME, 1.5 * FINAL_TIME, FINAL_TIME]])
+    run_up = last - 2.5 * FINAL_TIME
+    pieces = int(np.ceil(run_up / PIECE_MAX))
+    return np.concatenate([durations[:-1], pieces * [run_up / pieces], [1.5 * FINAL_TIME, FINAL_TIME]])
 
 
 def lengthen_approach(durations: np.ndarray) -> np.ndarray:
