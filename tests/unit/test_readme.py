@@ -210,6 +210,8 @@ def test_the_parameter_that_is_changed_exists(nodes):
         _, _, _, node, name, value = shlex.split(command)
         node = nodes[node.strip("/")]
         before, value = node.get_parameter(name).value, yaml.safe_load(value)
-        result = node.set_parameters([rclpy.Parameter(name, value=value)])[0]
+        # As it comes by service: arrays of numbers are no lists there.
+        changed = rclpy.Parameter.from_parameter_msg(rclpy.Parameter(name, value=value).to_parameter_msg())
+        result = node.set_parameters([changed])[0]
         assert result.successful, result.reason
         assert list(node.get_parameter(name).value) == value != list(before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from array import array
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -52,8 +53,8 @@ def _describe(item: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A value as rclpy wants it: tuples as lists; nan stays for 'not set'."""
-    return list(value) if isinstance(value, tuple) else value
+    """Tuples, and the arrays in which rclpy hands over what came by service, as lists."""
+    return list(value) if isinstance(value, (tuple, array)) else value
 
 
 def _value_at(instance: Any, name: str) -> Any:
@@ -92,7 +93,7 @@ class Parameters(typing.Generic[T]):
         node.add_on_set_parameters_callback(self._set)
 
     def _set(self, changes: list[Parameter]) -> SetParametersResult:
-        mine = {p.name: p.value for p in changes if p.name in self._leaves}
+        mine = {p.name: _plain(p.value) for p in changes if p.name in self._leaves}
         if not mine:
             return SetParametersResult(successful=True)
         flat = {name: _plain(_value_at(self.value, name)) for name in self._leaves} | mine
