@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from perch_control.modes import Command, State as ControllerState
 from perch_core.trajectory import FlatTrajectory
 
 
@@ -24,29 +25,6 @@ class Phase(str, Enum):
     PERCHED = "perched"
     RECOVERING = "recovering"
     LANDING = "landing"
-
-
-class ControllerState(IntEnum):
-    """States of perch_msgs/ControllerStatus."""
-
-    DISARMED = 0
-    ARMED = 1
-    TRACKING = 2
-    HOVERING = 3
-    RECOVERING = 4
-    LANDING = 5
-    FAILED = 6
-
-
-class Command(IntEnum):
-    """Commands of perch_msgs/ControllerCommand."""
-
-    DISARM = 0
-    ARM = 1
-    HOVER = 2
-    LAND = 3
-    ATTACHED = 4
-    KILL = 5
 
 
 class Result(IntEnum):
