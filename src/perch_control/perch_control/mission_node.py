@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from perch_msgs.action import Perch
 from perch_msgs.msg import ControllerCommand, ControllerStatus, EstimatorStatus, PowerlineArray, Step, Trajectory
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import GoalResponse
 from rclpy.task import Future
 from sensor_msgs.msg import Imu
 
@@ -23,6 +23,7 @@ from perch_control.mission import (
     ControllerState, Goal, Inputs, MissionMachine, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission.powerline import MappedLine, powerline_target
+from perch_control.ros.goal_server import GoalServer
 from perch_control.ros.planner_clients import PlannerClients
 
 TICK_STEPS = 10  # the mission decides at 50 Hz
@@ -45,8 +46,6 @@ class MissionNode(PerchNode[MissionParameters]):
         self._pending: tuple[float, Future] | None = None   # when the answer counts, and the answer
         self._deferred: Step | None = None                  # a tick that waits for the planner's answer
         self._goal_handle: Any = None
-        self._done: Future | None = None
-        self._ended = 0.0                                   # when the last goal ended [s]
         self._held: Step | None = None                      # the first tick, held until there is a goal
 
         self._participant = Participant(self)
@@ -60,8 +59,7 @@ class MissionNode(PerchNode[MissionParameters]):
         self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS)
         self._participant.greet()
         self._planners = PlannerClients(self)
-        self._server = ActionServer(self, Perch, "perch", self._execute, goal_callback=self._accept,
-                                    cancel_callback=lambda _: CancelResponse.ACCEPT)
+        self._server = GoalServer(self, Perch, "perch", self._begin, self._accept)
 
     def _change(self, value: MissionParameters) -> None:
         self._machine.settings = value.mission
@@ -166,8 +164,7 @@ class MissionNode(PerchNode[MissionParameters]):
                 phase=self._machine.phase.value, progress=float(self._machine.progress),
                 time_to_contact=float(self._machine.time_to_contact), message=self._machine.message))
         if outputs.outcome is not None:
-            self._ended = now
-            self._finish(outputs.outcome)
+            self._finish(now, outputs.outcome)
 
     # -- planner -----------------------------------------------------------------------------------------------------
 
@@ -186,36 +183,34 @@ class MissionNode(PerchNode[MissionParameters]):
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
-    async def _execute(self, handle: Any) -> Perch.Result:
+    def _begin(self, handle: Any) -> None:
         problem = self._problem(handle.request)
         if problem:
             handle.abort()
-            return Perch.Result(success=False, error_code=Perch.Result.BAD_GOAL, message=problem)
-        self._goal_handle, self._done = handle, Future()
+            self._server.finish(handle, Perch.Result(success=False, error_code=Perch.Result.BAD_GOAL, message=problem))
+            return
+        self._goal_handle = handle
         start = self._odometry.header.stamp if self._odometry else to_stamp(0)
         self._goal = self._goal_of(handle.request)
         self._machine.start(self._goal, to_seconds(start))
         if self._held is not None:
             held, self._held = self._held, None
             self._tick(held)
-        outcome: Outcome = await self._done
-        self._goal_handle, self._done = None, None
-        result = Perch.Result(success=outcome.result is Result.PERCHED, error_code=int(outcome.result),
-                              message=outcome.message, contact_time=float(outcome.contact_time))
-        result.end_time = self._ended
-        result.final_pose = self._odometry.pose.pose
+
+    def _finish(self, now: float, outcome: Outcome) -> None:
+        self.get_logger().info(f"{outcome.result.name.lower()}: {outcome.message}")
+        if self._goal_handle is None:
+            return
+        handle, self._goal_handle = self._goal_handle, None
         if outcome.result is Result.PERCHED:
             handle.succeed()
         elif outcome.result is Result.CANCELLED:
             handle.canceled()
         else:
             handle.abort()
-        return result
-
-    def _finish(self, outcome: Outcome) -> None:
-        self.get_logger().info(f"{outcome.result.name.lower()}: {outcome.message}")
-        if self._done is not None:
-            self._done.set_result(outcome)
+        self._server.finish(handle, Perch.Result(
+            success=outcome.result is Result.PERCHED, error_code=int(outcome.result), message=outcome.message,
+            contact_time=float(outcome.contact_time), end_time=now, final_pose=self._odometry.pose.pose))
 
     def _goal_of(self, request: Perch.Goal) -> Goal:
         settings = self.params.mission
