@@ -22,9 +22,9 @@ from perch_core.ros.trajectories import flat_message
 from perch_control.mission import (
     ControllerState, Goal, Inputs, MissionMachine, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters
-from perch_control.mission.powerline import MappedLine, powerline_target
 from perch_control.ros.goal_server import GoalServer
 from perch_control.ros.planner_clients import PlannerClients
+from perch_control.ros.powerline_map import mapped_target
 
 TICK_STEPS = 10  # the mission decides at 50 Hz
 
@@ -135,12 +135,7 @@ class MissionNode(PerchNode[MissionParameters]):
         """The pad, or the place on the mapped line that the goal means."""
         if self._goal is None or self._goal.mode is Mode.SURFACE or self._map is None:
             return self._target if self._goal is None or self._goal.mode is Mode.SURFACE else None
-        lines = [MappedLine(m.id, to_array(m.start), to_array(m.end),
-                            math.sqrt(max(0.0, np.linalg.eigvalsh(np.reshape(m.covariance, (3, 3)))[-1])), m.direction_sigma)
-                 for m in self._map.lines]
-        return powerline_target(
-            to_seconds(self._map.header.stamp), lines, self._goal.perch_point, self._goal.perch_pitch,
-            to_array(self._odometry.pose.pose.position), self._map.lines)
+        return mapped_target(self._map, self._goal, to_array(self._odometry.pose.pose.position))
 
     def _act(self, now: float, outputs: Outputs) -> None:
         stamp = to_stamp(float(now))

@@ -106,15 +106,7 @@ class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
         return self._mapper.update(exposed, body, [place(one, body, self._mount) for one in sightings])
 
     def _publish(self, lines: LineMap, exposed: float, problem: str = "") -> None:
-        msg = PowerlineArray(degenerate=lines.degenerate,
-                             message="; ".join(part for part in (problem, lines.message) if part))
-        msg.header.stamp, msg.header.frame_id = to_stamp(float(exposed)), "map"
-        for line in lines.lines:
-            start, end = line.segment.ends
-            msg.lines.append(Powerline(
-                id=int(line.segment.id), start=to_point(start), end=to_point(end), radius=float(line.segment.radius),
-                covariance=line.covariance.astype(float).ravel(), direction_sigma=float(line.direction_sigma),
-                observations=int(line.observations)))
+        msg = map_message(lines, exposed, problem)
         self._lines.publish(msg)
         if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD and self._costs:
             self._diagnosed = exposed
@@ -122,6 +114,26 @@ class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
             values = {"images": self._images, "lines": len(msg.lines), "dropped": self._pending.dropped,
                       "cost_ms_median": float(np.median(costs)), "cost_ms_p99": float(np.percentile(costs, 99))}
             self.publish_diagnostics(exposed, values, 1 if msg.message else 0, msg.message or "ok")
+
+
+def map_message(lines: LineMap, exposed: float, problem: str = "") -> PowerlineArray:
+    """The map as published.
+
+    Args:
+        lines: what is known.
+        exposed: middle of the last image's exposure [s].
+        problem: why that image was not used; empty when it was.
+    """
+    msg = PowerlineArray(degenerate=lines.degenerate,
+                         message="; ".join(part for part in (problem, lines.message) if part))
+    msg.header.stamp, msg.header.frame_id = to_stamp(float(exposed)), "map"
+    for line in lines.lines:
+        start, end = line.segment.ends
+        msg.lines.append(Powerline(
+            id=int(line.segment.id), start=to_point(start), end=to_point(end), radius=float(line.segment.radius),
+            covariance=line.covariance.astype(float).ravel(), direction_sigma=float(line.direction_sigma),
+            observations=int(line.observations)))
+    return msg
 
 
 def create(**kwargs: Any) -> PowerlineMapperNode:

@@ -30,7 +30,7 @@ class PlannerClients:
             missing = Future()
             missing.set_result(client.srv_type.Response(success=False, message=f"service {client.srv_name} is not there"))
             return missing
-        return client.call_async(_surface(query) if query.goal.mode is Mode.SURFACE else _powerline(query))
+        return client.call_async(_surface(query) if query.goal.mode is Mode.SURFACE else powerline_request(query))
 
     @staticmethod
     def answer(future: Future) -> PlanAnswer:
@@ -38,12 +38,17 @@ class PlannerClients:
         response: Any = future.result()
         if response is None:
             return PlanAnswer(False, f"the planner failed: {future.exception()}")
-        trajectory = response.trajectory
-        if isinstance(response, PlanPowerline.Response):
-            trajectory.at_end, duration = Trajectory.AT_END_RECOVER, response.perch_time
-        else:
-            trajectory.at_end, duration = Trajectory.AT_END_CONTACT, sum(s.duration for s in trajectory.segments)
-        return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp), duration)
+        return plan_answer(response)
+
+
+def plan_answer(response: PlanPerch.Response | PlanPowerline.Response) -> PlanAnswer:
+    """What a planner's response means to the mission."""
+    trajectory = response.trajectory
+    if isinstance(response, PlanPowerline.Response):
+        trajectory.at_end, duration = Trajectory.AT_END_RECOVER, response.perch_time
+    else:
+        trajectory.at_end, duration = Trajectory.AT_END_CONTACT, sum(s.duration for s in trajectory.segments)
+    return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp), duration)
 
 
 def _surface(query: PlanQuery) -> PlanPerch.Request:
@@ -57,7 +62,8 @@ def _surface(query: PlanQuery) -> PlanPerch.Request:
     return request
 
 
-def _powerline(query: PlanQuery) -> PlanPowerline.Request:
+def powerline_request(query: PlanQuery) -> PlanPowerline.Request:
+    """The request for a perch on a cable."""
     q_WB = so3.quat_exp([0.0, 0.0, query.yaw])
     request = PlanPowerline.Request(
         start_time=to_stamp(float(query.start_time)), start_pose=to_pose(query.p, q_WB), start_velocity=to_vector(query.v),

@@ -1,0 +1,1 @@
+"""Messages of the planners, to their requests and from their plans."""
