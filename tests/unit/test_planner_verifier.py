@@ -68,7 +68,7 @@ import json
 import numpy as np
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_planner.compilation import COMPILED
+from perch_core.jit import COMPILED
 from perch_planner.planner import plan
 from perch_planner.problem import PerchProblem, PerchSettings, StartState
 surface = PerchSurface.from_inclination(np.array([1.7, 0.2, 1.5]), 1.2, 0.1)

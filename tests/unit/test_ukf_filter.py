@@ -80,7 +80,7 @@ import sys, json, numpy as np
 if sys.argv[1] == "plain":
     sys.modules["numba"] = None  # as on a machine without it
 from perch_perception.ukf import Estimator, ImuSample, VioPose
-from perch_perception.ukf.compiled import COMPILED
+from perch_core.jit import COMPILED
 from perch_perception.vio.preintegration import preintegrate
 assert COMPILED == (sys.argv[1] != "plain")
 rng, estimator = np.random.default_rng(1), Estimator()

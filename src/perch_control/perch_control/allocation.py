@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_control.jit import scalar
+from perch_core.jit import compiled
 from perch_core.vehicle import Vehicle
 
 _TINY = 1e-12  # coefficients below this are zero: the unknown does not act on that bound
 
 
-@scalar
+@compiled
 def _interval(lo, hi, offset, slope):
     """Range of y with `lo_i <= offset_i + slope_i y <= hi_i` for all i; empty where the first exceeds the second."""
     low, high = -1e300, 1e300
@@ -27,7 +27,7 @@ def _interval(lo, hi, offset, slope):
     return low, high
 
 
-@scalar
+@compiled
 def _thrust_row(i, j, lo, hi, offset, a, d):
     """The bound on T that remains when Mz is eliminated from Mz >= bound i and Mz <= bound j: `c T <= r`."""
     # With k = 1/d > 0, Mz lies in [(lo - offset - a T) k, (hi - offset - a T) k]; with k < 0 the ends swap.
@@ -37,7 +37,7 @@ def _thrust_row(i, j, lo, hi, offset, a, d):
     return a[j] * kj - a[i] * ki, (edge_j - offset[j]) * kj - (edge_i - offset[i]) * ki
 
 
-@scalar
+@compiled
 def _thrust_interval(lo, hi, offset, a, d):
     """Range of T for which some Mz keeps all rotors within their bounds."""
     low, high = -1e300, 1e300
@@ -51,7 +51,7 @@ def _thrust_interval(lo, hi, offset, a, d):
     return low, high
 
 
-@scalar
+@compiled
 def _tilt_share(lo, hi, base, step, a, d):
     """Largest share s <= 1 of the tilt step for which some T and Mz keep all rotors within their bounds.
 
@@ -82,7 +82,7 @@ def _tilt_share(lo, hi, base, step, a, d):
     return s
 
 
-@scalar
+@compiled
 def _nearest(value, low, high):
     """The point of [low, high] nearest to a value; an interval that rounding has emptied counts as its middle."""
     if low > high:
@@ -90,13 +90,13 @@ def _nearest(value, low, high):
     return min(max(value, low), high)
 
 
-@scalar
+@compiled
 def _sum(base, k, direction):
     """`base + k direction` for four rotors."""
     return (base[0] + k * direction[0], base[1] + k * direction[1], base[2] + k * direction[2], base[3] + k * direction[3])
 
 
-@scalar
+@compiled
 def allocate(wrench, reachable_tilt, lo, hi, mixing):
     """Rotor thrusts for a wanted wrench, by priority: tilt, then thrust, then yaw.
 

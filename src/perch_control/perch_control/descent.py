@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import sqrt
 
+from perch_core.vector3 import axes_of, cross, norm, scale, turned
+from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.law import moment
 from perch_control.geometric.step import rotors_for
 from perch_control.monitors import Persistent
 from perch_control.settings import GeometricGains
-from perch_control.vector3 import axes_of, cross, norm, scale, turned
-from perch_core.vehicle import GRAVITY, Vehicle
 
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]
 _SETTLE_TIME = 0.3  # the change of thrust at the beginning is over [s]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from math import inf
 from typing import Any, Protocol
 
+from perch_core.vector3 import axes_of, axpy, norm
+from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import ControlOutput, packed_vehicle
@@ -19,8 +21,6 @@ from perch_control.reference import Following
 from perch_control.rotor_lag import RotorEstimate, thrusts
 from perch_control.settings import GeometricGains
 from perch_control.supervisor import Supervisor
-from perch_control.vector3 import axes_of, axpy, norm
-from perch_core.vehicle import Vehicle
 
 _AIRBORNE = 0.1              # so far above where it was armed, the ground no longer carries the vehicle [m]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground

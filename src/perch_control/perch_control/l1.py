@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import exp
 
-from perch_control.geometric.controller import packed_vehicle
-from perch_control.geometric.law import GRAVITY
-from perch_control.geometric.step import drag_compensation, wrench_of
-from perch_control.jit import scalar
-from perch_control.rotor_lag import RotorEstimate, thrusts
-from perch_control.vector3 import axes_of, axpy, cross, limited, scale, times
 from perch_core.config import quantity
-from perch_core.vehicle import Vehicle
+from perch_core.jit import compiled
+from perch_core.vector3 import axes_of, axpy, cross, limited, scale, times
+from perch_core.vehicle import GRAVITY, Vehicle
+from perch_control.geometric.controller import packed_vehicle
+from perch_control.geometric.step import drag_compensation, wrench_of
+from perch_control.rotor_lag import RotorEstimate, thrusts
 
 _ZERO = (0.0,) * 6
 _LONGEST_GAP = 0.01  # a longer time between samples starts the predictor anew [s]
@@ -36,7 +35,7 @@ class L1Settings:
     moment_max: float = quantity(60.0, unit="rad/s^2", low=0.0, doc="largest angular acceleration that is made up for")
 
 
-@scalar
+@compiled
 def model_rates(state, f, vehicle):
     """Accelerations of the model: in W, gravity and drag included, and angular in B; 6 floats. [M:eq1]"""
     mass, J = vehicle[0][0], vehicle[0][1:4]
@@ -49,7 +48,7 @@ def model_rates(state, f, vehicle):
     return (a[0], a[1], a[2], (Mx - gyro[0]) / J[0], (My - gyro[1]) / J[1], (Mz - gyro[2]) / J[2])
 
 
-@scalar
+@compiled
 def adapted(predicted, measured, filtered, decay, dt, bandwidths, bounds):
     """One adaptation: disturbance of the last period, and its filtered value, 6 floats each.
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from perch_core.vector3 import axes_of, axpy, norm, scale
+from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
@@ -14,8 +16,6 @@ from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
-from perch_control.vector3 import axes_of, axpy, norm, scale
-from perch_core.vehicle import GRAVITY, Vehicle
 
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import acos, degrees
 
+from perch_core.vector3 import axes_of, axpy, dot, norm
+from perch_core.vehicle import GRAVITY
 from perch_control.flight_settings import FlightSettings
 from perch_control.reference import Setpoint
-from perch_control.vector3 import axes_of, axpy, dot, norm
-from perch_core.vehicle import GRAVITY
 
 
 @dataclass

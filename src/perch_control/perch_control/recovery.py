@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import cos, radians, sin
 
+from perch_core.config import quantity
+from perch_core.vector3 import axes_of, axpy, dot, limited, norm, scale
+from perch_core.vehicle import GRAVITY
 from perch_control.guidance import horizontal
 from perch_control.reference import Setpoint
-from perch_control.vector3 import axes_of, axpy, dot, limited, norm, scale
-from perch_core.config import quantity
-from perch_core.vehicle import GRAVITY
 
 
 @dataclass(frozen=True)

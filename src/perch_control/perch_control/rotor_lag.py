@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import exp
 
-from perch_control.jit import scalar
+from perch_core.jit import compiled
 from perch_core.vehicle import Vehicle
 
 
-@scalar
+@compiled
 def approached(speed, target, share):
     """Speeds after the share `1 - exp(-t / tau)` of the way to their targets [rad/s], 4 floats."""
     return (
@@ -23,14 +23,14 @@ def approached(speed, target, share):
     )
 
 
-@scalar
+@compiled
 def thrusts(speed, coefficient):
     """Thrusts of rotor speeds [rad/s] -> [N], 4 floats."""
     return (coefficient * speed[0] * speed[0], coefficient * speed[1] * speed[1],
             coefficient * speed[2] * speed[2], coefficient * speed[3] * speed[3])
 
 
-@scalar
+@compiled
 def reachable(speed, share, speed_min, speed_max):
     """Lowest and highest speeds that the rotors can have after the lead time [rad/s], 4 floats each.
 
@@ -43,7 +43,7 @@ def reachable(speed, share, speed_min, speed_max):
              min(max(high[2], speed_min), speed_max), min(max(high[3], speed_min), speed_max)))
 
 
-@scalar
+@compiled
 def leading_command(speed, thrust, coefficient, share, speed_min, speed_max):
     """Commands with which the rotors have the wanted thrusts after the lead time, within their limits [rad/s], 4 floats."""
     a, b, c, d = thrust

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from perch_core.vector3 import axes_of, norm
 from perch_control.admission import AtEnd, Order
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import State
 from perch_control.monitors import Persistent, TrackingMonitor
 from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint
-from perch_control.vector3 import axes_of, norm
 
 _COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
 

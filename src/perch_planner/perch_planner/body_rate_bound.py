@@ -16,8 +16,8 @@ from math import cos, sin, sqrt
 
 import numpy as np
 
+from perch_core.jit import compiled
 from perch_planner.bounds import BELOW, UNDECIDED, VIOLATED, bernstein_row, cross, derivative, dot, product, split
-from perch_planner.compilation import compiled
 
 _DEPTH = 20
 _NODES = 3000

@@ -10,7 +10,7 @@ from math import comb
 
 import numpy as np
 
-from perch_planner.compilation import compiled
+from perch_core.jit import compiled
 
 ROUNDING = 1e-13
 """Enclosures are widened by this share of the largest coefficient."""

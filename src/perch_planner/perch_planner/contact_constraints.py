@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_planner.compilation import compiled
+from perch_core.jit import compiled
 from perch_planner.problem import PerchProblem, PerchSettings, contact_acceleration
 
 INSET = 1e-7

@@ -7,10 +7,10 @@ from math import cos, sin, sqrt
 import numpy as np
 
 from perch_core import bernstein
+from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
 from perch_planner.bounds import BELOW, VIOLATED, cross, derivative, dot, maximum, product, stays_below
-from perch_planner.compilation import compiled
 
 THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE = range(5)
 """Rows of the results; thrust is the specific thrust |a + g e3|."""

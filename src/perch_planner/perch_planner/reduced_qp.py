@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.jit import compiled
 from perch_planner.bounds import bernstein_row
-from perch_planner.compilation import compiled
 from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, GRAMS, HERMITE, TABLES
 
 

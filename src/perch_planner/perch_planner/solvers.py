@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_planner.compilation import compiled
+from perch_core.jit import compiled
 
 FEASIBILITY = 1e-6
 """Largest violation of a row of unit length that counts as solved."""

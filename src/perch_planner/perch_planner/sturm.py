@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core import bernstein
+from perch_core.jit import compiled
 from perch_planner.bounds import dot
-from perch_planner.compilation import compiled
 from perch_planner.plan_checks import specific_force
 
 

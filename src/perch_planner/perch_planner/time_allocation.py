@@ -6,8 +6,8 @@ from math import sqrt
 
 import numpy as np
 
+from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
-from perch_planner.compilation import compiled
 from perch_planner.problem import PerchProblem, PerchSettings
 
 CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_planner.compilation import compiled
+from perch_core.jit import compiled
 from perch_planner.reference_element import DEGREE
 
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.jit import compiled
 from perch_sim.body import PLATE_POINTS, Body
-from perch_sim.compiled import compiled
 from perch_sim.obstacles import Surfaces
 
 GRAVITY = 9.81

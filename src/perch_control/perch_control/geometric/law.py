@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from math import sqrt
 
-from perch_control.jit import scalar
-from perch_control.vector3 import axes_of, axpy, cross, dot, limited, norm, quaternion_of, quaternion_product, scale, times
+from perch_core.flatness import commanded_frame
+from perch_core.jit import compiled
+from perch_core.vector3 import axes_of, axpy, cross, dot, limited, norm, quaternion_of, quaternion_product, scale, times
+from perch_core.vehicle import GRAVITY
 
-GRAVITY = 9.81
-
-
-@scalar
+@compiled
 def position_feedback(e_p, e_v, k_p, k_v, bound):
     """Acceleration demanded by the errors, bounded, and whether the bound acts. [M:eq2]"""
     fb = axpy(-1.0, times(k_p, e_p), scale(-1.0, times(k_v, e_v)))
@@ -27,7 +26,7 @@ def position_feedback(e_p, e_v, k_p, k_v, bound):
     return fb, False
 
 
-@scalar
+@compiled
 def specific_force(a_ref, feedback, b3_body, tilt_tangent, floor):
     """Specific force f whose direction is the commanded b3, within a cone about the reference's thrust direction. [M:eq10]
 
@@ -53,45 +52,7 @@ def specific_force(a_ref, feedback, b3_body, tilt_tangent, floor):
     return axpy(along, axis, across), False, defined
 
 
-@scalar
-def direction_derivatives(f, df, ddf):
-    """Unit vector along f with its first and second derivative."""
-    n = norm(f)
-    k = 1.0 / n
-    u = scale(k, f)
-    dn = dot(u, df)
-    du = scale(k, axpy(-dn, u, df))
-    ddn = dot(du, df) + dot(u, ddf)
-    ddu = scale(k, axpy(-2.0 * dn, du, axpy(-ddn, u, ddf)))
-    return u, du, ddu
-
-
-@scalar
-def commanded_frame(f, df, ddf, h, dh, ddh):
-    """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [M:eq12, M:eq13]
-
-    Args:
-        f, df, ddf: specific force and its derivatives, |f| > 0.
-        h, dh, ddh: wanted direction of b2 (b2_des) and its derivatives; not parallel to f.
-
-    Returns:
-        b1, b2, b3 (columns of R_C), w_C and dw_C in the commanded frame [rad/s, rad/s^2].
-    """
-    b3, db3, ddb3 = direction_derivatives(f, df, ddf)
-    n = cross(h, b3)
-    dn = axpy(1.0, cross(dh, b3), cross(h, db3))
-    ddn = axpy(1.0, cross(ddh, b3), axpy(2.0, cross(dh, db3), cross(h, ddb3)))
-    b1, db1, ddb1 = direction_derivatives(n, dn, ddn)
-    b2 = cross(b3, b1)
-    # R' = R hat(w): b3' = R (wy, -wx, 0), b1' = R (0, wz, -wy); R'' = R (hat(w)^2 + hat(w')).
-    wx, wy, wz = -dot(b2, db3), dot(b1, db3), dot(b2, db1)
-    dwx = -dot(b2, ddb3) + wy * wz
-    dwy = dot(b1, ddb3) - wx * wz
-    dwz = dot(b2, ddb1) - wx * wy
-    return b1, b2, b3, (wx, wy, wz), (dwx, dwy, dwz)
-
-
-@scalar
+@compiled
 def attitude_error(q, q_C):
     """Attitude error e_R in B [rad], and the rotation q_e = q_C^-1 q. [M:eq2]
 
@@ -103,7 +64,7 @@ def attitude_error(q, q_C):
     return (k * e[0], k * e[1], k * e[2]), e
 
 
-@scalar
+@compiled
 def moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, dw_extra):
     """Moment in B. [M:eq2]
 
@@ -126,7 +87,7 @@ def moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, dw_extra):
     return axpy(1.0, times(J, demand), cross(w, Jw))
 
 
-@scalar
+@compiled
 def geometric_step(state, reference, thrust, extra, gains, limits, J):
     """Wanted specific thrust and moment. [M:eq2, M:eq12, M:eq13]
 

@@ -12,14 +12,14 @@ from math import exp
 
 import numpy as np
 
-from perch_control.geometric.law import commanded_frame
+from perch_core.flatness import commanded_frame
+from perch_core.jit import compiled
+from perch_core.vector3 import quaternion_of
+from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.geometric.step import control_step, drag_compensation, predicted
 from perch_control.guidance import Blend, Polynomial
-from perch_control.jit import scalar
 from perch_control.reference import packed_many
 from perch_control.rotor_lag import RotorEstimate, approached, thrusts
-from perch_control.vector3 import quaternion_of
-from perch_core.vehicle import GRAVITY, Vehicle
 
 _ROUNDS = 5
 _SPAN = 1.5     # the last part of the trajectory is rehearsed [s]
@@ -30,7 +30,7 @@ _CLOSE = 0.1    # the sum of both, with which the rounds end
 _LARGEST = 0.5  # an offset beyond this belongs to the planner [m, m/s]
 
 
-@scalar
+@compiled
 def flown(start, speed, table, gains, limits, narrow, window, lead, period, duration, vehicle):
     """State at the end of a flight of the geometric controller on the nominal vehicle; see `rehearse`."""
     state, command = start, speed

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from math import exp
 
+from perch_core.jit import compiled
+from perch_core.vector3 import axes_of, axpy, cross, dot, scale, times, turned
+from perch_core.vehicle import GRAVITY
 from perch_control.allocation import allocate
-from perch_control.geometric.law import GRAVITY, geometric_step
-from perch_control.jit import scalar
+from perch_control.geometric.law import geometric_step
 from perch_control.rotor_lag import approached, leading_command, reachable, thrusts
-from perch_control.vector3 import axes_of, axpy, cross, dot, scale, times, turned
 
 
-@scalar
+@compiled
 def wrench_of(f, forward):
     """Collective thrust and moments of rotor thrusts. [P:eq2]
 
@@ -28,7 +29,7 @@ def wrench_of(f, forward):
     )
 
 
-@scalar
+@compiled
 def predicted(state, f, extra, duration, mass, J, forward):
     """State after a short time under constant rotor thrusts. [M:eq1]
 
@@ -57,7 +58,7 @@ def predicted(state, f, extra, duration, mass, J, forward):
     return (p1[0], p1[1], p1[2], v1[0], v1[1], v1[2], q1[0], q1[1], q1[2], q1[3], w1[0], w1[1], w1[2])
 
 
-@scalar
+@compiled
 def drag_compensation(q, v, drag, extra):
     """`extra` with what makes up for the rotor drag `drag` (per mass, axes of B) [1/s] at a velocity in W added."""
     b1, b2, b3 = axes_of(q)
@@ -65,7 +66,7 @@ def drag_compensation(q, v, drag, extra):
     return (extra[0] + d[0], extra[1] + d[1], extra[2] + d[2], extra[3], extra[4], extra[5])
 
 
-@scalar
+@compiled
 def rotors_for(wrench, speed, vehicle, lead):
     """Rotor commands that reach a wrench after the lead time, tilt before thrust before yaw.
 
@@ -90,7 +91,7 @@ def rotors_for(wrench, speed, vehicle, lead):
     return leading_command(speed, f, coefficient, share, speed_min, speed_max), f
 
 
-@scalar
+@compiled
 def control_step(state, reference, speed, command, extra, gains, limits, lead, vehicle):
     """One control period. [M:eq2]
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_control.jit import COMPILED, scalar
+from perch_core.jit import COMPILED, compiled
 
 
-@scalar
+@compiled
 def unpack(results, X, A, B, c, Q, q):
     """Distribute the stage function's results, matrices by columns, into arrays; c are the defects."""
     nodes, n = X.shape
@@ -39,7 +39,7 @@ def unpack(results, X, A, B, c, Q, q):
             q[k, i] = o[p + i]
 
 
-@scalar
+@compiled
 def condense_loops(A, B, c, Q, q, r, R, dx0, H, h, xi, G):
     """H and h of the condensed QP, the free response xi and the input-to-state matrices G.
 
@@ -145,7 +145,7 @@ def condense_matrices(A, B, c, Q, q, r, R, dx0, H, h, xi, G) -> None:
 condense = condense_loops if COMPILED else condense_matrices
 
 
-@scalar
+@compiled
 def expand_loops(A, B, c, dx0, du, X, U):
     """Add the QP's solution to the trajectory: inputs, and states by the linearised dynamics."""
     N, n = c.shape

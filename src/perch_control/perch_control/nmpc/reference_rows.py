@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from perch_control.geometric.law import GRAVITY, commanded_frame
-from perch_control.jit import scalar
-from perch_control.vector3 import axpy, cross, norm, quaternion_of, scale, times
+from perch_core.flatness import commanded_frame
+from perch_core.jit import compiled
+from perch_core.vector3 import axpy, cross, norm, quaternion_of, scale, times
+from perch_core.vehicle import GRAVITY
 
 PERIOD = 0.002
 _KEPT = 4096
 
 
-@scalar
+@compiled
 def reference_row(x, floor, vehicle):
     """p, q, v, w and rotor thrusts of a setpoint, 17 floats. [M:eq9-13]
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from perch_perception.ukf.compiled import compiled
+from perch_core.jit import compiled
 
 _GRAVITY = 9.81  # numba freezes globals: equal to perch_core.vehicle.GRAVITY, which a test asserts
 

@@ -14,10 +14,10 @@ from filterpy.kalman import MerweScaledSigmaPoints
 
 from perch_core import so3
 from perch_core.errors import PerchError
+from perch_core.jit import COMPILED
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import kernels
 from perch_perception.ukf import layout as at
-from perch_perception.ukf.compiled import COMPILED
 from perch_perception.ukf.config import UkfConfig
 
 # columns of a run of IMU steps

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_perception.ukf.compiled import compiled
+from perch_core.jit import compiled
 
 
 @dataclass(frozen=True)

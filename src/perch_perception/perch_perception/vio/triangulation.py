@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from perch_perception.ukf.compiled import compiled
+from perch_core.jit import compiled
 
 
 @compiled

@@ -7,46 +7,46 @@ from __future__ import annotations
 
 from math import cos, sin, sqrt
 
-from perch_control.jit import scalar
+from perch_core.jit import compiled
 
 
-@scalar
+@compiled
 def dot(a, b):
     """Scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@scalar
+@compiled
 def cross(a, b):
     """Vector product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@scalar
+@compiled
 def axpy(s, a, b):
     """`s a + b`."""
     return (s * a[0] + b[0], s * a[1] + b[1], s * a[2] + b[2])
 
 
-@scalar
+@compiled
 def scale(s, a):
     """`s a`."""
     return (s * a[0], s * a[1], s * a[2])
 
 
-@scalar
+@compiled
 def times(a, b):
     """Product by component, a diagonal matrix times a vector."""
     return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
 
 
-@scalar
+@compiled
 def norm(a):
     """Euclidean length."""
     return sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 
 
-@scalar
+@compiled
 def limited(a, bound):
     """The vector, shortened to a length of at most `bound`."""
     n = norm(a)
@@ -55,7 +55,7 @@ def limited(a, bound):
     return (a[0], a[1], a[2])
 
 
-@scalar
+@compiled
 def axes_of(q):
     """Columns b1, b2, b3 of the rotation matrix of a unit quaternion xyzw."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -66,7 +66,7 @@ def axes_of(q):
     )
 
 
-@scalar
+@compiled
 def quaternion_product(a, b):
     """Hamilton product of quaternions xyzw."""
     return (
@@ -77,7 +77,7 @@ def quaternion_product(a, b):
     )
 
 
-@scalar
+@compiled
 def turned(q, phi):
     """Unit quaternion of `q` followed by the rotation vector `phi` in the body's axes [rad]."""
     angle = norm(phi)
@@ -87,7 +87,7 @@ def turned(q, phi):
     return (n * out[0], n * out[1], n * out[2], n * out[3])
 
 
-@scalar
+@compiled
 def quaternion_of(b1, b2, b3):
     """Unit quaternion xyzw, w >= 0, of the rotation with columns b1, b2, b3: the best conditioned of Shepperd's forms."""
     trace = b1[0] + b2[1] + b3[2]

@@ -1,0 +1,63 @@
+"""Kernels are written once: numba compiles them where it is installed, the interpreter runs them where it is not.
+
+Compiled code is cached beside its source, so that only the first process of a checkout pays for it. PERCH_NUMBA=0 turns
+compilation off: the same results to rounding, many times slower.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+Kernel = TypeVar("Kernel", bound=Callable)
+
+try:
+    if os.environ.get("PERCH_NUMBA") == "0":
+        raise ImportError
+    from numba import njit
+except ImportError:
+    njit = None
+
+COMPILED = njit is not None
+
+
+@lru_cache(maxsize=None)
+def _stamp(package: Path) -> str:
+    """Hash of every file with kernels in a package and in this one."""
+    digest = hashlib.sha256()
+    for folder in sorted({package, Path(__file__).parent}):
+        for path in sorted(folder.rglob("*.py")):
+            text = path.read_bytes()
+            if b"@compiled" in text:
+                digest.update(text)
+    return digest.hexdigest()
+
+
+def _package(file: Path) -> Path:
+    """The outermost package that holds a file."""
+    folder = file.parent
+    while (folder.parent / "__init__.py").exists():
+        folder = folder.parent
+    return folder
+
+
+def compiled(kernel: Kernel) -> Kernel:
+    """Decorator: the kernel compiled by numba with an on-disk cache, or the kernel itself.
+
+    Without `fastmath`: results must not depend on how a compiler groups a sum. The plain function stays reachable as
+    `.py_func` either way. A kernel may call kernels of its own package and of perch_core.
+    """
+    if njit is None:
+        kernel.py_func = kernel
+        return kernel
+    out = njit(cache=True, error_model="numpy")(kernel)
+    # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
+    # unseen. The hash of all sources with kernels takes the place of that file's date.
+    index = getattr(getattr(out, "_cache", None), "_cache_file", None)
+    if hasattr(index, "_source_stamp"):
+        index._source_stamp = _stamp(_package(Path(kernel.__code__.co_filename)))
+    return out
