@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from perch_msgs.msg import PowerlineArray
 
 from perch_control.admission import AtEnd
 from perch_control.mission import (
-    Command, ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Outcome, PlanAnswer, State, Target)
+    Command, ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Outcome, PlanAnswer, State, Target)
+from perch_control.ros.powerline_map import mapped_target
+from perch_core.ros.trajectories import from_message
 from perch_core.scenario import Scenario
 from perch_core.trajectory import FlatTrajectory
 from perch_eval.in_process.estimation import Odometry
 from perch_eval.in_process.piloting import FlownTrajectory, PilotStatus
-from perch_eval.in_process.planning import Planning
+from perch_eval.in_process.planning import Planning, PowerlinePlanning
 from perch_eval.in_process.stamps import published, seconds
 from perch_perception.ukf import Health, ImuSample, Status
 
@@ -21,16 +26,21 @@ TICK_STEPS = 10
 def goal_of(scenario: Scenario) -> Goal:
     """The goal that a scenario's mission part describes; as `perch_eval.pilot.goal_of` sends it."""
     mission = scenario.mission
-    return Goal(mission.takeoff_height, mission.search_timeout, replan=mission.replan, attempts=max(1, mission.attempts))
+    powerline = scenario.mode == "powerline"
+    return Goal(mission.takeoff_height, mission.search_timeout, mode=Mode.POWERLINE if powerline else Mode.SURFACE,
+                perch_point=np.array(mission.perch_point) if powerline else np.zeros(3),
+                perch_pitch=math.radians(mission.perch_pitch_deg), perception_aware=mission.perception_aware,
+                replan=mission.replan, attempts=max(1, mission.attempts))
 
 
 class Commanding:
     """Owns the mission's machine and its view of the world."""
 
-    def __init__(self, settings: MissionSettings, planning: Planning, goal: Goal) -> None:
+    def __init__(self, settings: MissionSettings, planning: Planning | PowerlinePlanning, goal: Goal) -> None:
         self._settings, self._planning, self._goal = settings, planning, goal
         self._machine = MissionMachine(settings)
         self._target: Target | None = None
+        self._map: PowerlineArray | None = None
         self._estimator: Status | None = None
         self._imu: list[tuple[float, float, float]] = []
         self._pending: tuple[float, PlanAnswer] | None = None
@@ -38,9 +48,12 @@ class Commanding:
         self.outcome: Outcome | None = None
         self.phases: list[tuple[float, str, str]] = []  # (time [s], phase, message) whenever they change
 
-    def take(self, target: Target) -> None:
-        """A target that counts from this step on."""
-        self._target = target
+    def take(self, sighting: Target | PowerlineArray) -> None:
+        """A target, or a map of powerlines, that counts from this step on."""
+        if isinstance(sighting, Target):
+            self._target = sighting
+        else:
+            self._map = sighting
 
     def hear(self, estimator: Status) -> None:
         """The estimator's health, at every 50th step."""
@@ -60,11 +73,14 @@ class Commanding:
         if self._pending is not None and time >= self._pending[0] - 1e-9:
             answer, self._pending = self._pending[1], None
         e, estimator = odometry.estimate, self._estimator
+        target = self._target
+        if self._goal.mode is Mode.POWERLINE:
+            target = mapped_target(self._map, self._goal, e.p_WB) if self._map is not None else None
         outputs = self._machine.tick(Inputs(
             time=time, state=State(e.p_WB, e.q_WB, odometry.v_WB, e.w_WB_B),
             estimator_ready=estimator is not None and estimator.health is Health.RUNNING,
             controller=ControllerState(status.state), controller_message=status.message,
-            trajectory_id=status.trajectory_id, trajectory_time=status.trajectory_time, target=self._target,
+            trajectory_id=status.trajectory_id, trajectory_time=status.trajectory_time, target=target,
             specific_force_B=np.array(self._imu).reshape(-1, 3), plan=answer, cancel=cancel))
         self._imu.clear()
         published_items: list[tuple[Command, str] | FlownTrajectory] = list(outputs.commands)
@@ -73,14 +89,23 @@ class Commanding:
             flat = FlatTrajectory(flat.durations, flat.coefficients, published(flat.start_time))
             published_items.append(FlownTrajectory(outputs.trajectory_id, flat, AtEnd.HOLD))
         if outputs.perch is not None:
-            published_items.append(FlownTrajectory(outputs.trajectory_id, outputs.perch.trajectory, AtEnd.CONTACT,
-                                                   float(self._settings.contact_time)))
+            published_items.append(self._flown(outputs.trajectory_id, outputs.perch))
         if outputs.query is not None:
-            self._pending = (time + self._settings.planner_latency, self._planning.answer(outputs.query))
+            settings = self._settings
+            latency = settings.powerline_latency if self._goal.mode is Mode.POWERLINE else settings.planner_latency
+            self._pending = (time + latency, self._planning.answer(outputs.query))
         if outputs.outcome is not None:
             self.outcome = outputs.outcome
         self._note(time)
         return published_items
+
+    def _flown(self, id: int, plan: PlanAnswer) -> FlownTrajectory:
+        """A planned perch as it is published."""
+        contact_time = float(self._settings.contact_time)
+        if self._goal.mode is Mode.SURFACE:
+            return FlownTrajectory(id, plan.trajectory, AtEnd.CONTACT, contact_time)
+        msg = plan.trajectory
+        return FlownTrajectory(id, from_message(msg), AtEnd(msg.at_end), contact_time, msg.recovery_start)
 
     def _note(self, time: float) -> None:
         now = (self._machine.phase.value, self._machine.message)

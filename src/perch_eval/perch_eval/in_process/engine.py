@@ -12,25 +12,30 @@ import numpy as np
 
 from perch_control.modes import Command, StepResult
 from perch_control.parameters import ControllerParameters
+from perch_control.mission import Target
 from perch_control.mission.parameters import MissionParameters
+from perch_core.camera import CameraMount
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 from perch_core.tag_board import load_board
 from perch_eval.in_process.commanding import TICK_STEPS, Commanding, goal_of
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
 from perch_eval.in_process.estimation import Estimation, Odometry
+from perch_eval.in_process.line_source import LineSource
 from perch_eval.in_process.mailbox import Mailbox
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.piloting import STATUS_STEPS, FlownTrajectory, Piloting, PilotStatus
-from perch_eval.in_process.planning import Planning
+from perch_eval.in_process.planning import Planning, PowerlinePlanning
 from perch_eval.in_process.stamps import SECOND, seconds
 from perch_eval.in_process.target_source import ModelledSight, RenderedSight, TargetSource
 from perch_eval.in_process.trace import FlightTrace
 from perch_eval.in_process.vio_source import MEMORY, ModelledVio, RenderedVio
+from perch_perception.powerline_mapper_node import PowerlineMapperConfig
 from perch_perception.target_localizer_node import TargetLocalizerConfig
 from perch_perception.ukf import ImuSample, UkfConfig
 from perch_perception.vio_node import VioNodeConfig
 from perch_planner.perching_planner_node import PerchingPlannerParameters
+from perch_planner.powerline_planner_node import PowerlinePlannerParameters
 from perch_sim import seeding
 from perch_sim.calibration import true_mount
 from perch_sim.camera_stream import Delivery
@@ -66,32 +71,35 @@ class _Flight:
     """One flight in the making."""
 
     def __init__(self, scenario: Scenario, seed: int, sensing: Sensing, pool: ThreadPoolExecutor | None) -> None:
-        if scenario.mode != "surface":
+        powerline = scenario.mode == "powerline"
+        if scenario.mode not in ("surface", "powerline"):
             raise PerchError(f"scenario {scenario.name}: mode {scenario.mode!r} is not flown by the in-process engine")
+        if powerline and sensing.target != "rendered":
+            raise PerchError(f"scenario {scenario.name}: powerlines have no error model; sensing.target must be rendered")
         params = NodeParameters(scenario, seed)
         self.scenario = scenario
         self.simulation = Simulation(scenario, seed, sensing.cameras, pool)
         vehicle = self.simulation.vehicle
         self.latency = {t.node: round(t.latency * 1e9)
-                        for t in triggers(("vio", "target_localizer", "mission"), scenario.latency)}
+                        for t in triggers(("vio", "target_localizer", "powerline_mapper", "mission"), scenario.latency)}
+        self.finder = "powerline_mapper" if powerline else "target_localizer"
         down, front = vehicle.mounts["down"], vehicle.mounts["front"]
         if sensing.vio == "model":
             self.vio = ModelledVio(params.of("vio_model", VioModelParameters), down)
         else:
             self.vio = RenderedVio(params.of("vio", VioNodeConfig), down, vehicle.perch_offset)
-        localizer = params.of("target_localizer", TargetLocalizerConfig)
-        board = load_board(localizer.board)
-        if sensing.target == "model":
-            true = true_mount(front, seeding.stream(seed, "calibration_front")) if scenario.realism == "default" else front
-            sight = ModelledSight(board, front, true, localizer, seeding.stream(seed, "tag_corners"))
+        if powerline:
+            self.target = LineSource(params.of("powerline_mapper", PowerlineMapperConfig), front)
         else:
-            sight = RenderedSight(board, front, localizer)
-        self.target = TargetSource(sight, front, localizer)
+            self.target = _target_source(scenario, seed, sensing, params.of("target_localizer", TargetLocalizerConfig), front)
         self.estimation = Estimation(params.of("estimator", UkfConfig))
         controller = params.of("controller", ControllerParameters)
         self.piloting = Piloting(controller, vehicle)
         self.reference_period = controller.controller.reference_period
-        planning = Planning(params.of("perching_planner", PerchingPlannerParameters), vehicle)
+        if powerline:
+            planning = PowerlinePlanning(params.of("powerline_planner", PowerlinePlannerParameters))
+        else:
+            planning = Planning(params.of("perching_planner", PerchingPlannerParameters), vehicle)
         self.commanding = Commanding(params.of("mission", MissionParameters).mission, planning, goal_of(scenario))
         self.trace = FlightTrace(self.simulation.pad)
         self.poses, self.sightings, self.orders = Mailbox(), Mailbox(), Mailbox()
@@ -115,9 +123,9 @@ class _Flight:
         result = self._control(time, imu, odometry, stamp)
         if index % STATUS_STEPS == 0:
             self.status = self.piloting.status
-        for target in self.sightings.released(stamp):
-            self.commanding.take(target)
-            self.trace.targets.append((time, target))
+        for sighting in self.sightings.released(stamp):
+            self.commanding.take(sighting)
+            (self.trace.targets if isinstance(sighting, Target) else self.trace.maps).append((time, sighting))
         if index % HEALTH_STEPS == 0:
             health = self.estimation.status
             self.piloting.hear(health)
@@ -147,7 +155,7 @@ class _Flight:
 
     def _look(self, stamp: int) -> None:
         """Take the frames that arrive at this step, and give those that can be answered to their consumers."""
-        for name, node in (("down", "vio"), ("front", "target_localizer")):
+        for name, node in (("down", "vio"), ("front", self.finder)):
             camera = self.simulation.cameras[name]
             if camera.due(stamp) is not None:
                 self.frames[name].append(camera.take())
@@ -187,11 +195,21 @@ class _Flight:
                 self.trace.commands.append((time, int(item[0]), item[1]))
 
 
+def _target_source(scenario: Scenario, seed: int, sensing: Sensing, localizer: TargetLocalizerConfig,
+                   front: CameraMount) -> TargetSource:
+    """What sees the pad, by its error model or on rendered images."""
+    board = load_board(localizer.board)
+    if sensing.target == "rendered":
+        return TargetSource(RenderedSight(board, front, localizer), front, localizer)
+    true = true_mount(front, seeding.stream(seed, "calibration_front")) if scenario.realism == "default" else front
+    return TargetSource(ModelledSight(board, front, true, localizer, seeding.stream(seed, "tag_corners")), front, localizer)
+
+
 def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: float = 0.0) -> FlightTrace:
     """Fly a scenario once.
 
     Args:
-        scenario: what is flown, mode `surface`.
+        scenario: what is flown, mode `surface` or `powerline`.
         seed: of everything that is random; the same seed gives the same flight to the last bit.
         sensing: which cameras are rendered.
         linger: flown on after the goal's end [s].

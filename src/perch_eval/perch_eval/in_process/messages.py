@@ -12,7 +12,8 @@ from perch_msgs.msg import (
 
 from perch_core import so3
 from perch_core.ros.conversions import fill_odometry, to_pose, to_stamp, to_vector
-from perch_core.ros.trajectories import flat_message
+from perch_core.ros.trajectories import flat_message, sampled_message
+from perch_core.trajectory import FlatTrajectory
 from perch_eval.in_process.stamps import stamp_of
 from perch_eval.in_process.trace import ESTIMATE, TRUTH, FlightTrace
 
@@ -41,11 +42,15 @@ def events(trace: FlightTrace) -> Iterator[tuple[str, int, Any]]:
             tangential_speed=float(event.tangential_speed), tilt_error=float(event.tilt_error), offset=float(event.offset),
             reason=event.reason), event.time)
     for time, flown in trace.trajectories:
-        msg: Trajectory = flat_message(flown.trajectory)
+        flat = isinstance(flown.trajectory, FlatTrajectory)
+        msg: Trajectory = flat_message(flown.trajectory) if flat else sampled_message(flown.trajectory)
         msg.id, msg.at_end, msg.contact_time = flown.id, int(flown.at_end), float(flown.contact_time)
+        msg.recovery_start = float(flown.recovery_start)
         yield "trajectory", stamp_of(time), msg
     for time, code, reason in trace.commands:
         yield "controller/command", stamp_of(time), _stamped(ControllerCommand(command=code, reason=reason), time)
+    for time, lines in trace.maps:
+        yield "powerlines", stamp_of(time), lines
     for time, target in trace.targets:
         msg = PoseWithCovarianceStamped()
         msg.pose.pose = to_pose(target.p_WS, target.q_WS)

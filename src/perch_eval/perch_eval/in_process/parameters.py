@@ -12,7 +12,8 @@ from perch_eval.node_launch import node_launches
 
 T = TypeVar("T")
 
-FLOWN = ("vio_model", "vio", "estimator", "target_localizer", "perching_planner", "controller", "mission")
+FLOWN = ("vio_model", "vio", "estimator", "target_localizer", "powerline_mapper", "perching_planner", "powerline_planner",
+         "controller", "mission")
 
 
 class NodeParameters:

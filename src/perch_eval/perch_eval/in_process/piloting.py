@@ -11,9 +11,9 @@ from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, StepResult
 from perch_control.nmpc import NmpcController
 from perch_control.parameters import ControllerParameters
-from perch_control.reference import FlatReference
+from perch_control.reference import FlatReference, SampledReference
 from perch_core.errors import PerchError
-from perch_core.trajectory import FlatTrajectory
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import Vehicle
 from perch_eval.in_process.estimation import Odometry
 from perch_perception.ukf import ImuSample, Status
@@ -26,9 +26,10 @@ class FlownTrajectory:
     """A trajectory as published: `perch_msgs/Trajectory` without ROS."""
 
     id: int
-    trajectory: FlatTrajectory
+    trajectory: FlatTrajectory | SampledTrajectory
     at_end: AtEnd
     contact_time: float = 0.0
+    recovery_start: float = -1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,7 @@ class Piloting:
     """Owns the flight controller."""
 
     def __init__(self, params: ControllerParameters, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
         gains = params.gain_set(vehicle.name)
         geometric = GeometricController(vehicle, gains)
         self._flight = FlightController(vehicle, geometric, gains, params.flight)
@@ -62,9 +64,11 @@ class Piloting:
 
     def follow(self, order: FlownTrajectory) -> None:
         """A trajectory that counts from this step on."""
+        flat = isinstance(order.trajectory, FlatTrajectory)
+        source = FlatReference(order.trajectory) if flat else SampledReference(order.trajectory, self._vehicle.mass)
         try:
-            self._flight.follow(Order(order.id, FlatReference(order.trajectory), order.trajectory.start_time, order.at_end,
-                                      order.contact_time, -1.0))
+            self._flight.follow(Order(order.id, source, order.trajectory.start_time, order.at_end, order.contact_time,
+                                      order.recovery_start))
         except PerchError as error:
             self._flight.maneuvers.message = f"trajectory {order.id} refused: {error}"
 

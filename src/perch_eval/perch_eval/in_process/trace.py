@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from perch_msgs.msg import PowerlineArray
 
 from perch_control.mission import Target
 from perch_core.surface import PerchSurface
@@ -34,6 +35,7 @@ class FlightTrace:
         trajectories: (time of publication [s], trajectory) in order.
         commands: (time [s], code, reason) of the mission's commands.
         targets: (time from which it counts [s], target).
+        maps: (time from which it counts [s], map of powerlines).
         vio: poses in the order they counted.
         pad: the true pad at the end.
         phases: (time [s], phase, message) of the mission.
@@ -55,6 +57,7 @@ class FlightTrace:
     trajectories: list[tuple[float, FlownTrajectory]] = field(default_factory=list)
     commands: list[tuple[float, int, str]] = field(default_factory=list)
     targets: list[tuple[float, Target]] = field(default_factory=list)
+    maps: list[tuple[float, PowerlineArray]] = field(default_factory=list)
     vio: list[tuple[float, VioPose]] = field(default_factory=list)
     phases: list[tuple[float, str, str]] = field(default_factory=list)
     estimator: list[tuple[float, Status]] = field(default_factory=list)
