@@ -63,7 +63,7 @@ def pose_arrays(pose: Pose) -> tuple[np.ndarray, np.ndarray]:
     return to_array(pose.position), quaternion_array(pose.orientation)
 
 
-def _turned(q: Sequence[float], v: Sequence[float], sign: float) -> tuple[float, float, float]:
+def turned(q: Sequence[float], v: Sequence[float], sign: float) -> tuple[float, float, float]:
     """`v` rotated by `q` (sign +1) or by its inverse (-1), in plain floats: 2 us, where numpy needs 35 at every 2 ms step."""
     x, y, z, w = sign * q[0], sign * q[1], sign * q[2], q[3]
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
@@ -83,7 +83,7 @@ def fill_odometry(msg: Odometry, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.nd
         w_WB_B: angular velocity in B [rad/s], shape (3,).
     """
     p_WB, q_WB, w_WB_B = (np.asarray(x, float).tolist() for x in (p_WB, q_WB, w_WB_B))
-    v_B = _turned(q_WB, np.asarray(v_WB, float).tolist(), -1.0)
+    v_B = turned(q_WB, np.asarray(v_WB, float).tolist(), -1.0)
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
     p.x, p.y, p.z = p_WB
     q.x, q.y, q.z, q.w = q_WB
@@ -96,4 +96,4 @@ def odometry_arrays(msg: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     """`p_WB, q_WB (xyzw), v_WB (in W), w_WB_B` of an odometry message."""
     p, q = pose_arrays(msg.pose.pose)
     o, v = msg.pose.pose.orientation, msg.twist.twist.linear
-    return p, q, np.array(_turned((o.x, o.y, o.z, o.w), (v.x, v.y, v.z), 1.0)), to_array(msg.twist.twist.angular)
+    return p, q, np.array(turned((o.x, o.y, o.z, o.w), (v.x, v.y, v.z), 1.0)), to_array(msg.twist.twist.angular)
