@@ -21,7 +21,7 @@ from perch_control.flight import FlightController
 from perch_control.geometric import GeometricController
 from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, StepResult
-from perch_control.nmpc import NmpcController
+from perch_control.nmpc import NmpcController, chosen_lines
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference, SampledReference
 from perch_core.errors import ConfigError, PerchError
@@ -127,8 +127,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         if self._nmpc is None or msg.degenerate:
             return
         segments = [Segment.between(to_array(line.start), to_array(line.end), float(line.radius), line.id) for line in msg.lines]
-        segments.sort(key=lambda s: float(s.distance(np.array(self._flight.maneuvers.belief[0:3]))))
-        self._nmpc.lines(tuple((*s.centre.tolist(), *s.direction.tolist(), s.half_length, s.radius) for s in segments))
+        self._nmpc.lines(chosen_lines(segments, np.array(self._flight.maneuvers.belief[0:3]), self.params.nmpc.lines.watched))
 
     def _receive_estimator(self, msg: EstimatorStatus) -> None:
         self._flight.supervisor.estimator(msg.state, float(msg.vio_age), msg.message)

@@ -130,6 +130,23 @@ class Mission:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Waypoint:
+    """A place on the way of an inspection."""
+
+    position: Vector3 = quantity(unit="m", doc="in map")
+    yaw_deg: float = quantity(0.0, unit="deg", low=-180.0, high=180.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """The reference of an inspection: straight lines from waypoint to waypoint, at rest at each."""
+
+    waypoints: tuple[Waypoint, ...] = quantity(())
+    speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0, doc="mean speed between waypoints")
+    watched: Vector3 = quantity((0.0, 0.0, 0.0), unit="m", doc="rough point on the cable to keep in view, in map")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scenario:
     """A flight that can be repeated from its file and a seed."""
 
@@ -145,6 +162,7 @@ class Scenario:
     disturbance: Disturbance = part(Disturbance)
     adhesion: Adhesion = part(Adhesion)
     grip: Grip = part(Grip)
+    inspection: Inspection = part(Inspection)
     latency: Latency = part(Latency)
     mission: Mission = part(Mission)
     time_limit: float = quantity(40.0, unit="s", above=0.0, high=600.0, doc="simulated time after which the flight has failed")
@@ -161,6 +179,8 @@ class Scenario:
                 raise ConfigError("", f"parameters.{node}", f"is not one of {', '.join(NODES)}")
         if self.mode == "surface":
             self._check_target()
+        if self.mode == "inspection" and len(self.inspection.waypoints) < 2:
+            raise ConfigError("", "inspection.waypoints", f"has {len(self.inspection.waypoints)} entries, needs at least 2")
 
     def _check_target(self) -> None:
         p = self.surface.p_WS

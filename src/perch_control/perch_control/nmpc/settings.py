@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from perch_core.config import part, quantity
+from perch_core.errors import ConfigError
 
 Vector3 = tuple[float, float, float]
 
@@ -18,6 +19,11 @@ class LineWeights:
     collision: float = quantity(0.0, low=0.0, doc="clearance from every line [P:eq7]")
     margin: float = quantity(0.3, unit="-", low=0.0, doc="scaled clearance below which the collision term acts")
     ramp_time: float = quantity(3.0, unit="s", low=0.0, doc="the terms grow to their weights over this time")
+    watched: tuple[float, ...] = quantity((), unit="m", doc="rough point in map on the line to keep in view (x, y, z); empty: the nearest line")
+
+    def __post_init__(self) -> None:
+        if len(self.watched) not in (0, 3):
+            raise ConfigError("", "watched", f"has {len(self.watched)} entries, needs 3 (x, y, z), or none")
 
     @property
     def any(self) -> bool:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from perch_control.admission import AtEnd, Order
 from perch_control.flight import FlightController
 from perch_control.geometric import GeometricController
 from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, StepResult
-from perch_control.nmpc import NmpcController
+from perch_control.nmpc import NmpcController, chosen_lines
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference, SampledReference
 from perch_core.errors import PerchError
+from perch_core.lines import Segment
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import Vehicle
 from perch_eval.in_process.estimation import Odometry
@@ -52,8 +56,11 @@ class Piloting:
         self._flight = FlightController(vehicle, geometric, gains, params.flight)
         if params.controller.adaptive:
             self._flight.compensator = L1Augmentation(vehicle, params.l1)
+        self._watched = params.nmpc.lines.watched
+        self._nmpc: NmpcController | None = None
         if params.controller.type == "nmpc":
-            self._flight.use(NmpcController(vehicle, params.nmpc, geometric), gains, params.flight)
+            self._nmpc = NmpcController(vehicle, params.nmpc, geometric)
+            self._flight.use(self._nmpc, gains, params.flight)
 
     def command(self, command: Command, reason: str) -> None:
         """A command that counts from this step on."""
@@ -76,6 +83,11 @@ class Piloting:
         """The motor command of a step."""
         self._flight.imu(time, imu.w_B, imu.f_B)
         return self._flight.step(time, odometry.sample)
+
+    def see(self, lines: Sequence[Segment]) -> None:
+        """The map of powerlines, for the line terms of the NMPC."""
+        if self._nmpc is not None and self._nmpc.settings.lines.any:
+            self._nmpc.lines(chosen_lines(lines, np.array(self._flight.maneuvers.belief[0:3]), self._watched))
 
     def hear(self, estimator: Status) -> None:
         """The estimator's health, at every 50th step."""

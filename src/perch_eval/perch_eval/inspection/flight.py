@@ -1,0 +1,187 @@
+"""One inspection, flown by the algorithm cores: plant, IMU, VIO model, UKF, NMPC; no ROS. [P:VI-A]
+
+The controller knows the state that the estimator has and a map with an error; truth enters through the sensors' models alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_control.admission import AtEnd
+from perch_control.modes import Command, State
+from perch_control.parameters import ControllerParameters
+from perch_core.errors import PerchError
+from perch_core.lines import Segment
+from perch_core.scenario import Scenario
+from perch_core.trajectory import rest_to_rest
+from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
+from perch_eval.in_process.estimation import Estimation
+from perch_eval.in_process.mailbox import Mailbox
+from perch_eval.in_process.parameters import NodeParameters
+from perch_eval.in_process.piloting import FlownTrajectory, Piloting
+from perch_eval.in_process.stamps import seconds
+from perch_eval.in_process.vio_source import ModelledVio
+from perch_eval.inspection.layout import segments, watched
+from perch_eval.inspection.measures import Judgement, judge, reference_of, reference_states
+from perch_perception.ukf import Health, ImuSample, UkfConfig
+from perch_sim import seeding
+from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.plant import PERIOD
+from perch_sim.simulation import Simulation
+from perch_sim.vio_model import VioModelParameters
+
+MAP_ERROR = 0.02   # 1 sigma of each axis of both ends of a mapped line [m]; the mapper's bar is 3 cm
+MAP_STEPS = 50     # the map is published at 10 Hz
+LEAD = 0.04        # from an order to its start [s]
+SETTLE = 1.0       # hover before the line terms begin [s]
+RECORD = 5         # every so many steps
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """A flown inspection beside its reference.
+
+    Attributes:
+        times: since the start of the reference [s], shape (n,).
+        states: true p, q, v, w, shape (n, 13).
+        flown: the flight, judged by the true lines.
+        reference_times, reference_states, reference: the same of the waypoint lines, as if flown exactly.
+        lines, line: the true lines, and the watched one.
+        contacts: what the plant reports.
+        message: why the flight ended early; empty: it came to its end.
+    """
+
+    times: np.ndarray
+    states: np.ndarray
+    flown: Judgement
+    reference_times: np.ndarray
+    reference_states: np.ndarray
+    reference: Judgement
+    lines: list[Segment]
+    line: Segment
+    contacts: list[ContactEvent]
+    message: str
+
+    @property
+    def collisions(self) -> int:
+        """Of the flight, by the plant or by the geometry of the recorded states, whichever counts more."""
+        return max(self.flown.collisions, sum(c.state is ContactState.COLLISION for c in self.contacts))
+
+
+def mapped(lines: list[Segment], rng: np.random.Generator) -> list[Segment]:
+    """Lines as a mapper finds them: each end is off by `MAP_ERROR`."""
+    return [Segment.between(*(end + MAP_ERROR * rng.normal(size=3) for end in line.ends), line.radius, line.id) for line in lines]
+
+
+class _Flight:
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        params = NodeParameters(scenario, seed)
+        self.simulation = Simulation(scenario, seed)
+        mount = self.simulation.vehicle.mounts["down"]
+        self.vio = ModelledVio(params.of("vio_model", VioModelParameters), mount)
+        self.latency = round(scenario.latency.vio * 1e9)
+        self.estimation = Estimation(params.of("estimator", UkfConfig))
+        self.piloting = Piloting(params.of("controller", ControllerParameters), self.simulation.vehicle)
+        self.poses: Mailbox = Mailbox()
+        self.waiting: deque = deque()
+        self.map: list[Segment] = []
+        self.index = 0
+        self.contacts: list[ContactEvent] = []
+        self.rows: list[tuple[float, ...]] = []
+
+    @property
+    def time(self) -> float:
+        return seconds(self.simulation.time)
+
+    def step(self) -> None:
+        output = self.simulation.advance()
+        stamp, time = output.time, seconds(output.time)
+        imu = ImuSample(stamp, tuple(output.imu.gyro.tolist()), tuple(output.imu.accel.tolist()))
+        self.vio.see(output.state, imu)
+        for pose in self.poses.released(stamp):
+            self.estimation.add_vio(pose)
+        odometry = self.estimation.step(imu)
+        if self.map and self.index % MAP_STEPS == 0:
+            self.piloting.see(self.map)
+        result = self.piloting.step(time, imu, odometry)
+        self.simulation.motors.command(self.simulation.time, result.armed, np.array(result.rotor_speed))
+        if self.index % HEALTH_STEPS == 0:
+            self.piloting.hear(self.estimation.status)
+        camera = self.simulation.cameras["down"]
+        if camera.due(stamp) is not None:
+            self.waiting.append(camera.take())
+        while self.waiting and self.vio.covers(self.waiting[0]):
+            delivery = self.waiting.popleft()
+            answer = self.vio.answer(delivery)
+            if answer is not None:
+                self.poses.post(max(delivery.frame.middle + self.latency, stamp + PERIOD), answer)
+        self.contacts.extend(output.contacts)
+        if self.index % RECORD == 0:
+            x = output.state
+            self.rows.append((time, *x.p_WB.tolist(), *x.q_WB.tolist(), *x.v_WB.tolist(), *x.w_WB_B.tolist()))
+        self.index += 1
+
+    def run(self, duration: float) -> None:
+        end = self.time + duration
+        while self.time < end and not self.simulation.plant.crashed:
+            self.step()
+
+
+def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
+    """Take off below the first waypoint, let the line terms grow, fly the waypoint lines.
+
+    Args:
+        scenario: mode `inspection`.
+        seed: of everything that is random.
+        with_lines: False: the controller is not told of the lines, and follows the reference as it is.
+
+    Raises:
+        PerchError: the scenario is not an inspection, or the vehicle does not take off.
+    """
+    if scenario.mode != "inspection":
+        raise PerchError(f"scenario {scenario.name}: mode {scenario.mode!r} is not inspection")
+    flight = _Flight(scenario, seed)
+    lines = segments(scenario)
+    _take_off(flight, scenario)
+    if with_lines:
+        flight.map = mapped(lines, seeding.stream(seed, "line_map"))
+    ramp = (scenario.parameters or {}).get("controller", {}).get("nmpc.lines.ramp_time", 3.0)
+    flight.run(ramp + SETTLE)
+    start = flight.time + LEAD
+    trajectory = reference_of(scenario, start)
+    flight.piloting.follow(FlownTrajectory(2, trajectory, AtEnd.HOLD))
+    flight.run(LEAD)
+    flight.rows.clear()
+    flight.run(trajectory.duration)
+    status = flight.piloting.status
+    flying = State(status.state) in (State.TRACKING, State.HOVERING) and not flight.simulation.plant.crashed
+    table = np.array(flight.rows)
+    times, states = table[:, 0] - start, table[:, 1:]
+    vehicle, line = flight.simulation.vehicle, watched(scenario, lines)
+    reference_times, reference = reference_states(scenario)
+    return Inspected(times, states, judge(states, lines, line, vehicle), reference_times, reference,
+                     judge(reference, lines, line, vehicle), lines, line, flight.contacts,
+                     "" if flying else status.message)
+
+
+def _take_off(flight: _Flight, scenario: Scenario) -> None:
+    first = scenario.inspection.waypoints[0]
+    while flight.estimation.status.health is not Health.RUNNING:
+        if flight.time > 10.0:
+            raise PerchError(f"the estimator is not ready: {flight.estimation.status.message}")
+        flight.step()
+    flight.run(0.2)
+    flight.piloting.command(Command.ARM, "inspection")
+    flight.run(0.2)
+    e = flight.simulation.state
+    yaw = float(np.radians(first.yaw_deg))
+    duration = max(2.0, first.position[2] / 0.8)
+    flight.piloting.follow(FlownTrajectory(1, rest_to_rest(e.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD),
+                                           AtEnd.HOLD))
+    flight.run(duration + LEAD + SETTLE)
+    if State(flight.piloting.status.state) is not State.HOVERING:
+        raise PerchError(f"did not take off: {flight.piloting.status.message}")

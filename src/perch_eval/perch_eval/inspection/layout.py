@@ -1,0 +1,104 @@
+"""Random places to inspect: three cables, and waypoints whose straight lines collide twice and look past the cable. [P:VI-A]"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from perch_core.lines import Segment, scaled_clearance, segment_distance
+from perch_core.scenario import Cable, Inspection, Scenario, Start, Waypoint, World
+from perch_core.vehicle import load_vehicle
+from perch_eval.inspection.measures import collisions, reference_states
+
+RADIUS = 0.03           # of the cables [m]
+WAYPOINTS = 6
+OFF_CENTRE = (0.2, 0.6)  # height of the cable over the image centre at a waypoint, by its distance: 80 to 230 px of the rpg's camera
+APART = 0.15            # least distance between two cables [m]
+CLEAR = 0.3             # least scaled clearance at the first and at the last waypoint, and on the way up
+DRAWS = 1000
+
+
+def random_layout(base: Scenario, seed: int) -> Scenario:
+    """`base` with cables and waypoints drawn anew; the reference collides exactly twice.
+
+    The watched cable hangs about 4 m in front, up to 12 deg askew and 6 deg inclined; the waypoints run along it at a distance of
+    1.4 to 2.4 m, each so high or low that the cable is 80 to 230 px from the image centre, and up to 25 deg turned away.
+    One or two slanted cables cross the way of the reference; where it is one, the reference touches the watched cable itself.
+
+    Args:
+        base: everything that is not drawn.
+        seed: of the layout.
+
+    Raises:
+        RuntimeError: no such layout was drawn.
+    """
+    rng = np.random.default_rng(seed)
+    vehicle = load_vehicle(base.vehicle)
+    for _ in range(DRAWS):
+        scenario = _draw(base, rng)
+        cables = segments(scenario)
+        states = reference_states(scenario)[1]
+        clear = min(float(scaled_clearance(states[[0, -1], 0:3], states[[0, -1], 3:7], c, vehicle.body_radii).min()) for c in cables)
+        apart = min(segment_distance(a, b) for k, a in enumerate(cables) for b in cables[:k])
+        if apart > APART and clear > CLEAR and _way_up(scenario, cables, vehicle.body_radii) and collisions(states, cables, vehicle.body_radii) == 2:
+            return dataclasses.replace(scenario, name=f"{base.name}_{seed}")
+    raise RuntimeError(f"no layout within {DRAWS} draws of seed {seed}")
+
+
+def segments(scenario: Scenario) -> list[Segment]:
+    """The cables of a scenario, which are straight here, in W."""
+    return [Segment.between(c.start, c.end, c.radius, k) for k, c in enumerate(scenario.world.cables)]
+
+
+def watched(scenario: Scenario, lines: list[Segment]) -> Segment:
+    """The line that the scenario's rough point means."""
+    return min(lines, key=lambda s: float(s.distance(np.array(scenario.inspection.watched))))
+
+
+def _draw(base: Scenario, rng: np.random.Generator) -> Scenario:
+    azimuth, elevation = np.radians(rng.uniform(-12, 12)), np.radians(rng.uniform(-6, 6))
+    along = np.array([-math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation)])
+    away = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])  # from the vehicle to the cable
+    up = np.array([0.0, 0.0, 1.0])
+    centre = np.array([4.0, 0.0, rng.uniform(2.4, 3.2)])
+    places = np.linspace(-2.5, 2.5, WAYPOINTS) + rng.uniform(-0.2, 0.2, WAYPOINTS)
+    distances = rng.uniform(1.6, 2.2) + rng.uniform(-0.2, 0.2, WAYPOINTS)
+    heights = distances * rng.uniform(*OFF_CENTRE, WAYPOINTS) * rng.choice([-1.0, 1.0], WAYPOINTS)
+    touching = rng.random() < 0.5
+    legs = sorted(rng.choice(np.arange(1, WAYPOINTS - 1), 2, replace=False).tolist())
+    if touching:
+        k = legs[1]
+        distances[k], heights[k] = rng.uniform(0.0, 0.2), rng.uniform(-0.1, 0.1)
+    points = centre + np.outer(places, along) - np.outer(distances, away) + np.outer(heights, up)
+    yaws = np.degrees(azimuth) + rng.uniform(-25, 25, WAYPOINTS)
+    cables = [(centre - 4.0 * along, centre + 4.0 * along)]
+    for leg in legs[:1] if touching else legs:
+        crossing = points[leg] + rng.uniform(0.3, 0.7) * (points[leg + 1] - points[leg])
+        slant = np.radians(rng.uniform(-60, 60))
+        direction = math.cos(slant) * away + math.sin(slant) * up + rng.uniform(-0.3, 0.3) * along
+        direction /= np.linalg.norm(direction)
+        middle, half = crossing + rng.uniform(-0.5, 0.5) * direction, rng.uniform(0.8, 1.5)
+        cables.append((middle - half * direction, middle + half * direction))
+    if touching:
+        behind = centre + rng.uniform(0.8, 1.2) * away + rng.uniform(-0.6, 0.6) * up
+        cables.append((behind - 4.0 * along, behind + 4.0 * along))
+    inspection = dataclasses.replace(
+        base.inspection, watched=_vector(centre),
+        waypoints=tuple(Waypoint(position=_vector(p), yaw_deg=float(yaw)) for p, yaw in zip(points, yaws)))
+    world = dataclasses.replace(base.world, cables=tuple(Cable(start=_vector(a), end=_vector(b), radius=RADIUS) for a, b in cables))
+    start = Start(position=(float(points[0, 0]), float(points[0, 1]), 0.0), yaw_deg=float(yaws[0]))
+    return dataclasses.replace(base, inspection=inspection, world=world, start=start)
+
+
+def _way_up(scenario: Scenario, cables: list[Segment], radii: np.ndarray) -> bool:
+    """The take-off, straight up to the first waypoint, is free."""
+    x, y, z = scenario.inspection.waypoints[0].position
+    column = np.column_stack([np.full(30, x), np.full(30, y), np.linspace(0.0, z, 30)])
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (30, 1))
+    return all(float(scaled_clearance(column, level, c, radii).min()) > CLEAR for c in cables)
+
+
+def _vector(v: np.ndarray) -> tuple[float, float, float]:
+    return (float(v[0]), float(v[1]), float(v[2]))

@@ -1,0 +1,70 @@
+"""What an inspection is judged by: collisions, and the measures of the paper's Fig. 5. [P:eq7, P:eq9, P:eq12, P:eq13]"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_control.geometric import packed_vehicle
+from perch_control.mission.waypoints import waypoint_lines
+from perch_control.nmpc.reference_rows import reference_row
+from perch_control.reference import FlatReference
+from perch_core.lines import Segment, scaled_clearance
+from perch_core.scenario import Scenario
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import Vehicle, load_vehicle
+from perch_planner.powerline.visibility import Visibility, visibility
+
+SAMPLE = 0.01  # of the reference's states [s]
+
+
+def reference_of(scenario: Scenario, start_time: float = 0.0) -> FlatTrajectory:
+    """The waypoint lines of a scenario."""
+    places = [(np.array(w.position), float(np.radians(w.yaw_deg))) for w in scenario.inspection.waypoints]
+    return waypoint_lines(places, scenario.inspection.speed, start_time)
+
+
+def reference_states(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Times from its start [s], shape (n,), and states of the reference by flatness: p, q, v, w, shape (n, 13). [M:eq9-13]"""
+    vehicle, source = packed_vehicle(load_vehicle(scenario.vehicle)), FlatReference(reference_of(scenario))
+    times = np.arange(0.0, source.duration, SAMPLE)
+    return times, np.array([reference_row(source.setpoint(float(t)).packed, 0.5, vehicle)[:13] for t in times])
+
+
+def clearance(states: np.ndarray, lines: Sequence[Segment], radii: np.ndarray) -> np.ndarray:
+    """Scaled distance of the nearest line minus 1 at each state, negative: the line is in the body, shape (n,)."""
+    return np.min([scaled_clearance(states[:, 0:3], states[:, 3:7], line, radii) for line in lines], axis=0)
+
+
+def collisions(states: np.ndarray, lines: Sequence[Segment], radii: np.ndarray) -> int:
+    """How often a line enters the body."""
+    inside = np.concatenate([[False], clearance(states, lines, radii) < 0.0])
+    return int(np.count_nonzero(~inside[:-1] & inside[1:]))
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A way past the lines, judged.
+
+    Attributes:
+        clearance: scaled clearance of the nearest line, shape (n,). [P:eq7]
+        seen: measures of the watched line, n states.
+        collisions: how often a line enters the body.
+    """
+
+    clearance: np.ndarray
+    seen: Visibility
+    collisions: int
+
+    @property
+    def reprojection(self) -> float:
+        """Mean distance of the watched line from the image centre [px]. [P:eq9]"""
+        return float(np.mean(self.seen.reprojection))
+
+
+def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: Vehicle) -> Judgement:
+    """Judge states p, q, ..., shape (n, >= 7), against the true lines, of which `line` is to be watched."""
+    return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, vehicle.mounts["front"]),
+                     collisions(states, lines, vehicle.body_radii))
