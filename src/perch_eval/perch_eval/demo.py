@@ -14,7 +14,7 @@ from perch_core.scenario import Scenario, load_scenario
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.nodes import programs
-from perch_eval.pilot import FlightResult, Pilot
+from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
 from perch_eval.report import build_report
 from perch_eval.stack import Stack, StackError
 
@@ -90,7 +90,7 @@ def _pilot(scenario: Scenario, stack: Stack) -> FlightResult:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point; 0 perched, 1 the flight failed, 2 the caller's mistake."""
+    """Entry point; 0 perched or inspected, 1 the flight failed, 2 the caller's mistake."""
     args = parser().parse_args(arguments)
     try:
         report = fly(args.scenario, args.seed, args.out, args.composed, args.realtime, args.verbose)
@@ -102,7 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     print(summary(report))
     print(f"report: {args.out / 'report.html'}")
-    return 0 if report["outcome"] == "perched" else 1
+    return 0 if report["outcome"] in SUCCESSES else 1
 
 
 def summary(report: dict) -> str:

@@ -171,6 +171,13 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
     """What the scenario as a whole means for single nodes."""
     participants = [node for node in PARTICIPANTS if node in nodes]
     vehicle = {"vehicle": scenario.vehicle}
+    mission = {"mission.planner_latency": scenario.latency.perching_planner,
+               "mission.powerline_latency": scenario.latency.powerline_planner}
+    controller = dict(vehicle)
+    if scenario.mode == "inspection":
+        mission |= {"mission.waypoints": [v for w in scenario.inspection.waypoints for v in (*w.position, w.yaw_deg)],
+                    "mission.inspection_speed": scenario.inspection.speed}
+        controller["nmpc.lines.watched"] = list(scenario.inspection.watched)
     every_step = [topic for node, topic in (("estimator", "odometry"), ("controller", "motor_command")) if node in nodes]
     return {
         "recorder": {"every_step": every_step if lockstep and every_step else [""]},
@@ -178,9 +185,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         "vio": vehicle | {"start_position": list(scenario.start.position), "start_yaw_deg": scenario.start.yaw_deg},
         "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,
         "target_localizer": vehicle | {"board": scenario.target.board},
-        "perching_planner": vehicle, "powerline_planner": vehicle, "controller": vehicle,
-        "mission": {"mission.planner_latency": scenario.latency.perching_planner,
-                    "mission.powerline_latency": scenario.latency.powerline_planner},
+        "perching_planner": vehicle, "powerline_planner": vehicle, "controller": controller, "mission": mission,
     }
 
 

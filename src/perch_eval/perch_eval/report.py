@@ -13,6 +13,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.flight import Flight
 from perch_eval.metrics import contact_report, diagnostics, flight_metrics, node_durations, perch_window, rates
+from perch_eval.pilot import SUCCESSES
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -101,7 +102,7 @@ def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
 
 
 def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Any) -> str:
-    good = report["outcome"] == "perched"
+    good = report["outcome"] in SUCCESSES
     contact = contact_report(flight)
     rows = [
         _row("scenario", f"{scenario.name}: {scenario.description}"), _row("seed", report["seed"]),

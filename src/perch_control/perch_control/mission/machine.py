@@ -8,10 +8,11 @@ import numpy as np
 
 from perch_core import so3
 from perch_control.mission.adhesion import AdhesionMonitor
-from perch_control.mission.moves import Moves, Place, place_of
+from perch_control.mission.moves import LEAD, Moves, Place, place_of
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import (
     Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
+from perch_control.mission.waypoints import waypoint_lines
 
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
@@ -67,6 +68,8 @@ class MissionMachine:
     def progress(self) -> float:
         """Share of the mission's phases that lie behind, 0 to 1."""
         order = [Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING, Phase.VERIFYING, Phase.PERCHED]
+        if self.phase is Phase.INSPECTING:
+            return order.index(Phase.TRACKING) / (len(order) - 1)
         return order.index(self.phase) / (len(order) - 1) if self.phase in order else 0.0
 
     # -- phases ------------------------------------------------------------------------------------------------------
@@ -105,7 +108,10 @@ class MissionMachine:
                 self._seen_since = inputs.time
                 self.message = "target in view"
             if inputs.time - self._seen_since >= self.settings.target_settle and self._moves.arrived(inputs.time, inputs.state):
-                self._ask_plan(inputs, outputs, target)
+                if self._goal.mode is Mode.INSPECTION:
+                    self._inspect(inputs, outputs)
+                else:
+                    self._ask_plan(inputs, outputs, target)
             return
         if self._elapsed(inputs) > self._goal.search_timeout:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
@@ -154,6 +160,26 @@ class MissionMachine:
             if self._goal.mode is Mode.SURFACE:  # a powerline plan goes on into its recovery by itself
                 outputs.commands.append((Command.HOVER, "no adhesion"))
             self._missed(inputs, "no adhesion")
+
+    def _inspect(self, inputs: Inputs, outputs: Outputs) -> None:
+        """From the present hover along the waypoints; the controller's line terms keep the line in view and all lines away."""
+        places = [self._moves.hover, *self.settings.places]
+        outputs.reference = waypoint_lines(places, self.settings.inspection_speed, inputs.time + LEAD)
+        outputs.trajectory_id = self._perch_id = self._new_id()
+        self._inspected = inputs.time + LEAD + outputs.reference.duration
+        self._enter(Phase.INSPECTING, inputs.time, f"inspecting, {outputs.reference.duration:.1f} s")
+
+    def _inspecting(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._lost(inputs, outputs):
+            return
+        if inputs.trajectory_id == self._perch_id and inputs.controller is ControllerState.HOVERING:
+            if inputs.time < self._inspected:
+                self._missed(inputs, f"inspection given up: {inputs.controller_message}")
+            else:
+                self._end(outputs, Result.PERCHED, f"inspected along {len(self.settings.places)} waypoints")
+        elif inputs.time > self._inspected + self.settings.arming_timeout:
+            outputs.commands.append((Command.HOVER, "the inspection does not end"))
+            self._missed(inputs, f"the inspection does not end: {inputs.controller_message}")
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._adhesion.free_fall():

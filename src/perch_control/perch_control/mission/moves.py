@@ -49,7 +49,7 @@ class Moves:
         up and down, and a little to the sides.
         """
         rise, turn = self.settings.search_rise, math.radians(self.settings.search_yaw_deg)
-        if goal.mode is Mode.POWERLINE:
+        if goal.mode is not Mode.SURFACE:
             reach = self.settings.mapping_reach
             return [(np.array(v), 0.0) for v in ((0, 0, reach), (0, reach / 2, 0), (0, -reach / 2, reach), (0, 0, 0))]
         return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),

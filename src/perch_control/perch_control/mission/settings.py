@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from perch_core.config import part, quantity
+from perch_core.errors import ConfigError
 from perch_control.mission.adhesion import AdhesionLimits
 
 
@@ -32,7 +36,18 @@ class MissionSettings:
     replan_until: float = quantity(0.7, unit="s", low=0.0, high=5.0, doc="no new plan closer than this to the contact")
     contact_time: float = quantity(0.25, unit="s", low=0.0, high=2.0, doc="how long adhesion is awaited after the planned contact")
     contact_early: float = quantity(0.15, unit="s", low=0.0, high=1.0, doc="how long before the planned contact adhesion is looked for")
+    waypoints: tuple[float, ...] = quantity((), unit="m, deg", doc="of an inspection, in map: x, y, z, yaw of each, one after the other")
+    inspection_speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0, doc="mean speed between waypoints")
     rest_time: float = quantity(0.6, unit="s", low=0.1, high=10.0, doc="rest with motors off that confirms the perch")
     arming_timeout: float = quantity(10.0, unit="s", above=0.0, high=60.0)
     phase_timeout: float = quantity(20.0, unit="s", above=0.0, high=300.0, doc="longest take-off or recovery")
     adhesion: AdhesionLimits = part(AdhesionLimits)
+
+    def __post_init__(self) -> None:
+        if len(self.waypoints) % 4:
+            raise ConfigError("", "waypoints", f"has {len(self.waypoints)} entries, not 4 (x, y, z, yaw) for each waypoint")
+
+    @property
+    def places(self) -> list[tuple[np.ndarray, float]]:
+        """The waypoints: positions in W [m], shape (3,), and yaws [rad]."""
+        return [(np.array(self.waypoints[k:k + 3]), math.radians(self.waypoints[k + 3])) for k in range(0, len(self.waypoints), 4)]

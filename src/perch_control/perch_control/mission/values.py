@@ -21,6 +21,7 @@ class Phase(str, Enum):
     SEARCHING = "searching"
     PLANNING = "planning"
     TRACKING = "tracking"
+    INSPECTING = "inspecting"
     VERIFYING = "verifying"
     PERCHED = "perched"
     RECOVERING = "recovering"
@@ -42,10 +43,11 @@ class Result(IntEnum):
 
 
 class Mode(IntEnum):
-    """What is perched on: MODE_* of the Perch action."""
+    """What is perched on: MODE_* of the Perch action; or a powerline that is inspected along the mission's waypoints."""
 
     SURFACE = 0
     POWERLINE = 1
+    INSPECTION = 2
 
 
 @dataclass(frozen=True)

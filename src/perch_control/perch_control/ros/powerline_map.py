@@ -9,6 +9,7 @@ from perch_msgs.msg import PowerlineArray
 
 from perch_core.ros.conversions import to_array, to_seconds
 from perch_control.mission import Goal, Target
+from perch_core.lines import Segment
 from perch_control.mission.powerline import MappedLine, powerline_target
 
 
@@ -27,3 +28,8 @@ def mapped_target(lines: PowerlineArray, goal: Goal, p_WB: np.ndarray) -> Target
                         math.sqrt(max(0.0, np.linalg.eigvalsh(np.reshape(m.covariance, (3, 3)))[-1])), m.direction_sigma)
              for m in lines.lines]
     return powerline_target(to_seconds(lines.header.stamp), known, goal.perch_point, goal.perch_pitch, p_WB, lines.lines)
+
+
+def mapped_segments(lines: PowerlineArray) -> list[Segment]:
+    """The map's lines as segments in W. What is published is known, also while some other wire is not yet determined."""
+    return [Segment.between(to_array(m.start), to_array(m.end), float(m.radius), m.id) for m in lines.lines]

@@ -26,9 +26,9 @@ TICK_STEPS = 10
 def goal_of(scenario: Scenario) -> Goal:
     """The goal that a scenario's mission part describes; as `perch_eval.pilot.goal_of` sends it."""
     mission = scenario.mission
-    powerline = scenario.mode == "powerline"
-    return Goal(mission.takeoff_height, mission.search_timeout, mode=Mode.POWERLINE if powerline else Mode.SURFACE,
-                perch_point=np.array(mission.perch_point) if powerline else np.zeros(3),
+    points = {"powerline": mission.perch_point, "inspection": scenario.inspection.watched}
+    return Goal(mission.takeoff_height, mission.search_timeout, mode=Mode[scenario.mode.upper()],
+                perch_point=np.array(points.get(scenario.mode, (0.0, 0.0, 0.0))),
                 perch_pitch=math.radians(mission.perch_pitch_deg), perception_aware=mission.perception_aware,
                 replan=mission.replan, attempts=max(1, mission.attempts))
 
@@ -36,7 +36,7 @@ def goal_of(scenario: Scenario) -> Goal:
 class Commanding:
     """Owns the mission's machine and its view of the world."""
 
-    def __init__(self, settings: MissionSettings, planning: Planning | PowerlinePlanning, goal: Goal) -> None:
+    def __init__(self, settings: MissionSettings, planning: Planning | PowerlinePlanning | None, goal: Goal) -> None:
         self._settings, self._planning, self._goal = settings, planning, goal
         self._machine = MissionMachine(settings)
         self._target: Target | None = None
@@ -74,7 +74,7 @@ class Commanding:
             answer, self._pending = self._pending[1], None
         e, estimator = odometry.estimate, self._estimator
         target = self._target
-        if self._goal.mode is Mode.POWERLINE:
+        if self._goal.mode is not Mode.SURFACE:
             target = mapped_target(self._map, self._goal, e.p_WB) if self._map is not None else None
         outputs = self._machine.tick(Inputs(
             time=time, state=State(e.p_WB, e.q_WB, odometry.v_WB, e.w_WB_B),

@@ -14,6 +14,7 @@ from perch_control.modes import Command, StepResult
 from perch_control.parameters import ControllerParameters
 from perch_control.mission import Target
 from perch_control.mission.parameters import MissionParameters
+from perch_control.ros.powerline_map import mapped_segments
 from perch_core.camera import CameraMount
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
@@ -71,9 +72,7 @@ class _Flight:
     """One flight in the making."""
 
     def __init__(self, scenario: Scenario, seed: int, sensing: Sensing, pool: ThreadPoolExecutor | None) -> None:
-        powerline = scenario.mode == "powerline"
-        if scenario.mode not in ("surface", "powerline"):
-            raise PerchError(f"scenario {scenario.name}: mode {scenario.mode!r} is not flown by the in-process engine")
+        powerline = scenario.mode != "surface"
         if powerline and sensing.target != "rendered":
             raise PerchError(f"scenario {scenario.name}: powerlines have no error model; sensing.target must be rendered")
         params = NodeParameters(scenario, seed)
@@ -96,9 +95,10 @@ class _Flight:
         controller = params.of("controller", ControllerParameters)
         self.piloting = Piloting(controller, vehicle)
         self.reference_period = controller.controller.reference_period
-        if powerline:
+        planning = None
+        if scenario.mode == "powerline":
             planning = PowerlinePlanning(params.of("powerline_planner", PowerlinePlannerParameters))
-        else:
+        elif scenario.mode == "surface":
             planning = Planning(params.of("perching_planner", PerchingPlannerParameters), vehicle)
         self.commanding = Commanding(params.of("mission", MissionParameters).mission, planning, goal_of(scenario))
         self.trace = FlightTrace(self.simulation.pad)
@@ -119,11 +119,15 @@ class _Flight:
         for pose in self.poses.released(stamp):
             self.estimation.add_vio(pose)
             self.trace.vio.append((time, pose))
+        sightings = self.sightings.released(stamp)
+        for sighting in sightings:
+            if not isinstance(sighting, Target):
+                self.piloting.see(mapped_segments(sighting))
         odometry = self.estimation.step(imu)
         result = self._control(time, imu, odometry, stamp)
         if index % STATUS_STEPS == 0:
             self.status = self.piloting.status
-        for sighting in self.sightings.released(stamp):
+        for sighting in sightings:
             self.commanding.take(sighting)
             (self.trace.targets if isinstance(sighting, Target) else self.trace.maps).append((time, sighting))
         if index % HEALTH_STEPS == 0:
@@ -209,7 +213,7 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
     """Fly a scenario once.
 
     Args:
-        scenario: what is flown, mode `surface` or `powerline`.
+        scenario: what is flown.
         seed: of everything that is random; the same seed gives the same flight to the last bit.
         sensing: which cameras are rendered.
         linger: flown on after the goal's end [s].
@@ -238,6 +242,8 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
         trace.outcome, trace.message = outcome.result.name.lower(), outcome.message
         if trace.outcome == "cancelled" and cancelled:
             trace.outcome = "timeout"
+        elif trace.outcome == "perched" and scenario.mode == "inspection":
+            trace.outcome = "inspected"
     trace.wall_time = clock.perf_counter() - began
     return trace
 
