@@ -197,3 +197,41 @@ def test_many_setpoints_are_the_single_ones():
     source = FlatReference(FlatTrajectory(np.array([0.6, 0.9]), rng.normal(size=(2, 4, 8))))
     times = np.array([0.0, 0.3, 0.59, 0.7, 1.2, 1.5, 1.6])
     np.testing.assert_allclose(packed_many(source, times), [source.setpoint(t).packed for t in times], atol=1e-9)
+
+
+def test_a_carried_attitude_is_flown_where_the_force_shows_none():
+    """Turning upside down in near free fall: position errors of centimetres must not choose the attitude."""
+    rate = 5.0
+    for angle in (1.2, 2.0, 3.0):
+        R = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+        b3, db3 = R[:, 2], rate * R[:, 0]
+        specific = 0.3
+        a = specific * b3 - (0, 0, 9.81)
+        reference = Setpoint((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), tuple(a), h=(0.0, 1.0, 0.0), b3=tuple(b3), db3=tuple(db3),
+                             ddb3=tuple(-rate**2 * b3))
+        q = Rotation.from_matrix(R).as_quat()
+        state = (0.04, -0.03, 0.05, 0.1, 0.0, -0.1, *q, 0.0, rate, 0.0)
+        args = tuple(map(float, state)), reference.packed, specific, NONE, GAINS, (8.0, 0.84, 0.8, 18.0, 250.0, 0.0), J
+        thrust, M, q_C, w_C, _ = geometric_step(*args)
+        off = (Rotation.from_quat(q_C).inv() * Rotation.from_quat(q)).magnitude()
+        assert np.degrees(off) < 4.0
+        np.testing.assert_allclose(w_C, (0.0, rate, 0.0), atol=0.3)
+        for got, plain in zip(geometric_step(*args), geometric_step.py_func(*args)):
+            np.testing.assert_allclose(got, plain, rtol=1e-9, atol=1e-9)
+
+
+def test_a_carried_attitude_changes_nothing_where_the_force_shows_it():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        x = flat(rng)
+        plain = setpoint(x)
+        f = np.array(plain.a) + (0, 0, 9.81)
+        if np.linalg.norm(f) < 9.81:  # below the weight the cone is narrower
+            continue
+        b3 = f / np.linalg.norm(f)
+        db3 = (np.array(plain.j) - b3 * (b3 @ plain.j)) / np.linalg.norm(f)
+        state = tuple(map(float, (*plain.p, *plain.v, *Rotation.align_vectors([b3], [[0, 0, 1]])[0].as_quat(), 0, 0, 0)))
+        carried = Setpoint(plain.p, plain.v, plain.a, plain.j, plain.s, plain.h, plain.dh, plain.ddh, tuple(b3), tuple(db3))
+        for a, b in zip(geometric_step(state, plain.packed, 9.0, NONE, GAINS, FREE, J)[0:4:2],
+                        geometric_step(state, carried.packed, 9.0, NONE, GAINS, FREE, J)[0:4:2]):
+            np.testing.assert_allclose(a, b, atol=1e-9)

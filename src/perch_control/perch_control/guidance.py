@@ -128,7 +128,7 @@ class Blend:
             return x
         d = self.offset.setpoint(t - self.start)
         return Setpoint(*(tuple(m + n for m, n in zip(getattr(x, k), getattr(d, k))) for k in ("p", "v", "a", "j", "s")),
-                        x.h, x.dh, x.ddh)
+                        x.h, x.dh, x.ddh, x.b3, x.db3, x.ddb3)
 
 
 def blended(old: Setpoint, source, start: float, duration: float = 0.5):

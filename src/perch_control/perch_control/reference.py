@@ -27,6 +27,8 @@ class Setpoint:
         p, v, a, j, s: position and its derivatives [m, m/s, m/s^2, m/s^3, m/s^4].
         h, dh, ddh: wanted direction of b2 (b2_des of [M:eq12]) and its derivatives. A vector, not an angle: a reference
             attitude gives it without singularity, whatever the tilt.
+        b3, db3, ddb3: wanted direction of b3 and its derivatives; zero: that of the specific force a + g e3. A plan that
+            carries its attitude gives it also where there is hardly a force to tell it from.
     """
 
     p: Vector
@@ -37,11 +39,14 @@ class Setpoint:
     h: Vector = (0.0, 1.0, 0.0)
     dh: Vector = _ZERO
     ddh: Vector = _ZERO
+    b3: Vector = _ZERO
+    db3: Vector = _ZERO
+    ddb3: Vector = _ZERO
 
     @property
     def packed(self) -> tuple[float, ...]:
-        """All fields in their order, 24 floats."""
-        return (*self.p, *self.v, *self.a, *self.j, *self.s, *self.h, *self.dh, *self.ddh)
+        """All fields in their order, 33 floats."""
+        return (*self.p, *self.v, *self.a, *self.j, *self.s, *self.h, *self.dh, *self.ddh, *self.b3, *self.db3, *self.ddb3)
 
 
 def _floats(v) -> Vector:
@@ -108,7 +113,7 @@ class FlatReference:
 @dataclass(frozen=True)
 class SampledReference:
     """Full states with rotor thrusts, brought to the same form: jerk and snap follow from the attitude's motion and the
-    collective thrust, b2_des from the reference attitude."""
+    collective thrust, b2_des and b3 from the reference attitude."""
 
     trajectory: SampledTrajectory
     mass: float
@@ -142,11 +147,11 @@ class SampledReference:
         s = 2.0 * rate * db3 + specific * ddb3
         p, v = x.p + over * (x.v + 0.5 * over * a), x.v + over * a
         return Setpoint(_floats(p), _floats(v), _floats(a), _floats(j), _floats(s), _floats(R[:, 1]),
-                        _floats(turn[:, 1]), _floats(turn2[:, 1]))
+                        _floats(turn[:, 1]), _floats(turn2[:, 1]), _floats(b3), _floats(db3), _floats(ddb3))
 
 
 def packed_many(source, times: np.ndarray) -> np.ndarray:
-    """Setpoints of a source at many times [s], packed, shape (n, 24); a flat trajectory is evaluated in one go."""
+    """Setpoints of a source at many times [s], packed, shape (n, 33); a flat trajectory is evaluated in one go."""
     if not isinstance(source, FlatReference):
         return np.array([source.setpoint(float(t)).packed for t in times])
     end = source.trajectory.duration
@@ -155,8 +160,8 @@ def packed_many(source, times: np.ndarray) -> np.ndarray:
     c, s, r, q = np.cos(x.yaw), np.sin(x.yaw), x.yaw_rate, x.yaw_acc
     zero = np.zeros_like(c)
     h = np.stack([-s, c, zero, -c * r, -s * r, zero, s * r * r - c * q, -c * r * r - s * q, zero], axis=-1)
-    out = np.empty((len(times), 24))
-    out[inside] = np.concatenate([x.p, x.v, x.a, x.j, x.s, h], axis=-1)
+    out = np.zeros((len(times), 33))
+    out[inside, :24] = np.concatenate([x.p, x.v, x.a, x.j, x.s, h], axis=-1)
     for k in np.flatnonzero(~inside):
         out[k] = source.setpoint(float(times[k])).packed
     return out

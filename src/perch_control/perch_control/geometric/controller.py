@@ -64,7 +64,7 @@ class GeometricController:
         self._gains = (*gains.position, *gains.velocity, *gains.attitude, *gains.rate)
         self._wide, self._narrow = tan(radians(gains.cone_deg)), tan(radians(gains.cone_contact_deg))
         self._rate_max = _RATE_RESERVE * vehicle.body_rate_max
-        self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 7, RotorEstimate.at_idle(vehicle))
+        self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 16, RotorEstimate.at_idle(vehicle))
 
     @property
     def lead(self) -> float:
@@ -82,7 +82,7 @@ class GeometricController:
 
         Args:
             state: p_WB [m], v_WB [m/s] in W, q_WB xyzw, w_WB_B [rad/s], 13 floats.
-            reference: setpoint `lead` seconds from now, 24 floats (see `Setpoint.packed`).
+            reference: setpoint `lead` seconds from now, 33 floats (see `Setpoint.packed`).
             rotors: rotor speeds and what they are following.
             compensation: acceleration in W and angular acceleration in B that make up for disturbances, 6 floats.
             time_to_contact: [s]; near zero position feedback gives way to attitude.
@@ -115,7 +115,7 @@ class GeometricController:
         Args:
             start: state at the beginning, shape (13,).
             rotors: rotors at the beginning.
-            table: setpoints `lead` ahead of each period, shape (n, 24).
+            table: setpoints `lead` ahead of each period, shape (n, 33).
             period: control period [s].
             duration: time from the beginning to the contact [s].
 

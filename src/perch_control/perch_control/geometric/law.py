@@ -53,6 +53,25 @@ def specific_force(a_ref, feedback, b3_body, tilt_tangent, floor):
 
 
 @compiled
+def force_about(a_ref, feedback, b3_ref, tilt_tangent, floor):
+    """Specific force f within a cone about the reference's own b3, for references that carry an attitude.
+
+    A small thrust cannot push sideways much, however far it is turned: below the weight the cone narrows with it, so that
+    near free fall the planned attitude is flown and nothing else.
+
+    Returns:
+        Its part along the reference's b3 [m/s^2], and the direction it shall have, of any length (3).
+    """
+    total = (a_ref[0] + feedback[0], a_ref[1] + feedback[1], a_ref[2] + feedback[2] + GRAVITY)
+    along = dot(total, b3_ref)
+    across = axpy(-along, b3_ref, total)
+    along = max(along, floor)
+    limit = tilt_tangent * min(along / GRAVITY, 1.0)
+    lean = norm(across) / along
+    return along, axpy(min(1.0, limit / lean) / along if lean > 1e-9 else 0.0, across, b3_ref)
+
+
+@compiled
 def attitude_error(q, q_C):
     """Attitude error e_R in B [rad], and the rotation q_e = q_C^-1 q. [M:eq2]
 
@@ -93,7 +112,8 @@ def geometric_step(state, reference, thrust, extra, gains, limits, J):
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
-        reference: p, v, a, j, s in W, then b2_des with its first two derivatives, 24 floats.
+        reference: p, v, a, j, s in W, then b2_des and b3 (zero: follows from the force) with their first two derivatives,
+            33 floats.
         thrust: specific thrust that acts now [m/s^2], for the derivative of the feedback.
         extra: acceleration in W and angular acceleration in B that make up for known disturbances, 6 floats.
         gains: k_p, k_v, k_R, k_w, 12 floats.
@@ -129,6 +149,10 @@ def geometric_step(state, reference, thrust, extra, gains, limits, J):
         df, ddf = axpy(limits[5], rate, df), axpy(limits[5], rate2, ddf)
     if not defined:
         df, ddf = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    b3_r = reference[24:27]
+    if dot(b3_r, b3_r) > 0.5:
+        along, direction = force_about(a_r, demand, b3_r, limits[1], limits[2])
+        f, df, ddf = scale(along, direction), scale(along, reference[27:30]), scale(along, reference[30:33])
 
     n = cross(h, f)
     if dot(n, n) < 1e-4 * dot(f, f):  # b2_des within 0.6 degrees of the thrust: keep the present heading instead

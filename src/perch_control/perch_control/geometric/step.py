@@ -99,7 +99,7 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B now, 13 floats.
-        reference: at `lead` seconds from now, 24 floats; see `geometric_step`.
+        reference: at `lead` seconds from now, 33 floats; see `geometric_step`.
         speed, command: rotor speeds now and what they are following [rad/s], 4 floats each.
         extra, gains, limits: see `geometric_step`.
         lead: time in which the rotors shall reach the wanted thrust [s].

@@ -24,7 +24,7 @@ def reference_row(x, floor, vehicle):
     """p, q, v, w and rotor thrusts of a setpoint, 17 floats. [M:eq9-13]
 
     Args:
-        x: packed setpoint, 24 floats.
+        x: packed setpoint, 33 floats.
         floor: specific thrust below which the attitude is taken as level [m/s^2].
         vehicle: packed constants (see `packed_vehicle`).
     """
