@@ -147,7 +147,8 @@ def test_takes_off_follows_switches_and_lands(vehicle):
     assert vehicle.plant.p[2] == pytest.approx(0.5, abs=0.03)
     assert vehicle.state() == ControllerStatus.HOVERING and vehicle.status[-1].trajectory_id == 5
     assert any(r.trajectory_id == 5 for r in vehicle.references)
-    assert vehicle.diagnostics and any(v.key == "missed_deadlines" for v in vehicle.diagnostics[-1].status[0].values)
+    keys = {v.key for v in vehicle.diagnostics[-1].status[0].values}
+    assert "step_us_median" in keys and "missed_deadlines" not in keys  # the wall clock means nothing in lockstep
 
     answer = vehicle.call(vehicle.choose, SetController.Request(type="pid"))
     assert not answer.success and answer.error_code == 1 and "geometric, nmpc" in answer.message

@@ -11,7 +11,8 @@ from rclpy.node import Node
 
 from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds, to_stamp
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.wire import stamp_of
 
 PERIOD = 2_000_000
 
@@ -135,3 +136,32 @@ def test_a_report_carries_trigger_and_counts(graph):
     graph.slow.report(to_stamp(5 * PERIOD))
     graph.until(lambda: any(nanoseconds(r.trigger) == 5 * PERIOD for r in graph.reports))
     assert [(r.topic, r.count) for r in graph.reports[-1].published] == [("/result", 1)]
+
+
+def test_a_node_of_ticks_gets_every_message_up_to_its_tick(graph):
+    """The tick brings all chain messages since the last one, of a slower chain the one with its stamp, and all releases."""
+    node = Node("ticking", context=graph.context)
+    graph.executor.add_node(node)
+    seen = []
+    side = Participant(node, lambda tick: seen.append(("tick", tick.index)), every=TICK_STEPS)
+    side.subscribe(ControllerCommand, "result", lambda m: seen.append(("result", m.reason)))
+    side.chain(MotorCommand, "chain", lambda m: seen.append(nanoseconds(m.header.stamp) // PERIOD))
+    side.chain(MotorCommand, "chain", lambda data: seen.append(("slow", stamp_of(data) // PERIOD)), TICK_STEPS, raw=True)
+    ticks = graph.vehicle.create_publisher(Step, "tick", qos.STEP)
+    graph.until(lambda: ticks.get_subscription_count() == 1 and graph.chain.get_subscription_count() == 3)
+    for k in range(2 * TICK_STEPS):
+        graph.link(k)
+    graph.results.publish(ControllerCommand(reason="first"))
+    graph.results.publish(ControllerCommand(reason="second"))
+    for k, count in ((0, 0), (TICK_STEPS, 1)):
+        ticks.publish(Step(stamp=to_stamp(k * PERIOD), index=k, lockstep=True, released=[Release(topic="/result", count=count)]))
+    graph.until(lambda: ("slow", TICK_STEPS) in seen)
+    graph.settle()
+    assert seen == [("tick", 0), 0, ("slow", 0), ("result", "first"), ("tick", TICK_STEPS), *range(1, TICK_STEPS + 1),
+                    ("slow", TICK_STEPS)]
+    node.destroy_node()
+
+
+def test_only_steps_and_ticks_can_be_asked_for(graph):
+    with pytest.raises(ValueError, match="every 5 is neither 1 nor 10"):
+        Participant(graph.consumer, every=5)

@@ -43,7 +43,7 @@ class Vehicle:
         self.rng = np.random.default_rng(0)
         self.maps, self.reports = [], []
         self.odometry = self.node.create_publisher(Odometry, "odometry", qos.CHAIN)
-        self.steps = self.node.create_publisher(Step, "step", qos.STEP)
+        self.ticks = self.node.create_publisher(Step, "tick", qos.STEP)
         self.images = self.node.create_publisher(Image, "camera_front/image_raw", qos.IMAGE)
         self.node.create_subscription(PowerlineArray, "powerlines", self.maps.append, qos.GATED)
         self.node.create_subscription(StepReport, "step_report", self.reports.append, qos.GATED)
@@ -66,7 +66,7 @@ class Vehicle:
             fill_odometry(msg, self.position(to_seconds(stamp)), PITCH_UP, self.velocity, np.zeros(3))
             msg.pose.covariance = np.diag([self.sigma**2] * 3 + [1e-5] * 3).ravel()
             self.odometry.publish(msg)
-            self.steps.publish(Step(stamp=stamp, index=self.index, lockstep=True))
+            self.ticks.publish(Step(stamp=stamp, index=self.index, lockstep=True))
             self.index += 1
 
     def fly(self, seconds, encoding="rgb8"):
@@ -101,7 +101,7 @@ def graph(ros_domain, renderer):
         vehicle = kind(context, executor, renderer)
         nodes.extend((node, vehicle.node))
         vehicle.spin_until(lambda: vehicle.reports and vehicle.images.get_subscription_count()
-                           and vehicle.odometry.get_subscription_count() and vehicle.steps.get_subscription_count(),
+                           and vehicle.odometry.get_subscription_count() and vehicle.ticks.get_subscription_count(),
                            "the node")
         return vehicle
 

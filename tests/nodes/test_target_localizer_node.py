@@ -43,7 +43,7 @@ class Vehicle:
         self.rng = np.random.default_rng(0)
         self.detections, self.reports, self.poses = [], [], []
         self.odometry = self.node.create_publisher(Odometry, "odometry", qos.CHAIN)
-        self.steps = self.node.create_publisher(Step, "step", qos.STEP)
+        self.ticks = self.node.create_publisher(Step, "tick", qos.STEP)
         self.images = self.node.create_publisher(Image, "camera_front/image_raw", qos.IMAGE)
         self.node.create_subscription(TargetDetection, "target/detections", self.detections.append, qos.GATED)
         self.node.create_subscription(StepReport, "step_report", self.reports.append, qos.GATED)
@@ -66,7 +66,7 @@ class Vehicle:
                           np.array([SPEED, 0.0, 0.0]), np.zeros(3))
             msg.pose.covariance = np.diag([1e-4] * 3 + [1e-5] * 3).ravel()
             self.odometry.publish(msg)
-            self.steps.publish(Step(stamp=stamp, index=self.index, lockstep=True))
+            self.ticks.publish(Step(stamp=stamp, index=self.index, lockstep=True))
             self.index += 1
 
     def send(self, exposed, pixels=None, **fields):
@@ -106,7 +106,7 @@ def graph(ros_domain, renderer):
         vehicle.spin_until(lambda: vehicle.reports, "the greeting")
         vehicle.spin_until(lambda: vehicle.images.get_subscription_count() > 0
                            and vehicle.odometry.get_subscription_count() > 0
-                           and vehicle.steps.get_subscription_count() > 0, "the node's subscriptions")
+                           and vehicle.ticks.get_subscription_count() > 0, "the node's subscriptions")
         return vehicle
 
     yield start

@@ -67,10 +67,12 @@ def test_a_motor_command_survives_both_ways(frame, armed):
 
 @pytest.mark.parametrize("released", [[], [("/vio/odometry", 3)], [("/a", 0), ("/target/pose", 2**40)]])
 @pytest.mark.parametrize("lockstep", [False, True])
-def test_a_step_is_read(released, lockstep):
+def test_a_step_is_read_and_written(released, lockstep):
     msg = Step(stamp=to_stamp(STAMP), index=2**33 + 7, lockstep=lockstep,
                released=[Release(topic=topic, count=count) for topic, count in released])
-    assert wire.read_step(serialize_message(msg)) == (STAMP, 2**33 + 7, lockstep, tuple(released))
+    reading = wire.read_step(serialize_message(msg))
+    assert reading == (STAMP, 2**33 + 7, lockstep, tuple(released))
+    assert deserialize_message(wire.write_step(reading), Step) == msg
 
 
 def test_templates_keep_what_they_do_not_fill():

@@ -24,13 +24,15 @@ from perch_control.modes import Command, StepResult
 from perch_control.nmpc import NmpcController, chosen_lines
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference, SampledReference
+from perch_control.ros.powerline_map import mapped_segments
 from perch_core.errors import ConfigError, PerchError
-from perch_core.lines import Segment
 from perch_core.ros import qos
-from perch_core.ros.conversions import to_array, to_pose, to_seconds, to_vector
+from perch_core.ros.conversions import seconds, to_pose, to_stamp, to_vector
+from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import from_message
+from perch_core.ros.wire import MotorCommandTemplate, read_imu, read_odometry, stamp_of
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import load_vehicle
 
@@ -58,27 +60,26 @@ class ControllerNode(PerchNode[ControllerParameters]):
         elif self.params.controller.standby:
             Thread(target=self._build_nmpc, daemon=True).start()
         self._costs: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
-        self._arrivals: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
-        self._missed = 0
+        self._deadlines = Deadlines()
         self._steps = 0
-        self._unanswered: Imu | None = None  # newest IMU sample without odometry
+        self._unanswered: bytes | None = None  # newest IMU sample without odometry
         self._unanswered_since = 0.0
 
-        self._command = MotorCommand()
-        self._command.header.frame_id = "base_link"
+        command = MotorCommand()
+        command.header.frame_id = "base_link"
+        self._command = MotorCommandTemplate(command)
         self._motors = self.create_publisher(MotorCommand, "motor_command", qos.CHAIN)
         self._references = self.create_publisher(ControlReference, "controller/reference", qos.CHAIN)
         self._status = self.create_publisher(ControllerStatus, "controller/status", qos.CHAIN)
         self._participant = Participant(self)
         self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
         self._participant.subscribe(ControllerCommand, "controller/command", self._receive_command)
-        self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, on_arrival=self._watch_imu)
         if self.params.nmpc.lines.any:
             self._participant.subscribe(PowerlineArray, "powerlines", self._receive_lines)
-        self._participant.chain(Odometry, "odometry", self._receive_odometry)
+        self._participant.chain(Odometry, "odometry", self._receive_odometry, raw=True)
         if self.params.estimator_status:
             self._participant.chain(EstimatorStatus, "estimator/status", self._receive_estimator, ESTIMATOR_STEPS)
-        self.create_subscription(Imu, "imu/data_raw", self._watch_imu, qos.SENSOR)
         self.create_timer(0.5, self._watch_lockstep, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.create_service(SetController, "set_controller", self._set_controller)
         self.create_service(Trigger, "abort", self._abort)
@@ -124,29 +125,28 @@ class ControllerNode(PerchNode[ControllerParameters]):
             self.get_logger().warning(f"command: {error}")
 
     def _receive_lines(self, msg: PowerlineArray) -> None:
-        if self._nmpc is None or msg.degenerate:
-            return
-        segments = [Segment.between(to_array(line.start), to_array(line.end), float(line.radius), line.id) for line in msg.lines]
-        self._nmpc.lines(chosen_lines(segments, np.array(self._flight.maneuvers.belief[0:3]), self.params.nmpc.lines.watched))
+        if self._nmpc is not None:
+            p_WB = np.array(self._flight.maneuvers.belief[0:3])
+            self._nmpc.lines(chosen_lines(mapped_segments(msg), p_WB, self.params.nmpc.lines.watched))
 
     def _receive_estimator(self, msg: EstimatorStatus) -> None:
         self._flight.supervisor.estimator(msg.state, float(msg.vio_age), msg.message)
 
-    def _receive_imu(self, msg: Imu) -> None:
-        w, f = msg.angular_velocity, msg.linear_acceleration
-        self._flight.imu(to_seconds(msg.header.stamp), (w.x, w.y, w.z), (f.x, f.y, f.z))
+    def _receive_imu(self, data: bytes) -> None:
+        stamp, gyro, accel = read_imu(data)
+        self._flight.imu(seconds(stamp), gyro, accel)
 
-    def _watch_imu(self, msg: Imu) -> None:
+    def _watch_imu(self, data: bytes) -> None:
         """Odometry that has stopped altogether would stop the commands: then the IMU's samples are answered instead.
 
         In lockstep the vehicle waits for the estimator, however long it takes on this machine, so only the timer may
         conclude that it is gone; in real time the IMU goes on and shows it.
         """
-        if to_seconds(msg.header.stamp) <= self._flight.maneuvers.now + PERIOD / 2:
+        if seconds(stamp_of(data)) <= self._flight.maneuvers.now + PERIOD / 2:
             return
         if self._unanswered is None:
             self._unanswered_since = time.monotonic()
-        self._unanswered = msg
+        self._unanswered = data
         if not self._participant.lockstep:
             self._answer_imu(self.params.blind_after)
 
@@ -155,47 +155,39 @@ class ControllerNode(PerchNode[ControllerParameters]):
             self._answer_imu(self.params.blind_after_lockstep)
 
     def _answer_imu(self, patience: float) -> None:
-        msg = self._unanswered
-        if msg is None or (time.monotonic() - self._unanswered_since < patience and not self._flight.blind):
+        data = self._unanswered
+        if data is None or (time.monotonic() - self._unanswered_since < patience and not self._flight.blind):
             return
         self._unanswered = None
-        self._receive_imu(msg)
-        self._answer(msg.header.stamp, self._flight.step_blind(to_seconds(msg.header.stamp)))
+        self._receive_imu(data)
+        stamp = stamp_of(data)
+        self._answer(stamp, self._flight.step_blind(seconds(stamp)))
 
-    def _receive_odometry(self, msg: Odometry) -> None:
+    def _receive_odometry(self, data: bytes) -> None:
         begin = time.perf_counter()
         self._unanswered = None
-        p, q = msg.pose.pose.position, msg.pose.pose.orientation
-        v, w = msg.twist.twist.linear, msg.twist.twist.angular
-        x, y, z, s = q.x, q.y, q.z, q.w
-        # The twist is in B: v_W = v + 2 s (u x v) + 2 u x (u x v).
-        tx, ty, tz = 2.0 * (y * v.z - z * v.y), 2.0 * (z * v.x - x * v.z), 2.0 * (x * v.y - y * v.x)
-        sample = (p.x, p.y, p.z, v.x + s * tx + y * tz - z * ty, v.y + s * ty + z * tx - x * tz,
-                  v.z + s * tz + x * ty - y * tx, x, y, z, s, w.x, w.y, w.z)
-        result = self._flight.step(to_seconds(msg.header.stamp), sample)
+        stamp, p, q, v, w = read_odometry(data)
+        result = self._flight.step(seconds(stamp), (*p, *v, *q, *w))
         self._costs.append(time.perf_counter() - begin)
-        self._answer(msg.header.stamp, result)
-        self._arrivals.append(begin)
-        self._missed += time.perf_counter() - begin > PERIOD
+        self._answer(stamp, result)
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
-    def _answer(self, stamp: Any, result: StepResult) -> None:
-        self._command.header.stamp = stamp
-        self._command.armed = result.armed
-        self._command.rotor_speed = np.array(result.rotor_speed)
-        self._motors.publish(self._command)
+    def _answer(self, stamp: int, result: StepResult) -> None:
+        self._motors.publish(self._command.fill(stamp, result.armed, result.rotor_speed))
+        if self._participant.lockstep is False:
+            self._deadlines.answered(stamp, time.monotonic_ns())
         if result.event:
             self.get_logger().info(result.event)
         # In lockstep the vehicle counts steps; the same steps carry the status in every run.
         step = self._participant.step
         index = step.index if step is not None else self._steps
         if index % STATUS_STEPS == 0:
-            self._publish_status(stamp)
+            self._publish_status(to_stamp(stamp))
         if result.setpoint is not None and index % self.params.controller.reference_period == 0:
-            self._publish_reference(stamp, result)
+            self._publish_reference(to_stamp(stamp), result)
         if index % DIAGNOSTICS_STEPS == 0:
-            self._publish_diagnostics(to_seconds(stamp))
+            self._publish_diagnostics(seconds(stamp))
         self._steps += 1
 
     def _publish_status(self, stamp: Any) -> None:
@@ -221,12 +213,12 @@ class ControllerNode(PerchNode[ControllerParameters]):
     def _publish_diagnostics(self, now: float) -> None:
         flight = self._flight
         values: dict[str, Any] = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
-                                  "missed_deadlines": self._missed, "odometry_age_s": float(min(flight.odometry_age, 1e6))}
+                                  "odometry_age_s": float(min(flight.odometry_age, 1e6))}
         if self._costs:
             values |= {"step_us_median": 1e6 * float(np.median(self._costs)),
                        "step_us_p99": 1e6 * float(np.percentile(self._costs, 99))}
-        if len(self._arrivals) > 2:
-            values["jitter_us_p99"] = 1e6 * float(np.percentile(np.abs(np.diff(self._arrivals) - PERIOD), 99))
+        if self._participant.lockstep is False:
+            values |= self._deadlines.report()
         level = 2 if flight.state.name == "FAILED" else 1 if flight.state.name in ("RECOVERING", "LANDING") else 0
         self.publish_diagnostics(now, values, level, flight.maneuvers.message)
 

@@ -9,24 +9,25 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from perch_msgs.action import Perch
-from perch_msgs.msg import ControllerCommand, ControllerStatus, EstimatorStatus, PowerlineArray, Step, Trajectory
+from perch_msgs.msg import ControllerCommand, ControllerStatus, EstimatorStatus, PowerlineArray, Trajectory
 from rclpy.action import GoalResponse
 from rclpy.task import Future
 from sensor_msgs.msg import Imu
 
 from perch_core import so3
-from perch_core.ros.conversions import odometry_arrays, pose_arrays, to_array, to_seconds, to_stamp
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.conversions import pose_arrays, seconds, to_array, to_pose, to_seconds, to_stamp
+from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import flat_message
+from perch_core.ros.wire import OdometryReading, read_imu, read_odometry, stamp_of
 from perch_control.mission import (
-    ControllerState, Goal, Inputs, MissionMachine, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
+    ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters
 from perch_control.ros.goal_server import GoalServer
 from perch_control.ros.planner_clients import PlannerClients
 from perch_control.ros.powerline_map import mapped_target
 
-TICK_STEPS = 10  # the mission decides at 50 Hz
+TICK = TICK_STEPS * 2_000_000  # the mission decides at 50 Hz [ns]
 
 
 class MissionNode(PerchNode[MissionParameters]):
@@ -40,23 +41,23 @@ class MissionNode(PerchNode[MissionParameters]):
         self._goal: Goal | None = None
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorStatus | None = None
-        self._odometry: Odometry | None = None
-        self._imu: list[list[float]] = []
-        self._last_tick = -math.inf
+        self._odometry: OdometryReading | None = None       # of the last tick
+        self._imu: list[bytes] = []                         # since the last tick
+        self._last_tick = -TICK
         self._pending: tuple[float, Future] | None = None   # when the answer counts, and the answer
-        self._deferred: Step | None = None                  # a tick that waits for the planner's answer
+        self._deferred: int | None = None                   # stamp of a tick that waits for the planner's answer
         self._goal_handle: Any = None
-        self._held: Step | None = None                      # the first tick, held until there is a goal
+        self._held: int | None = None                       # stamp of the first tick, held until there is a goal
 
-        self._participant = Participant(self)
+        self._participant = Participant(self, every=TICK_STEPS)
         self._trajectories = self._participant.publisher(Trajectory, "trajectory")
         self._commands = self._participant.publisher(ControllerCommand, "controller/command")
         self._participant.subscribe(PoseWithCovarianceStamped, "target/pose", self._receive_target)
         self._participant.subscribe(PowerlineArray, "powerlines", self._keep("_map"))
         self._participant.chain(ControllerStatus, "controller/status", self._keep("_status"), TICK_STEPS)
         self._participant.chain(EstimatorStatus, "estimator/status", self._keep("_estimator"), 5 * TICK_STEPS)
-        self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
-        self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS)
+        self._participant.chain(Imu, "imu/data_raw", self._imu.append, raw=True)
+        self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS, raw=True)
         self._participant.greet()
         self._planners = PlannerClients(self)
         self._server = GoalServer(self, Perch, "perch", self._begin, self._accept)
@@ -80,62 +81,57 @@ class MissionNode(PerchNode[MissionParameters]):
             position_sigma=math.sqrt(max(0.0, np.linalg.eigvalsh(covariance[:3, :3])[-1])),
             attitude_sigma=math.sqrt(max(0.0, np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
 
-    def _receive_imu(self, msg: Imu) -> None:
-        a = msg.linear_acceleration
-        self._imu.append([a.x, a.y, a.z])
-
-    def _receive_odometry(self, msg: Odometry) -> None:
-        self._odometry = msg
-        now = to_seconds(msg.header.stamp)
-        if now - self._last_tick < TICK_STEPS * 0.002 - 1e-6:
+    def _receive_odometry(self, data: bytes) -> None:
+        now = stamp_of(data)
+        if now - self._last_tick < TICK:
             return
-        self._last_tick = now
+        self._last_tick, self._odometry = now, read_odometry(data)
         step = self._participant.step
         if self.params.hold_for_goal and self._goal_handle is None and self._held is None and self._participant.lockstep:
             if step.index == 0:
-                self._held = step  # the vehicle waits for this tick's report: the flight starts with the goal
+                self._held = now  # the vehicle waits for this tick's report: the flight starts with the goal
                 return
-        self._tick(step)
+        self._tick(now)
 
     # -- ticks -------------------------------------------------------------------------------------------------------
 
-    def _tick(self, step: Step) -> None:
-        answer = None
+    def _tick(self, stamp: int) -> None:
+        now, answer = seconds(stamp), None
         if self._pending is not None:
             due, future = self._pending
-            if to_seconds(step.stamp) >= due - 1e-9:
+            if now >= due - 1e-9:
                 if future.done():
                     self._pending, answer = None, self._planners.answer(future)
                 elif self._participant.lockstep:
-                    self._deferred = step  # simulation time waits; in real time the mission goes on without an answer
+                    self._deferred = stamp  # simulation time waits; in real time the mission goes on without an answer
                     return
-        outputs = self._machine.tick(self._inputs(to_seconds(step.stamp), answer))
+        outputs = self._machine.tick(self._inputs(now, answer))
         self._imu.clear()
-        self._act(to_seconds(step.stamp), outputs)
-        self._participant.report(step.stamp)
+        self._act(now, outputs)
+        self._participant.report(stamp)
 
     def _resume(self, _: Future) -> None:
         if self._deferred is not None:
-            step, self._deferred = self._deferred, None
-            self._tick(step)
+            stamp, self._deferred = self._deferred, None
+            self._tick(stamp)
 
     def _inputs(self, now: float, answer: PlanAnswer | None) -> Inputs:
         status, estimator = self._status, self._estimator
         return Inputs(
-            time=now, state=State(*odometry_arrays(self._odometry)),
+            time=now, state=State(*(np.array(x) for x in self._odometry[1:])),
             estimator_ready=estimator is not None and estimator.state == EstimatorStatus.RUNNING,
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0,
             trajectory_time=status.trajectory_time if status else 0.0,
-            target=self._present_target(), specific_force_B=np.array(self._imu).reshape(-1, 3), plan=answer,
+            target=self._present_target(), specific_force_B=np.array([read_imu(data).accel for data in self._imu]).reshape(-1, 3), plan=answer,
             cancel=self._goal_handle is not None and self._goal_handle.is_cancel_requested)
 
     def _present_target(self) -> Target | None:
         """The pad, or the place on the mapped line that the goal means."""
         if self._goal is None or self._goal.mode is Mode.SURFACE or self._map is None:
             return self._target if self._goal is None or self._goal.mode is Mode.SURFACE else None
-        return mapped_target(self._map, self._goal, to_array(self._odometry.pose.pose.position))
+        return mapped_target(self._map, self._goal, np.array(self._odometry.p_WB))
 
     def _act(self, now: float, outputs: Outputs) -> None:
         stamp = to_stamp(float(now))
@@ -179,15 +175,15 @@ class MissionNode(PerchNode[MissionParameters]):
         return GoalResponse.ACCEPT
 
     def _begin(self, handle: Any) -> None:
-        problem = self._problem(handle.request)
+        problem = self._problem(handle.request, self.params.mission)
         if problem:
             handle.abort()
             self._server.finish(handle, Perch.Result(success=False, error_code=Perch.Result.BAD_GOAL, message=problem))
             return
         self._goal_handle = handle
-        start = self._odometry.header.stamp if self._odometry else to_stamp(0)
+        start = seconds(self._odometry.stamp) if self._odometry else 0.0
         self._goal = self._goal_of(handle.request)
-        self._machine.start(self._goal, to_seconds(start))
+        self._machine.start(self._goal, start)
         if self._held is not None:
             held, self._held = self._held, None
             self._tick(held)
@@ -205,7 +201,7 @@ class MissionNode(PerchNode[MissionParameters]):
             handle.abort()
         self._server.finish(handle, Perch.Result(
             success=outcome.result is Result.PERCHED, error_code=int(outcome.result), message=outcome.message,
-            contact_time=float(outcome.contact_time), end_time=now, final_pose=self._odometry.pose.pose))
+            contact_time=float(outcome.contact_time), end_time=now, final_pose=to_pose(self._odometry.p_WB, self._odometry.q_WB)))
 
     def _goal_of(self, request: Perch.Goal) -> Goal:
         settings = self.params.mission
@@ -226,11 +222,13 @@ class MissionNode(PerchNode[MissionParameters]):
             replan=request.replan, attempts=max(1, request.attempts))
 
     @staticmethod
-    def _problem(request: Perch.Goal) -> str:
+    def _problem(request: Perch.Goal, settings: MissionSettings) -> str:
         """Why a goal cannot be flown, or nothing."""
-        if request.mode not in (Perch.Goal.MODE_SURFACE, Perch.Goal.MODE_POWERLINE):
-            return f"mode {request.mode} is neither MODE_SURFACE (0) nor MODE_POWERLINE (1)"
-        if request.mode == Perch.Goal.MODE_POWERLINE:
+        if request.mode not in tuple(Mode):
+            return f"mode {request.mode} is neither MODE_SURFACE (0) nor MODE_POWERLINE (1) nor inspection (2)"
+        if request.mode == Mode.INSPECTION and len(settings.places) < 2:
+            return f"inspection: the parameter mission.waypoints holds {len(settings.places)} waypoints, needs at least 2"
+        if request.mode != Mode.SURFACE:
             if not np.isfinite(to_array(request.perch_point)).all():
                 return "perch_point is not finite"
             if not 0.0 <= request.perch_pitch <= math.pi + 1e-6:

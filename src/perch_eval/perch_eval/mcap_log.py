@@ -47,12 +47,6 @@ def message_definition(name: str) -> str:
     return "\n".join(parts)
 
 
-def stamp_of(data: bytes) -> int:
-    """Nanoseconds of the stamp with which a serialised message begins (its header's, or its own)."""
-    sec, nanosec = struct.unpack_from("<iI", data, 4)  # after the 4 bytes of CDR encapsulation
-    return sec * 1_000_000_000 + nanosec
-
-
 class McapLog:
     """Writes serialised messages to a file that stays readable when the process is killed: chunks are flushed."""
 

@@ -14,16 +14,17 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from perch_msgs.msg import (
     Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RotorState,
-    Step, TargetDetection, Trajectory)
+    TargetDetection, Trajectory)
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image, Imu
 
 from perch_core.config import quantity, text
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
-from perch_eval.mcap_log import McapLog, stamp_of, type_name
+from perch_core.ros.wire import StepReading, stamp_of
+from perch_eval.mcap_log import McapLog, type_name
 
 TOPICS = {
     "ground_truth/odometry": Odometry, "ground_truth/target": PoseStamped, "contact": Contact,
@@ -35,7 +36,7 @@ TOPICS = {
 }
 NOT_LATCHED = {"/diagnostics"}
 TRUTH = "ground_truth/odometry"
-TICK_STEPS = 50
+REPORT_STEPS = 50
 PATIENCE = 5.0  # [s] wall clock; messages that were sent long ago and have not come in this time never will
 
 
@@ -59,7 +60,7 @@ class RecorderNode(PerchNode[RecorderParameters]):
         super().__init__("recorder", RecorderParameters, **kwargs)
         self._log = McapLog(Path(self.params.file))
         self._counts = {topic: 0 for topic in (TRUTH, *self.params.every_step) if topic}
-        self._waiting: Step | None = None
+        self._waiting: StepReading | None = None
         self._waiting_since = 0.0
         self._next_image: dict[str, int] = {}
         for topic, msg_type in TOPICS.items():
@@ -75,7 +76,7 @@ class RecorderNode(PerchNode[RecorderParameters]):
                 self._log.add_topic(name, type_name(CompressedImage))
                 self.create_subscription(Image, f"camera_{camera}/image_raw", self._image_writer(name),
                                          QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE), raw=True)
-        self._participant = Participant(self, self._on_step)
+        self._participant = Participant(self, self._on_step, every=TICK_STEPS)
         self._participant.greet()
         self.create_timer(1.0, self._lose_patience, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -109,8 +110,8 @@ class RecorderNode(PerchNode[RecorderParameters]):
 
         return write
 
-    def _on_step(self, step: Step) -> None:
-        if step.lockstep and step.index % TICK_STEPS == 0:
+    def _on_step(self, step: StepReading) -> None:
+        if step.lockstep and step.index % REPORT_STEPS == 0:
             self._waiting, self._waiting_since = step, time.monotonic()
             self._report()
 

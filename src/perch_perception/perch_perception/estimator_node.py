@@ -10,9 +10,11 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from perch_core import so3
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_vector
+from perch_core.ros.conversions import nanoseconds, odometry_arrays, to_stamp, to_vector
+from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.wire import OdometryTemplate, read_imu
 from perch_msgs.msg import EstimatorStatus
 from sensor_msgs.msg import Imu
 
@@ -33,13 +35,15 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._covariance_step = -self.params.covariance_stride
         self._step_costs: deque[float] = deque(maxlen=DIAGNOSTICS_PERIOD)
         self._update_costs: deque[float] = deque(maxlen=60)
-        self._odometry = Odometry()
-        self._odometry.header.frame_id, self._odometry.child_frame_id = "map", "base_link"
+        self._deadlines = Deadlines()
+        odometry = Odometry(child_frame_id="base_link")
+        odometry.header.frame_id = "map"
+        self._odometry = OdometryTemplate(odometry)
         self._odometry_publisher = self.create_publisher(Odometry, "odometry", qos.CHAIN)
         self._status_publisher = self.create_publisher(EstimatorStatus, "estimator/status", qos.CHAIN)
         self._participant = Participant(self)
         self._participant.subscribe(Odometry, "vio/odometry", self._receive_vio)
-        self._participant.chain(Imu, "imu/data_raw", self._receive_imu)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True)
 
     def _receive_vio(self, msg: Odometry) -> None:
         begin = time.perf_counter()
@@ -54,40 +58,39 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs.append(time.perf_counter() - begin)
 
-    def _receive_imu(self, msg: Imu) -> None:
-        w, f = msg.angular_velocity, msg.linear_acceleration
-        sample = ImuSample(nanoseconds(msg.header.stamp), (w.x, w.y, w.z), (f.x, f.y, f.z))
+    def _receive_imu(self, data: bytes) -> None:
+        sample = ImuSample(*read_imu(data))
         begin = time.perf_counter()
         outcome = self._estimator.add_imu(sample)
         self._step_costs.append(time.perf_counter() - begin)
         if not outcome.used and self._estimator.estimate is None:
             return
         # a sample that was refused still gets its answer: the controller waits for this stamp
-        self._publish(msg)
+        self._publish(sample.stamp)
         if self._steps % STATUS_PERIOD == 0:
-            self._publish_status(msg)
+            self._publish_status(sample.stamp)
         if self._steps % DIAGNOSTICS_PERIOD == 0:
             self._publish_costs(sample.stamp * 1e-9)
         self._steps += 1
 
-    def _publish(self, imu: Imu) -> None:
-        estimate, out = self._estimator.estimate, self._odometry
-        out.header.stamp = imu.header.stamp
-        fill_odometry(out, estimate.p_WB, estimate.q_WB, estimate.v_WB, estimate.w_WB_B)
+    def _publish(self, stamp: int) -> None:
+        estimate = self._estimator.estimate
         if self._steps - self._covariance_step >= self.params.covariance_stride:
-            pose, twist = covariances(estimate, self.params.imu.gyro_noise)
-            out.pose.covariance, out.twist.covariance = pose.ravel(), twist.ravel()
+            self._odometry.covariances(*covariances(estimate, self.params.imu.gyro_noise))
             self._covariance_step = self._steps
-        self._odometry_publisher.publish(out)
+        state = (x.tolist() for x in (estimate.p_WB, estimate.q_WB, estimate.v_WB, estimate.w_WB_B))
+        self._odometry_publisher.publish(self._odometry.fill(stamp, *state))
+        if self._participant.lockstep is False:
+            self._deadlines.answered(stamp, time.monotonic_ns())
 
-    def _publish_status(self, imu: Imu) -> None:
+    def _publish_status(self, stamp: int) -> None:
         status, estimate = self._estimator.status, self._estimator.estimate
         msg = EstimatorStatus(
             state=status.health.value, vio_age=float(status.vio_age), updates_accepted=status.accepted,
             updates_rejected=status.rejected, nis=float(status.nis), gyro_bias=to_vector(estimate.gyro_bias),
             accel_bias=to_vector(estimate.accel_bias), position_sigma=float(status.position_sigma),
             attitude_sigma=float(status.attitude_sigma), message=status.message)
-        msg.header.stamp, msg.header.frame_id = imu.header.stamp, "map"
+        msg.header.stamp, msg.header.frame_id = to_stamp(stamp), "map"
         self._status_publisher.publish(msg)
 
     def _publish_costs(self, now: float) -> None:
@@ -99,6 +102,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
             if costs:
                 values[f"{name}_median"] = 1e6 * float(np.median(costs))
                 values[f"{name}_p99"] = 1e6 * float(np.percentile(costs, 99))
+        if self._participant.lockstep is False:
+            values |= self._deadlines.report()
         level = 0 if status.health.name == "RUNNING" else 2 if status.health.name == "DIVERGED" else 1
         self.publish_diagnostics(now, values, level, status.message)
 

@@ -6,6 +6,7 @@ its arrival.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field
@@ -73,7 +74,8 @@ class PoseBuffer:
         """Append a state. False, and nothing happens, where it is not newer than the last or not finite."""
         if self._times and state.time <= self._times[-1]:
             return False
-        if not all(np.all(np.isfinite(x)) for x in (state.time, state.p_WB, state.q_WB, state.v_WB, state.w_WB_B)):
+        squares = sum(x @ x for x in (state.p_WB, state.q_WB, state.v_WB, state.w_WB_B))
+        if not math.isfinite(state.time + squares):  # one check: this runs at 500 Hz
             return False
         self._states.append(state)
         self._times.append(state.time)

@@ -13,8 +13,8 @@ from nav_msgs.msg import Odometry
 from perch_core import config
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import odometry_arrays, to_point, to_seconds, to_stamp
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.conversions import to_point, to_stamp
+from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.vehicle import load_vehicle
 from perch_msgs.msg import Powerline, PowerlineArray
@@ -23,7 +23,8 @@ from sensor_msgs.msg import Image
 from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.pending_images import PendingImages
-from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+from perch_perception.pose_buffer import PoseBuffer, StampError
+from perch_perception.ros.states import body_state
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
@@ -61,17 +62,15 @@ class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
         self._used = -np.inf
         self._costs: deque[float] = deque(maxlen=100)
         self._images, self._diagnosed = 0, -np.inf
-        self._participant = Participant(self)
-        self._participant.chain(Odometry, "odometry", self._receive_odometry)
+        self._participant = Participant(self, every=TICK_STEPS)
+        self.create_subscription(Odometry, "odometry", self._receive_odometry, qos.CHAIN, raw=True)
         self._lines = self._participant.publisher(PowerlineArray, "powerlines")
         self._pending = PendingImages(mount.stamp_offset, self._handle)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
         self._participant.greet()
 
-    def _receive_odometry(self, msg: Odometry) -> None:
-        p, q, v, w = odometry_arrays(msg)
-        covariance = np.array(msg.pose.covariance).reshape(6, 6)
-        if self._buffer.add(BodyState(to_seconds(msg.header.stamp), p, q, v, w, covariance)):
+    def _receive_odometry(self, data: bytes) -> None:
+        if self._buffer.add(body_state(data)):
             self._pending.advance(self._buffer.newest)
 
     def _receive_image(self, msg: Image) -> None:

@@ -14,8 +14,8 @@ from nav_msgs.msg import Odometry
 from perch_core import config, so3
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import odometry_arrays, to_pose, to_seconds, to_stamp
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.conversions import to_pose, to_stamp
+from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
@@ -25,6 +25,7 @@ from sensor_msgs.msg import Image
 from perch_perception.images import ImageError, mono_image
 from perch_perception.pending_images import PendingImages
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+from perch_perception.ros.states import body_state
 from perch_perception.tags import (BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, LocalizerConfig,
                                    MapPose, fuse, start_fusion, to_map)
 
@@ -69,18 +70,16 @@ class TargetLocalizerNode(PerchNode[TargetLocalizerConfig]):
         self._costs: deque[float] = deque(maxlen=300)
         self._counts = {"images": 0, "found": 0, "complete": 0}
         self._message, self._diagnosed = "", -np.inf
-        self._participant = Participant(self)
-        self._participant.chain(Odometry, "odometry", self._receive_odometry)
+        self._participant = Participant(self, every=TICK_STEPS)
+        self.create_subscription(Odometry, "odometry", self._receive_odometry, qos.CHAIN, raw=True)
         self._detections = self._participant.publisher(TargetDetection, "target/detections")
         self._poses = self._participant.publisher(PoseWithCovarianceStamped, "target/pose")
         self._pending = PendingImages(self._mount.stamp_offset, self._handle)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
         self._participant.greet()
 
-    def _receive_odometry(self, msg: Odometry) -> None:
-        p, q, v, w = odometry_arrays(msg)
-        covariance = np.array(msg.pose.covariance).reshape(6, 6)
-        if self._buffer.add(BodyState(to_seconds(msg.header.stamp), p, q, v, w, covariance)):
+    def _receive_odometry(self, data: bytes) -> None:
+        if self._buffer.add(body_state(data)):
             self._pending.advance(self._buffer.newest)
 
     def _receive_image(self, msg: Image) -> None:

@@ -14,8 +14,9 @@ from perch_core import config, so3
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.conversions import fill_odometry, nanoseconds, to_stamp
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.wire import read_imu
 from perch_core.vehicle import load_vehicle
 from sensor_msgs.msg import Image, Imu
 
@@ -62,16 +63,15 @@ class VioNode(PerchNode[VioNodeConfig]):
         self._dropped, self._diagnosed = 0, -DIAGNOSTICS_PERIOD
         self._painter = TrackPainter()
         self._outcome: FrameOutcome | None = None
-        self._participant = Participant(self)
+        self._participant = Participant(self, every=TICK_STEPS)
         self._odometry = self._participant.publisher(Odometry, "vio/odometry")
         self._debug = self.create_publisher(Image, "vio/debug_image", qos.IMAGE)
-        self.create_subscription(Imu, "imu/data_raw", self._receive_imu, qos.CHAIN)
+        self.create_subscription(Imu, "imu/data_raw", self._receive_imu, qos.CHAIN, raw=True)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
         self._participant.greet()
 
-    def _receive_imu(self, msg: Imu) -> None:
-        w, f = msg.angular_velocity, msg.linear_acceleration
-        self._vio.add_imu(ImuSample(nanoseconds(msg.header.stamp), (w.x, w.y, w.z), (f.x, f.y, f.z)))
+    def _receive_imu(self, data: bytes) -> None:
+        self._vio.add_imu(ImuSample(*read_imu(data)))
         self._work()
 
     def _receive_image(self, msg: Image) -> None:

@@ -32,7 +32,7 @@ class Trigger:
     def topic(self) -> str:
         """The topic that carries the trigger."""
         if self.camera is None:
-            return "step"
+            return "tick"
         return f"camera_{self.camera}/{'image_raw' if self.needs_image else 'camera_info'}"
 
 

@@ -8,13 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
-from perch_msgs.msg import MotorCommand, Release, Step, StepReport
+from perch_msgs.msg import MotorCommand, Step, StepReport
 from rclpy.clock import Clock, ClockType
 
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import nanoseconds, to_stamp
+from perch_core.ros.conversions import nanoseconds
+from perch_core.ros.lockstep import TICK_STEPS
 from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.wire import StepReading, read_motor_command, write_step
 from perch_core.scenario import load_scenario
 from perch_sim.camera_stream import Delivery
 from perch_sim.ros.lockstep_watch import LockstepWatch
@@ -53,6 +55,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
             raise
         self._topics = VehicleTopics(self, self._simulation.vehicle.imu, self._simulation.vehicle.mounts)
         self._steps = self.create_publisher(Step, "step", qos.STEP)
+        self._ticks = self.create_publisher(Step, "tick", qos.STEP)
+        self._released: dict[str, int] = {}    # since the last tick
         self._output: Output | None = None     # of the step that is to be published next
         self._index = 0
         self._asked: set[int] = set()          # images whose end of drawing will wake the node
@@ -61,7 +65,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
         self._busy = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_subscription(MotorCommand, "motor_command", self._receive_command, qos.CHAIN)
+        self.create_subscription(MotorCommand, "motor_command", self._receive_command, qos.CHAIN, raw=True)
         self.create_timer(1.0, self._diagnose, clock=steady)
         self._watch: LockstepWatch | None = None
         self._pacing: Pacing | None = None
@@ -69,7 +73,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         if params.lockstep:
             self._idle_clock = self.create_timer(PERIOD * 1e-9, self._advance, clock=steady)
             self._idle_clock.cancel()
-            self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps],
+            self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps, self._ticks],
                                         params.lockstep_timeout, params.start_timeout)
             self.create_subscription(StepReport, "step_report", self._receive_report, qos.GATED)
             self.create_timer(0.05, self._look_after, clock=steady)
@@ -79,10 +83,10 @@ class VehicleNode(PerchNode[VehicleParameters]):
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
-    def _receive_command(self, msg: MotorCommand) -> None:
-        stamp = nanoseconds(msg.header.stamp)
+    def _receive_command(self, data: bytes) -> None:
+        stamp, armed, rotor_speed = read_motor_command(data)
         try:
-            self._simulation.motors.command(self._simulation.time, msg.armed, msg.rotor_speed)
+            self._simulation.motors.command(self._simulation.time, armed, rotor_speed)
         except MotorCommandError as error:
             self._counts["commands_refused"] += 1
             self.get_logger().error(str(error), throttle_duration_sec=1.0)
@@ -133,8 +137,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         for trigger in watch.triggers:
             if trigger.period and self._index % trigger.period == 0:
                 watch.trigger(trigger.node, stamp, stamp + round(trigger.latency * 1e9))
-        released = watch.begin(stamp)
-        self._publish(frames, [Release(topic=topic, count=count) for topic, count in released.items()])
+        self._publish(frames, watch.begin(stamp))
         return True
 
     def _in_time(self) -> bool:
@@ -194,13 +197,19 @@ class VehicleNode(PerchNode[VehicleParameters]):
                     frames.append((name, delivery))
                 else:
                     self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
-            self._publish(frames, [])
+            self._publish(frames, {})
 
     # -- output ------------------------------------------------------------------------------------------------------
 
-    def _publish(self, frames: list[tuple[str, Delivery]], released: list[Release]) -> None:
-        """Publish what this step shows, then the step itself."""
+    def _publish(self, frames: list[tuple[str, Delivery]], released: dict[str, int]) -> None:
+        """Publish this step and what it shows: first what the control loop waits for, which then works meanwhile."""
         output, topics, index = self._output, self._topics, self._index
+        topics.publish_imu(output.time, output.imu)
+        self._steps.publish(self._step(released))
+        self._released |= released
+        if index % TICK_STEPS == 0:
+            self._ticks.publish(self._step(self._released))
+            self._released = {}
         if index % CLOCK_STEPS == 0:
             topics.publish_clock(output.time)
         topics.publish_truth(output.state)
@@ -216,12 +225,12 @@ class VehicleNode(PerchNode[VehicleParameters]):
         for name, delivery in frames:
             self._simulation.cameras[name].take()
             topics.cameras[name].publish(delivery.frame.stamp, delivery.image.result() if delivery.image else None)
-        topics.publish_imu(output.time, output.imu)
-        self._steps.publish(Step(stamp=to_stamp(output.time), index=index, lockstep=self._watch is not None,
-                                 released=released))
         self._index, self._output = index + 1, None
         self._times.count_step()
         self._times.end("publishing")
+
+    def _step(self, released: dict[str, int]) -> bytes:
+        return write_step(StepReading(self._output.time, self._index, self._watch is not None, tuple(released.items())))
 
     def _log_contact(self, event: Any) -> None:
         self.get_logger().info(f"t = {event.time:.3f} s: {event.body}: {event.state.name.lower()}"

@@ -11,9 +11,10 @@ from sensor_msgs.msg import CameraInfo
 
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_stamp
-from perch_core.ros.lockstep import Participant
+from perch_core.ros.conversions import fill_odometry, nanoseconds, to_stamp
+from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.wire import read_odometry
 from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
 from perch_sim.state_history import StateHistory, TrueState
@@ -43,16 +44,16 @@ class VioModelNode(PerchNode[VioModelParameters]):
         self._newest = 0
         self._frames: deque[int] = deque()                        # stamps of frames to be answered
         self._late: deque[tuple[int, Odometry]] = deque()         # real time: (when it counts, answer)
-        self._participant = Participant(self)
+        self._participant = Participant(self, every=TICK_STEPS)
         self._publisher = self._participant.publisher(Odometry, "vio/odometry")
-        self._participant.chain(Odometry, "ground_truth/odometry", self._receive_truth)
+        self.create_subscription(Odometry, "ground_truth/odometry", self._receive_truth, qos.CHAIN, raw=True)
         self.create_subscription(CameraInfo, f"camera_{self.params.camera}/camera_info", self._receive_frame, qos.CHAIN)
         self._participant.greet()
         self.get_logger().warning("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
 
-    def _receive_truth(self, msg: Odometry) -> None:
-        self._newest = nanoseconds(msg.header.stamp)
-        self._history.append(TrueState(self._newest, *odometry_arrays(msg)))
+    def _receive_truth(self, data: bytes) -> None:
+        self._newest, *state = read_odometry(data)
+        self._history.append(TrueState(self._newest, *(np.array(x) for x in state)))
         self._answer()
         while self._late and self._late[0][0] <= self._newest:
             self._publisher.publish(self._late.popleft()[1])

@@ -22,6 +22,11 @@ def to_seconds(stamp: Time) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
+def seconds(time: int) -> float:
+    """Nanoseconds in seconds, to the last bit as `to_seconds` of their stamp."""
+    return time // NANOSECONDS + 1e-9 * (time % NANOSECONDS)
+
+
 def to_stamp(time: float | int) -> Time:
     """Stamp of a time in seconds (float) or in nanoseconds (int)."""
     ns = time if isinstance(time, int) else round(time * NANOSECONDS)

@@ -23,9 +23,13 @@ from perch_msgs.msg import Release, Step, StepReport
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 
 from perch_core.ros import qos
-from perch_core.ros.conversions import nanoseconds
+from perch_core.ros.conversions import to_stamp
+from perch_core.ros.wire import StepReading, read_step, stamp_of
+
+TICK_STEPS = 10  # `tick` repeats every tenth step, for nodes that need no more
 
 
 class GatedPublisher:
@@ -53,31 +57,43 @@ class _Gated:
 
 @dataclass
 class _Chain:
+    msg_type: type
     callback: Callable[[Any], None]
     period: int
-    inbox: dict[int, Any] = field(default_factory=dict)
+    raw: bool
+    inbox: dict[int, bytes] = field(default_factory=dict)  # stamp -> serialised message, in order
+
+    def deliver(self, data: bytes) -> None:
+        self.callback(data if self.raw else deserialize_message(data, self.msg_type))
 
 
 class Participant:
     """A node's side of the lockstep. Nothing here blocks; in real time messages are delivered on arrival."""
 
-    def __init__(self, node: Node, on_step: Callable[[Step], None] | None = None) -> None:
+    def __init__(self, node: Node, on_step: Callable[[StepReading], None] | None = None, every: int = 1) -> None:
         """
         Args:
             node: the node that takes part.
             on_step: called at each step, after the released messages and before the chain messages of that step.
+            every: steps that the node handles: 1, all of them; `TICK_STEPS`, those whose index it divides. A message
+                costs every subscriber 0.1 ms of processor time, whether or not it is used.
+
+        Raises:
+            ValueError: another `every`.
         """
+        if every not in (1, TICK_STEPS):
+            raise ValueError(f"every {every} is neither 1 nor {TICK_STEPS}")
         self._node, self._on_step = node, on_step
         self._gated: dict[str, _Gated] = {}
         self._chains: list[_Chain] = []
         self._publishers: list[GatedPublisher] = []
-        self._steps: deque[Step] = deque()
+        self._steps: deque[StepReading] = deque()
         self._busy = False
-        self.lockstep: bool | None = None  # unknown until the first step
-        self.step: Step | None = None      # the step handled last
+        self.lockstep: bool | None = None      # unknown until the first step
+        self.step: StepReading | None = None   # the step handled last
         self._reports: Publisher | None = None
         self._greeting = None
-        node.create_subscription(Step, "step", self._receive_step, qos.STEP)
+        node.create_subscription(Step, "step" if every == 1 else "tick", self._receive_step, qos.STEP, raw=True)
 
     # -- wiring ------------------------------------------------------------------------------------------------------
 
@@ -89,12 +105,28 @@ class Participant:
             msg_type, topic, lambda msg: self._receive_gated(gated, msg), profile)
         self._gated[subscription.topic_name] = gated
 
-    def chain(self, msg_type: type, topic: str, callback: Callable[[Any], None], period: int = 1,
-              profile: QoSProfile = qos.CHAIN) -> None:
-        """Subscribe to a topic that carries one message with the step's stamp at every `period`-th step."""
-        chain = _Chain(callback, period)
+    def chain(self, msg_type: type, topic: str, callback: Callable[[Any], None], period: int = 1, raw: bool = False,
+              on_arrival: Callable[[bytes], None] | None = None) -> None:
+        """Subscribe to a topic that carries one message with the step's stamp at every `period`-th step.
+
+        Args:
+            msg_type: of the topic; begins with a stamp or a header.
+            topic: its name.
+            callback: receives, at a step that is handled, its message; with period 1 those of the steps before it that
+                were not handled come first.
+            period: steps from one message that is wanted to the next.
+            raw: give the message to the callback as it is on the wire (`perch_core.ros.wire` reads it).
+            on_arrival: receives every serialised message as it comes, before its step is handled.
+        """
+        chain = _Chain(msg_type, callback, period, raw)
         self._chains.append(chain)
-        self._node.create_subscription(msg_type, topic, lambda msg: self._receive_chain(chain, msg), profile)
+
+        def receive(data: bytes) -> None:
+            if on_arrival is not None:
+                on_arrival(data)
+            self._receive_chain(chain, data)
+
+        self._node.create_subscription(msg_type, topic, receive, qos.CHAIN, raw=True)
 
     def publisher(self, msg_type: type, topic: str, profile: QoSProfile = qos.GATED) -> GatedPublisher:
         """A publisher on a gated topic. Only slow participants, which send reports, have these."""
@@ -108,10 +140,10 @@ class Participant:
         self.report(Time())
         self._greeting = self._node.create_timer(0.2, self._repeat_greeting)
 
-    def report(self, trigger: Time) -> None:
+    def report(self, trigger: Time | int) -> None:
         """Tell the vehicle that the work which the image or tick with stamp `trigger` started is finished and published."""
         self._reports.publish(StepReport(
-            node=self._node.get_name(), trigger=trigger,
+            node=self._node.get_name(), trigger=to_stamp(trigger) if isinstance(trigger, int) else trigger,
             published=[Release(topic=p.topic, count=p.count) for p in self._publishers]))
 
     def _repeat_greeting(self) -> None:
@@ -122,7 +154,8 @@ class Participant:
 
     # -- arrivals ----------------------------------------------------------------------------------------------------
 
-    def _receive_step(self, step: Step) -> None:
+    def _receive_step(self, data: bytes) -> None:
+        step = read_step(data)
         if self.lockstep is None:
             self.lockstep = step.lockstep
             if not step.lockstep:
@@ -143,12 +176,13 @@ class Participant:
         gated.inbox.append(msg)
         self._advance()
 
-    def _receive_chain(self, chain: _Chain, msg: Any) -> None:
+    def _receive_chain(self, chain: _Chain, data: bytes) -> None:
         if self.lockstep is False:
-            chain.callback(msg)
+            chain.deliver(data)
             return
-        chain.inbox[nanoseconds(msg.header.stamp)] = msg
-        self._advance()
+        chain.inbox[stamp_of(data)] = data
+        if self._steps:
+            self._advance()
 
     def _flush(self) -> None:
         """Real time: deliver what came before the first step."""
@@ -157,7 +191,7 @@ class Participant:
                 gated.callback(gated.inbox.popleft())
         for chain in self._chains:
             for key in sorted(chain.inbox):
-                chain.callback(chain.inbox.pop(key))
+                chain.deliver(chain.inbox.pop(key))
 
     # -- steps -------------------------------------------------------------------------------------------------------
 
@@ -172,19 +206,17 @@ class Participant:
         finally:
             self._busy = False
 
-    def _ready(self, step: Step) -> bool:
-        for release in step.released:
-            gated = self._gated.get(release.topic)
+    def _ready(self, step: StepReading) -> bool:
+        for topic, count in step.released:
+            gated = self._gated.get(topic)
             if gated is not None:
                 gated.announced = True
-                gated.released = max(gated.released, release.count)
-        stamp = nanoseconds(step.stamp)
+                gated.released = max(gated.released, count)
         return all(g.received >= g.released for g in self._gated.values() if g.announced) and all(
-            stamp in c.inbox for c in self._chains if step.index % c.period == 0)
+            step.stamp in c.inbox for c in self._chains if step.index % c.period == 0)
 
-    def _handle(self, step: Step) -> None:
+    def _handle(self, step: StepReading) -> None:
         self.step = step
-        stamp = nanoseconds(step.stamp)
         for topic in sorted(self._gated):
             gated = self._gated[topic]
             keep = gated.received - gated.released if gated.announced else 0
@@ -193,8 +225,7 @@ class Participant:
         if self._on_step is not None:
             self._on_step(step)
         for chain in self._chains:
-            msg = chain.inbox.pop(stamp, None)
-            for key in [key for key in chain.inbox if key < stamp]:
-                del chain.inbox[key]  # between the steps that this node asks for
-            if step.index % chain.period == 0:
-                chain.callback(msg)
+            for stamp in [stamp for stamp in chain.inbox if stamp <= step.stamp]:
+                data = chain.inbox.pop(stamp)
+                if chain.period == 1 or (stamp == step.stamp and step.index % chain.period == 0):
+                    chain.deliver(data)

@@ -16,14 +16,16 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
-from perch_msgs.msg import MotorCommand, Step
+from perch_msgs.msg import MotorCommand, Release, Step
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
 
 from perch_core.ros.conversions import NANOSECONDS, turned
 
 _HEADER = 4                  # bytes of encapsulation
+_LITTLE_ENDIAN = b"\0\1\0\0"
 _STAMP = struct.Struct("<iI")
 _LENGTH = struct.Struct("<I")
 _IMU = struct.Struct("<3d72x3d")             # angular velocity, its covariance, linear acceleration
@@ -36,6 +38,12 @@ def stamp_of(data: bytes) -> int:
     """Nanoseconds of the stamp with which a serialised message begins (its header's, or its own)."""
     sec, nanosec = _STAMP.unpack_from(data, _HEADER)
     return sec * NANOSECONDS + nanosec
+
+
+def seconds_of(data: bytes) -> float:
+    """The same stamp in seconds."""
+    sec, nanosec = _STAMP.unpack_from(data, _HEADER)
+    return sec + 1e-9 * nanosec
 
 
 def _after_text(data: bytes, offset: int) -> int:
@@ -131,6 +139,16 @@ def read_step(data: bytes) -> StepReading:
     if releases:
         released = tuple((r.topic, r.count) for r in deserialize_message(data, Step).released)
     return StepReading(sec * NANOSECONDS + nanosec, index, lockstep, released)
+
+
+def write_step(step: StepReading) -> bytes:
+    """Serialised `perch_msgs/Step`."""
+    sec, nanosec = divmod(step.stamp, NANOSECONDS)
+    if step.released:
+        return serialize_message(Step(
+            stamp=Time(sec=sec, nanosec=nanosec), index=step.index, lockstep=step.lockstep,
+            released=[Release(topic=topic, count=count) for topic, count in step.released]))
+    return _LITTLE_ENDIAN + _STEP.pack(sec, nanosec, step.index, step.lockstep, 0)
 
 
 class _Template:

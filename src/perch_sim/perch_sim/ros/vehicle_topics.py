@@ -16,7 +16,8 @@ from sensor_msgs.msg import CameraInfo, Image, Imu
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, to_pose, to_stamp
+from perch_core.ros.conversions import to_pose, to_stamp
+from perch_core.ros.wire import ImuTemplate, OdometryTemplate
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import ImuConfig
 from perch_sim.contact_event import ContactEvent
@@ -67,13 +68,13 @@ class VehicleTopics:
         self.contact = node.create_publisher(Contact, "contact", qos.GATED)
         self.clock = node.create_publisher(Clock, "/clock", qos.STATUS)
         self.cameras = {name: CameraTopics(node, mount) for name, mount in mounts.items()}
-        self._imu, self._odometry, self._rotors = Imu(), Odometry(), RotorState()
-        self._imu.header.frame_id = "imu_link"
-        self._imu.orientation_covariance[0] = -1.0  # sensor_msgs: no orientation
-        self._imu.angular_velocity_covariance = (np.eye(3) * imu.gyro_noise**2).ravel()
-        self._imu.linear_acceleration_covariance = (np.eye(3) * imu.accel_noise**2).ravel()
-        self._odometry.header.frame_id, self._odometry.child_frame_id = "map", "base_link"
-        self._rotors.header.frame_id = "base_link"
+        sample, truth, self._rotors = Imu(), Odometry(child_frame_id="base_link"), RotorState()
+        sample.header.frame_id = "imu_link"
+        sample.orientation_covariance[0] = -1.0  # sensor_msgs: no orientation
+        sample.angular_velocity_covariance = (np.eye(3) * imu.gyro_noise**2).ravel()
+        sample.linear_acceleration_covariance = (np.eye(3) * imu.accel_noise**2).ravel()
+        truth.header.frame_id, self._rotors.header.frame_id = "map", "base_link"
+        self._imu, self._odometry = ImuTemplate(sample), OdometryTemplate(truth)
 
     def publishers(self) -> list:
         """All of them, to see who listens."""
@@ -86,17 +87,12 @@ class VehicleTopics:
 
     def publish_imu(self, time: int, sample: ImuSample) -> None:
         """One IMU sample."""
-        self._imu.header.stamp = to_stamp(time)
-        force, rate = self._imu.linear_acceleration, self._imu.angular_velocity
-        force.x, force.y, force.z = sample.accel.tolist()
-        rate.x, rate.y, rate.z = sample.gyro.tolist()
-        self.imu.publish(self._imu)
+        self.imu.publish(self._imu.fill(time, sample.gyro.tolist(), sample.accel.tolist()))
 
     def publish_truth(self, state: TrueState) -> None:
         """The true state."""
-        self._odometry.header.stamp = to_stamp(state.time)
-        fill_odometry(self._odometry, state.p_WB, state.q_WB, state.v_WB, state.w_WB_B)
-        self.odometry.publish(self._odometry)
+        values = (x.tolist() for x in (state.p_WB, state.q_WB, state.v_WB, state.w_WB_B))
+        self.odometry.publish(self._odometry.fill(state.time, *values))
 
     def publish_rotors(self, time: int, speed: np.ndarray, thrust: np.ndarray) -> None:
         """Rotor speeds [rad/s] and thrusts [N], (4,)."""

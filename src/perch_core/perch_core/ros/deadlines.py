@@ -1,0 +1,52 @@
+"""Missed deadlines of a node that answers every step in real time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+PERIOD = 2_000_000  # of the control loop [ns]
+WINDOW = 500        # answers from which the clocks' offset and the figures are taken
+
+
+class Deadlines:
+    """Counts answers that left too late by the wall clock, and steps that were never answered.
+
+    In real time stamps advance with the wall clock, so `clock - stamp` is the same for every answer but for delays. Its
+    least value in the last second belongs to an undelayed answer. An answer is *missed* when it leaves more than one
+    period later than that: its successor was due by then. Whoever delayed it counts: the vehicle, the node, or the
+    operating system. In lockstep there are no deadlines, and nobody calls this.
+    """
+
+    def __init__(self) -> None:
+        self.answers = 0
+        self.missed = 0
+        self._last: int | None = None
+        self._least = self._coming = self._fresh = 0  # least offset of the last window and of the present one; its length
+        self._lateness: deque[int] = deque(maxlen=WINDOW)
+
+    def answered(self, stamp: int, now: int) -> None:
+        """An answer has left.
+
+        Args:
+            stamp: of the step that it answers [ns].
+            now: a monotonic clock [ns].
+        """
+        offset = now - stamp
+        if self._fresh == 0:
+            self._least, self._coming = (offset if self._last is None else self._coming), offset
+        self._fresh = (self._fresh + 1) % WINDOW
+        self._coming = min(self._coming, offset)
+        lateness = offset - min(self._least, self._coming)
+        self._lateness.append(lateness)
+        skipped = 0 if self._last is None else max(0, (stamp - self._last) // PERIOD - 1)
+        self.missed += skipped + (lateness > PERIOD)
+        self.answers += 1 + skipped
+        self._last = stamp
+
+    def report(self) -> dict[str, int | float]:
+        """Figures for /diagnostics: counts since the start, and the delay of the last second's answers."""
+        values: dict[str, int | float] = {"deadlines": self.answers, "missed_deadlines": self.missed}
+        if self._lateness:
+            ordered = sorted(self._lateness)
+            values["delay_us_p99"] = 1e-3 * ordered[int(0.99 * (len(ordered) - 1))]
+        return values

@@ -1,0 +1,1 @@
+"""ROS code that several nodes of perch_perception share."""

@@ -1,0 +1,44 @@
+"""When an answer in real time is late: against a made-up clock."""
+
+import numpy as np
+
+from perch_core.ros.deadlines import PERIOD, WINDOW, Deadlines
+
+START = 1_000_000_000  # stamp of the first step [ns]
+AHEAD = 77_000_000_000  # of the monotonic clock, unknown to the node [ns]
+
+
+def answer(deadlines, steps, delay=lambda k: 0):
+    for k in steps:
+        deadlines.answered(START + k * PERIOD, START + AHEAD + k * PERIOD + delay(k))
+    return deadlines.report()
+
+
+def test_a_steady_delay_is_no_miss():
+    report = answer(Deadlines(), range(2000), lambda k: 5 * PERIOD)
+    assert (report["deadlines"], report["missed_deadlines"], report["delay_us_p99"]) == (2000, 0, 0.0)
+
+
+def test_answers_later_than_a_period_are_missed_and_those_below_are_not():
+    late = {300: PERIOD + 1, 700: 3 * PERIOD, 900: PERIOD, 1100: PERIOD // 2}
+    assert answer(Deadlines(), range(1500), lambda k: late.get(k, 0))["missed_deadlines"] == 2
+
+
+def test_steps_without_an_answer_are_missed():
+    deadlines = Deadlines()
+    answer(deadlines, range(100))
+    report = answer(deadlines, range(103, 200))
+    assert (report["deadlines"], report["missed_deadlines"]) == (200, 3)
+
+
+def test_a_vehicle_that_gives_up_time_counts_until_the_next_window_only():
+    """Its stamps stay behind the wall clock for good; what was lost is counted, what follows is on time again."""
+    report = answer(Deadlines(), range(10 * WINDOW), lambda k: 50 * PERIOD if k >= 2 * WINDOW else 0)
+    assert WINDOW <= report["missed_deadlines"] <= 2 * WINDOW
+
+
+def test_the_delay_is_that_of_the_last_second():
+    delays = np.random.default_rng(1).uniform(0, 1e6, 5000).astype(int)
+    report = answer(Deadlines(), range(5000), lambda k: int(delays[k]))
+    expected = np.percentile(delays[-WINDOW:], 99) - delays[-2 * WINDOW:].min()
+    assert abs(1e3 * report["delay_us_p99"] - expected) < 3e4
