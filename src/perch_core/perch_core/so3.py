@@ -98,13 +98,15 @@ def quat_rotate(q_AB: np.ndarray, v_B: np.ndarray) -> np.ndarray:
 
 def quat_to_matrix(q: np.ndarray) -> np.ndarray:
     """Rotation matrix of a unit quaternion xyzw, shape (..., 4) -> (..., 3, 3)."""
-    x, y, z, w = np.moveaxis(np.asarray(q, float), -1, 0)
+    q = np.asarray(q, float)
+    # One quaternion in plain floats: 4 us, where arrays of single numbers take 40. The formula and its bits are the same.
+    x, y, z, w = q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.array(rows) if q.ndim == 1 else np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def quat_from_matrix(R: np.ndarray) -> np.ndarray:

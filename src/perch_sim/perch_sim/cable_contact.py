@@ -102,7 +102,7 @@ class CableMonitor:
         """
         if self._attachment is not None:
             self.hold = self._attachment.hold(time)
-        if self._attachment is not None or self.crashed:
+        if self._attachment is not None or self.crashed or not self._lines:
             return []
         R_WB = so3.quat_to_matrix(x[3:7])
         gripper_W = x[:3] - self._offset * R_WB[:, 2]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from perch_core.errors import PerchError
@@ -36,11 +38,11 @@ class Motors:
             MotorCommandError: a speed is not finite; the command before it stays until it times out.
         """
         speeds = np.asarray(speeds, float)
-        if armed and not np.all(np.isfinite(speeds)):
+        if armed and not math.isfinite(speeds.sum()):
             raise MotorCommandError(f"motor_command: rotor_speed {speeds.tolist()} is not finite")
         self._armed, self._received, self.timed_out = armed, now, False
         if armed:
-            self._speeds = np.clip(speeds, self._low, self._high)
+            self._speeds = np.minimum(np.maximum(speeds, self._low), self._high)
 
     def target(self, now: int) -> np.ndarray:
         """Speeds that the rotors aim at, (4,) [rad/s]."""
