@@ -15,13 +15,13 @@ class Certificate:
     """A proved bound on one quantity of a plan; fields as in `perch_msgs/Certificate`.
 
     Attributes:
-        quantity: thrust, speed, height, clearance or body_rate.
+        quantity: thrust, speed, height, clearance, body_rate or rotor_thrust.
         unit: unit of the values.
         lower_limit, upper_limit: required bounds, infinite where there is none.
         minimum, maximum: proved bounds of the quantity, infinite where none was asked for.
         time_of_minimum, time_of_maximum: times of the samples nearest to the proved bounds [s]; nan: none.
-        method: bernstein, sturm or dense.
-        holds: the limits are proved.
+        method: bernstein, sturm or dense; dense is sampled, and no proof.
+        holds: the limits are kept.
     """
 
     quantity: str
@@ -38,14 +38,18 @@ class Certificate:
     def describe(self) -> str:
         """One line for people."""
         return (f"{self.quantity} in [{self.minimum:.4g}, {self.maximum:.4g}] {self.unit}, required "
-                f"[{self.lower_limit:.4g}, {self.upper_limit:.4g}]: {'proved' if self.holds else 'not proved'} ({self.method})")
+                f"[{self.lower_limit:.4g}, {self.upper_limit:.4g}]: {self._verdict()} ({self.method})")
+
+    def _verdict(self) -> str:
+        kept = "kept" if self.method == "dense" else "proved"
+        return kept if self.holds else f"not {kept}"
 
 
 def certificates(results: np.ndarray, limits: Limits, mass: float, thrust_method: str = "bernstein") -> tuple[Certificate, ...]:
     """The certificates of `plan_checks.check`.
 
     Args:
-        results: shape (5, 5), of `plan_checks.check`.
+        results: rows of `plan_checks.NAMES`, shape (5, 5), or (6, 5) where the rotors were looked at.
         limits: what was required.
         mass: turns specific thrust into thrust [kg].
         thrust_method: who decided the thrust bound.
@@ -55,11 +59,12 @@ def certificates(results: np.ndarray, limits: Limits, mass: float, thrust_method
              ("speed", "m/s", -inf, limits.speed, 1.0, "bernstein"),
              ("height", "m", limits.height[0], limits.height[1], 1.0, "bernstein"),
              ("clearance", "m", limits.clearance, inf, 1.0, "bernstein"),
-             ("body_rate", "rad/s", -inf, limits.body_rate, 1.0, "bernstein"))
+             ("body_rate", "rad/s", -inf, limits.body_rate, 1.0, "bernstein"),
+             ("rotor_thrust", "N", *limits.rotor_thrust, 1.0, "dense"))
     out = []
     for row, (quantity, unit, low, high, scale, method) in zip(results.tolist(), table):
         minimum, at_minimum, maximum, at_maximum, holds = row
         out.append(Certificate(quantity, unit, low, high, scale * minimum, scale * maximum, at_minimum, at_maximum,
                                method, bool(holds)))
-    assert tuple(c.quantity for c in out) == plan_checks.NAMES
+    assert tuple(c.quantity for c in out) == plan_checks.NAMES[:len(out)]
     return tuple(out)

@@ -13,6 +13,7 @@ from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import derivatives_at
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 from perch_planner.problem import Limits, PerchProblem, contact_heading
+from perch_planner.rotor_thrusts import linear_bounds
 from perch_planner.segment_program import Cut
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -94,6 +95,20 @@ def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarra
         t = float(durations[:segment].sum() + s * durations[segment])
         cuts += [Cut(segment, s, *bound) for bound in _LIMIT_CUTS[row](derivatives, t, problem, limits)]
     return cuts
+
+
+def rotor_cuts(thrusts: np.ndarray, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, low: float,
+               high: float, rotors: tuple) -> list[Cut]:
+    """Cuts where a rotor's thrust leaves [low, high] [N]: linear in acceleration, jerk and snap at the present plan.
+
+    Args:
+        thrusts: of `rotor_thrusts.sampled`.
+        coefficients, yaw, durations: the plan.
+        rotors: of `rotor_thrusts.rotor_model`.
+    """
+    where, gradients, bounds = linear_bounds(thrusts, coefficients, yaw, durations, low, high, *rotors)
+    return [Cut(int(i), s, ((2, g[0]), (3, g[1]), (4, g[2])), lower, upper)
+            for (i, s), g, (lower, upper) in zip(where.tolist(), gradients, bounds.tolist())]
 
 
 def _speed_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):

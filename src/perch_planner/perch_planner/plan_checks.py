@@ -12,10 +12,10 @@ from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
 from perch_planner.bounds import BELOW, VIOLATED, cross, derivative, dot, maximum, product, stays_below
 
-THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE = range(5)
-"""Rows of the results; thrust is the specific thrust |a + g e3|."""
+THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE, ROTOR_THRUST = range(6)
+"""Rows of the results; thrust is the specific thrust |a + g e3|. `check` gives the first five, which are proved."""
 
-NAMES = ("thrust", "speed", "height", "clearance", "body_rate")
+NAMES = ("thrust", "speed", "height", "clearance", "body_rate", "rotor_thrust")
 
 MINIMUM, MINIMUM_AT, MAXIMUM, MAXIMUM_AT, HOLDS = range(5)
 """Columns of the results: proved bounds, the times of the samples nearest to them, and whether the limits hold."""

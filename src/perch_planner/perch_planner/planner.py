@@ -22,14 +22,17 @@ from perch_planner.search import Attempt, Outcome, Search
 from perch_planner.time_allocation import split_last
 
 _CODES = {"": refusals.INFEASIBLE_WINDOW, "thrust": refusals.THRUST_FLOOR, "speed": refusals.BOX, "height": refusals.BOX,
-          "clearance": refusals.BOX, "body_rate": refusals.BODY_RATE, "solver": refusals.SOLVER}
+          "clearance": refusals.BOX, "body_rate": refusals.BODY_RATE, "rotor_thrust": refusals.THRUST_FLOOR,
+          "solver": refusals.SOLVER}
 _WORDS = {"": "impact window and tube [M:eq14, M:eq15]", "thrust": "thrust range [M:eq16]", "speed": "speed limit",
           "height": "height limits", "clearance": "clearance from the surface until contact", "body_rate": "body-rate limit",
+          "rotor_thrust": "thrust range of the single rotors",
           "solver": "numerics of the quadratic program"}
 _ADVICE = {"": "widen the impact speeds, tangential_speed_max or the tube",
            "thrust": "raise thrust_max, tangential_speed_max or duration_max, or lower impact_acceleration",
            "speed": "raise speed_max", "height": "move the target or the start, or widen the height limits",
            "clearance": "start farther in front of the surface", "body_rate": "raise body_rate_max or impact_acceleration",
+           "rotor_thrust": "raise impact_acceleration or tube_tolerance, or shorten tube_time",
            "solver": "choose another solver"}
 
 
@@ -39,7 +42,7 @@ class PerchPlan:
 
     Attributes:
         trajectory: flat outputs, degree 14, from time 0 to contact.
-        certificates: one for each limit.
+        certificates: one for each limit; of the rotors, which are sampled, where `settings.rotors`.
         iterations: QPs solved.
         solve_time: wall-clock time [s].
         attempts: what was tried on the way, in order.

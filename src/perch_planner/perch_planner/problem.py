@@ -154,6 +154,8 @@ class PerchSettings:
     decider: str = choice("bernstein", options=("bernstein", "sturm"), doc="thrust bound: subdivision, or [M:alg1]")
     stretching: str = choice("adaptive", options=("adaptive", "whole", "segments"),
                              doc="what grows when a bound is violated: the approach or all, all, or as in [M:IV-C.3]")
+    rotors: bool = quantity(True, doc="keep the thrust of each rotor within its range too, on samples")
+    rotor_margin: float = quantity(0.005, low=0.0, high=0.4, doc="share of a rotor's range kept free at both its ends")
     cuts: bool = quantity(True, doc="add linear bounds where a limit is violated, before the time is stretched")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
@@ -179,6 +181,7 @@ class Limits:
         height: least and greatest height of the centre of mass [m].
         extension: radius of the disc around the centre of mass that stays in front of the surface until contact [m].
         clearance: least distance of that disc from the surface [m].
+        rotor_thrust: thrust of each rotor, least and greatest [N].
     """
 
     thrust: tuple[float, float]
@@ -187,14 +190,17 @@ class Limits:
     height: tuple[float, float]
     extension: float
     clearance: float
+    rotor_thrust: tuple[float, float]
 
     def without(self, name: str) -> Limits:
-        """The limits with one of them taken away: thrust, body_rate, speed, height or clearance."""
-        return replace(self, **{name: {"thrust": (1e-3, 1e3), "height": (-1e3, 1e3), "clearance": -1e3}.get(name, 1e3)})
+        """The limits with one of them taken away: thrust, body_rate, speed, height, clearance or rotor_thrust."""
+        none = {"thrust": (1e-3, 1e3), "height": (-1e3, 1e3), "clearance": -1e3, "rotor_thrust": (-1e3, 1e3)}
+        return replace(self, **{name: none.get(name, 1e3)})
 
     @classmethod
     def of(cls, settings: PerchSettings, vehicle: Vehicle) -> Limits:
         """The limits of a vehicle, where the settings do not replace them."""
+        free = settings.rotor_margin * (vehicle.thrust_max - vehicle.thrust_min)
         return cls(
             thrust=(settings.thrust_min or 4.0 * vehicle.thrust_min,
                     settings.thrust_max or settings.thrust_reserve * 4.0 * vehicle.thrust_max),
@@ -203,6 +209,7 @@ class Limits:
             height=(settings.height_min, settings.height_max),
             extension=settings.extension if settings.extension >= 0.0 else max(vehicle.body_radii[:2]),
             clearance=settings.clearance_min,
+            rotor_thrust=(vehicle.thrust_min + free, vehicle.thrust_max - free),
         )
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks
 from perch_planner.contact_constraints import Contact
-from perch_planner.cutting import limit_cuts, preventive_cuts, thrust_cuts, turning_side
+from perch_planner.cutting import limit_cuts, preventive_cuts, rotor_cuts, thrust_cuts, turning_side
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
+from perch_planner.rotor_thrusts import rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, FORMULATIONS
 from perch_planner.time_allocation import allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
 from perch_planner.yaw_profile import yaw_coefficients
@@ -68,6 +69,7 @@ class Search:
         self.contact = Contact(problem, settings, vehicle.perch_offset)
         self.first = allocate(problem, settings, self.contact.p_contact)
         self.end_yaw = contact_heading(problem.surface)
+        self.rotors = rotor_model(vehicle) if settings.rotors else None
         self.attempts: list[Attempt] = []
         self.failures: Counter[str] = Counter()
 
@@ -105,10 +107,10 @@ class Search:
             if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
                 return outcome
             if not outcome or rounds and outcome.margin > -_NEAR * self.limits.thrust[1]:
-                results, where = self._check(coefficients, yaw, durations, extrema)
+                results, where, further = self._check(coefficients, yaw, durations, extrema)
                 if results[:, plan_checks.HOLDS].all():
                     return Outcome(coefficients, yaw, results)
-                cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits)
+                cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits) + further
                 outcome = outcome or self._limit(coefficients, yaw, results)
             best = outcome
             if not cuts or not settings.cuts:
@@ -142,16 +144,27 @@ class Search:
         return Outcome(coefficients, yaw, results, name, self._margin(results, name))
 
     def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
+        """Rows of `plan_checks.NAMES`, first doubts of the proved ones, cuts for the rotors."""
         surface, limits = self.problem.surface, self.limits
-        return plan_checks.check(coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity,
-                                 np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed,
-                                 limits.height[0], limits.height[1], limits.extension, limits.clearance,
-                                 limits.body_rate)
+        results, where = plan_checks.check(
+            coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity,
+            np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed, limits.height[0], limits.height[1],
+            limits.extension, limits.clearance, limits.body_rate)
+        if self.rotors is None:
+            return results, where, []
+        low, high = limits.rotor_thrust
+        thrusts, row = sampled(coefficients, yaw, durations, *self.rotors)
+        keeps = low <= row[0] and row[2] <= high
+        results = np.vstack([results, [*row, keeps]])
+        return results, where, [] if keeps else rotor_cuts(thrusts, coefficients, yaw, durations, low, high, self.rotors)
 
     def _margin(self, results: np.ndarray, name: str) -> float:
         row, limits = results[plan_checks.NAMES.index(name)], self.limits
         if name == "speed":
             return limits.speed - row[plan_checks.MAXIMUM]
+        if name == "rotor_thrust":
+            low, high = limits.rotor_thrust
+            return min(row[plan_checks.MINIMUM] - low, high - row[plan_checks.MAXIMUM])
         if name == "height":
             return min(row[plan_checks.MINIMUM] - limits.height[0], limits.height[1] - row[plan_checks.MAXIMUM])
         return -float("inf")
