@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -45,16 +45,20 @@ def _package(file: Path) -> Path:
     return folder
 
 
-def compiled(kernel: Kernel) -> Kernel:
+def compiled(kernel: Kernel | None = None, *, nogil: bool = False) -> Kernel:
     """Decorator: the kernel compiled by numba with an on-disk cache, or the kernel itself.
+
+    With `nogil` it runs without the interpreter lock, which pays for kernels of milliseconds beside other threads.
 
     Without `fastmath`: results must not depend on how a compiler groups a sum. The plain function stays reachable as
     `.py_func` either way. A kernel may call kernels of its own package and of perch_core.
     """
+    if kernel is None:
+        return partial(compiled, nogil=nogil)
     if njit is None:
         kernel.py_func = kernel
         return kernel
-    out = njit(cache=True, error_model="numpy")(kernel)
+    out = njit(cache=True, error_model="numpy", nogil=nogil)(kernel)
     # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
     # unseen. The hash of all sources with kernels takes the place of that file's date.
     index = getattr(getattr(out, "_cache", None), "_cache_file", None)

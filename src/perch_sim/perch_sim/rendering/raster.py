@@ -12,6 +12,7 @@ import numpy as np
 from perch_core.camera import Camera
 from perch_sim.rendering.atlas import LEVELS_PER_OCTAVE, Atlas
 from perch_sim.rendering.grid import CELL, CellGrid, sample_weights
+from perch_sim.rendering.kernels import nearer_samples, uniform_samples
 from perch_sim.rendering.visibility import FaceArrays, View, look
 
 MIXED_SUPERSAMPLING = 2  # where faces meet, in each direction
@@ -76,24 +77,20 @@ class Rasterizer:
         return int(np.clip(wanted, 1, max(1, affordable)))
 
     def _affine(self, view: View, cells: np.ndarray, face: np.ndarray, supersampling: int) -> np.ndarray:
-        """(sx, ox, sy, oy) of the atlas level that fits each cell, shape (4, cells, 1): see `Atlas.affine`."""
+        """(sx, ox, sy, oy) of the atlas level that fits each cell, shape (cells, 4): see `Atlas.affine`."""
         footprint = self._texels_per_pixel(view, cells, face) / supersampling
         level = np.rint(LEVELS_PER_OCTAVE * np.log2(footprint))
         level = np.clip(level, 0, self.atlas.levels[face] - 1).astype(int)
-        return self.atlas.affine[face, level].T[..., None]
+        return self.atlas.affine[face, level]
 
     def _draw_uniform(self, image: np.ndarray, view: View, cells: np.ndarray, first: np.ndarray,
                       supersampling: int) -> None:
         if not len(cells):
             return
         face = first[cells]
-        sx, ox, sy, oy = self._affine(view, cells, face, supersampling)
-        M = view.M[face]
-        to_atlas = np.stack([sx * M[:, 0] + ox * M[:, 2], sy * M[:, 1] + oy * M[:, 2], M[:, 2]], axis=1)
-        corners = np.matmul(to_atlas, self.grid.corners[cells]).transpose(1, 0, 2)  # (3, cells, 4)
-        x, y, w = np.ascontiguousarray(corners) @ sample_weights(supersampling)
-        x /= w
-        y /= w
+        weights = sample_weights(supersampling)
+        x, y = np.empty((2, len(cells), weights.shape[1]), np.float32)
+        uniform_samples(view.M, self._affine(view, cells, face, supersampling), self.grid.corners, cells, face, weights, x, y)
         self._look_up(image, cells, x, y, supersampling)
 
     def _draw_mixed(self, image: np.ndarray, view: View, cells: np.ndarray, supersampling: int) -> None:
@@ -104,19 +101,9 @@ class Rasterizer:
         x = np.full_like(nearest, self.atlas.void[0])
         y = np.full_like(nearest, self.atlas.void[1])
         for face, rows in self._candidates(view, cells):
-            corners = np.matmul(view.M[face], self.grid.corners[cells[rows]]).transpose(1, 0, 2)
-            u, v, inverse = np.ascontiguousarray(corners) @ weights
-            before = nearest[rows]
-            wins = inverse > before
-            half_u, half_v = self.faces.half[face]
-            if np.isfinite(half_u):
-                wins &= (np.abs(u) <= np.float32(half_u) * inverse) & (np.abs(v) <= np.float32(half_v) * inverse)
-            sx, ox, sy, oy = self._affine(view, cells[rows], np.full(len(rows), face), supersampling)
-            np.copyto(before, inverse, where=wins)
-            range_ = 1.0 / before  # of this face where it wins; elsewhere the value is not used
-            x[rows] = np.where(wins, sx * (u * range_) + ox, x[rows])
-            y[rows] = np.where(wins, sy * (v * range_) + oy, y[rows])
-            nearest[rows] = before
+            affine = self._affine(view, cells[rows], np.full(len(rows), face), supersampling)
+            nearer_samples(view.M[face], self.faces.half[face].astype(np.float32), affine, self.grid.corners, cells, rows,
+                           weights, nearest, x, y)
         self._look_up(image, cells, x, y, supersampling)
 
     def _candidates(self, view: View, cells: np.ndarray) -> list[tuple[int, np.ndarray]]:
