@@ -147,3 +147,30 @@ def test_parameters_that_cannot_be_are_refused_at_the_start(ros_domain: int, nam
             powerline_planner_node.create(context=context, parameter_overrides=[Parameter(name, value=value)])
     finally:
         rclpy.shutdown(context=context)
+
+
+def test_the_node_goes_on_while_it_plans_and_answers_in_order() -> None:
+    with reserved_domain() as domain:
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=domain)
+        executor = EventsExecutor(context=context)
+        node = powerline_planner_node.create(context=context)
+        caller = rclpy.create_node("caller", context=context)
+        client = caller.create_client(PlanPowerline, "plan_powerline")
+        executor.add_node(node), executor.add_node(caller)
+        assert client.wait_for_service(timeout_sec=60.0)
+        events: list[str] = []
+        node.create_timer(0.005, lambda: events.append("tick"))
+        futures = [client.call_async(a_request(perch_pitch=math.radians(pitch))) for pitch in (80.0, 60.0)]
+        for number, future in enumerate(futures):
+            future.add_done_callback(lambda _, number=number: events.append(f"plan {number}"))
+        executor.spin_until_future_complete(futures[1], timeout_sec=120.0)
+        assert all(future.result().success for future in futures)
+        assert events.index("tick") < events.index("plan 0") < events.index("plan 1")
+        client.call_async(a_request(deadline=60.0))
+        executor.spin_once(timeout_sec=1.0)  # the node is destroyed in the middle of a solve
+        process = node._worker._process
+        executor.remove_node(node), executor.remove_node(caller)
+        node.destroy_node(), caller.destroy_node()
+        assert process.poll() is not None and not node._thread.is_alive()
+        rclpy.shutdown(context=context)

@@ -164,11 +164,11 @@ class PowerlineWorker:
         return self._receive()
 
     def close(self) -> None:
-        """End the processes."""
-        self._pipe.close()
+        """End the processes. A plan that another thread waits for is refused."""
         if self._process.poll() is None:
             try:
                 os.killpg(self._process.pid, signal.SIGKILL)  # its own session: supervisor and child
             except ProcessLookupError:
                 pass
         self._process.wait()
+        self._pipe.close()  # last: who waits at it sees its other end close, but not this one
