@@ -207,3 +207,64 @@ def test_at_rest_and_tilted_stops_the_motors():
     loop.odometry = lambda plant: tilted
     assert loop.run(3.0, until=lambda x: x.controller.state is State.FAILED), loop.events
     assert not loop.controller.step(loop.time, tilted).armed
+
+
+def along_x(start: float, p: float, v: float, duration: float, brakes: bool = False) -> SampledTrajectory:
+    """Level states along x, at constant speed or braking to rest."""
+    t = np.linspace(0.0, duration, 300)
+    a = -v / duration if brakes else 0.0
+    n, zero = len(t), np.zeros((len(t), 3))
+    x = p + v * t + 0.5 * a * t * t
+    hover = 9.81 * make_loop().controller.vehicle.mass / 4
+    return SampledTrajectory(t, np.stack([x, 0 * t, 1.0 + 0 * t], 1), np.tile([0.0, 0, 0, 1], (n, 1)), np.stack([v + a * t, 0 * t, 0 * t], 1),
+                             zero, np.tile([a, 0.0, 0.0], (n, 1)), zero, np.full((n, 4), hover), start)
+
+
+def leaving(recovery_start: float = 1.6):
+    """A hovering vehicle that has just begun to track a plan with an appended recovery."""
+    loop = hovering()
+    now, mass = loop.controller.maneuvers.now, loop.controller.vehicle.mass
+    plan = along_x(now, 0.0, 0.4, 2.5)
+    loop.controller.follow(Order(7, SampledReference(plan, mass), now, AtEnd.RECOVER, 0.25, recovery_start))
+    loop.run(0.1)
+    assert loop.controller.state is State.TRACKING
+    return loop, now
+
+
+def ready(loop, start: float, planned: float, id: int = 7) -> None:
+    order = along_x(planned, 0.4 * (planned - start), 0.4, 0.8, brakes=True)
+    loop.controller.keep_ready(Order(id, SampledReference(order, loop.controller.vehicle.mass), planned, AtEnd.HOLD, 0.0, 0.0))
+
+
+def test_an_abort_leaves_by_the_next_planned_recovery():
+    loop, start = leaving()
+    for planned in (0.3, 0.6, 0.9):
+        ready(loop, start, start + planned)
+    loop.run(0.3)
+    message = loop.controller.abort("stop it")
+    assert "stop it" in message and "planned recovery in 0.2" in message
+    loop.run(0.15)
+    assert loop.controller.maneuvers.order.start == start, "flown on until it begins"
+    loop.run(0.15)
+    assert loop.controller.maneuvers.order.start == pytest.approx(start + 0.6)
+    assert "under way" in loop.controller.abort()
+    loop.run(1.2)
+    assert loop.controller.state is State.HOVERING
+    assert np.linalg.norm(loop.controller.maneuvers.belief[3:6]) < 0.1
+
+
+@pytest.mark.parametrize("others", [(), (("id", 6), 0.5), (("id", 7), 1.4)])
+def test_without_a_way_out_of_this_plan_nearby_an_abort_brakes(others):
+    loop, start = leaving()
+    if others:
+        ready(loop, start, start + others[1], id=others[0][1])
+    loop.run(0.1)
+    loop.controller.command(Command.HOVER, "cancelled")
+    assert loop.controller.state is State.HOVERING
+
+
+def test_near_the_wire_the_plans_own_recovery_is_the_way_out():
+    loop, start = leaving(recovery_start=0.5)
+    loop.run(0.1)
+    loop.controller.command(Command.HOVER, "cancelled")
+    assert loop.controller.state is State.TRACKING and "planned recovery in 0.3" in loop.controller.maneuvers.message

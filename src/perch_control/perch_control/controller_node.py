@@ -73,8 +73,9 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._status = self.create_publisher(ControllerStatus, "controller/status", qos.CHAIN)
         self._participant = Participant(self)
         self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
+        self._participant.subscribe(Trajectory, "recovery", self._receive_recovery)
         self._participant.subscribe(ControllerCommand, "controller/command", self._receive_command)
-        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, on_arrival=self._watch_imu)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, on_arrival=self._watch_imu, backlog=True)
         if self.params.nmpc.lines.any:
             self._participant.subscribe(PowerlineArray, "powerlines", self._receive_lines)
         self._participant.chain(Odometry, "odometry", self._receive_odometry, raw=True)
@@ -116,6 +117,16 @@ class ControllerNode(PerchNode[ControllerParameters]):
         except PerchError as error:
             self._flight.maneuvers.message = f"trajectory {msg.id} refused: {error}"
             self.get_logger().warning(self._flight.maneuvers.message)
+
+    def _receive_recovery(self, msg: Trajectory) -> None:
+        try:
+            trajectory = from_message(msg)
+            if isinstance(trajectory, FlatTrajectory):
+                raise PerchError("a way out must carry states")
+            self._flight.keep_ready(Order(msg.id, SampledReference(trajectory, self._vehicle.mass), trajectory.start_time,
+                                          AtEnd.HOLD, 0.0, 0.0))
+        except PerchError as error:
+            self.get_logger().warning(f"way out of trajectory {msg.id} refused: {error}")
 
     def _receive_command(self, msg: ControllerCommand) -> None:
         try:

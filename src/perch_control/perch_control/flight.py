@@ -58,6 +58,7 @@ class FlightController:
         self._constants = packed_vehicle(vehicle)
         self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
         self._refused = ""
+        self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
 
     @property
     def settings(self) -> FlightSettings:
@@ -117,7 +118,7 @@ class FlightController:
             raise CommandRefused(f"{command.name.lower()} is refused: {m.message}")
         elif command is Command.LAND:
             m.land(f"landing{why}")
-        elif m.state is not State.RECOVERING:  # a recovery ends in a hover, and must not be cut short
+        elif m.state is not State.RECOVERING and not self._leave(f"hover{why}"):  # a recovery ends in a hover, and must not be cut short
             m.stop(f"hover{why}")
 
     def _arm(self) -> None:
@@ -150,9 +151,39 @@ class FlightController:
         check_start(order, m.now, m.expected(max(order.start, m.now)), self.settings)
         self._pending = order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT)
 
+    def keep_ready(self, order: Order) -> None:
+        """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
+
+        Raises:
+            TrajectoryRefused: it may not be flown.
+        """
+        check_joints(order.source.trajectory, self.settings.joint_gap)
+        self._ways_out = [o for o in self._ways_out if o.id == order.id and o.start >= self.maneuvers.now] + [order]
+
+    def _leave(self, reason: str) -> bool:
+        """Leave a trajectory by the next recovery that was planned for it; False where none is near.
+
+        Until that recovery starts the trajectory is flown on, for `leave_time` at most: braking out of a tilted attitude at
+        speed needs more room than a planned way out.
+        """
+        m, order = self.maneuvers, self.maneuvers.order
+        if m.state is not State.TRACKING or order.recovery_start < 0.0:
+            return False
+        own = order.start + order.recovery_start
+        if m.now >= own:
+            m.message = f"{reason}; the recovery is under way"
+            return True
+        ways = [o for o in self._ways_out if o.id == order.id and o.start >= m.now]
+        start = min([o.start for o in ways] + [own])
+        if start - m.now > self.settings.leave_time:
+            return False
+        self._pending = next(((o, self.law.prepare(o.source, False)) for o in ways if o.start == start), None)
+        m.message = f"{reason}; planned recovery in {start - m.now:.2f} s"
+        return True
+
     def abort(self, reason: str = "abort was requested") -> str:
         """End whatever is flown in a hover, through a recovery where the vehicle is tilted. Returns what is done."""
-        if self.state in (State.TRACKING, State.HOVERING):
+        if self.state in (State.TRACKING, State.HOVERING) and not self._leave(reason):
             self._pending = None
             self.maneuvers.stop(reason)
         return self.maneuvers.message

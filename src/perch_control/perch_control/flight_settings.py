@@ -16,6 +16,8 @@ class FlightSettings:
     """When the supervisor steps in, and how hover, landing and descent are flown."""
 
     brake_deceleration: float = quantity(4.0, unit="m/s^2", above=0.0, high=20.0)
+    leave_time: float = quantity(0.6, unit="s", low=0.0, high=5.0,
+                                 doc="an abort flies on for at most so long, to where a planned recovery begins")
     land_speed: float = quantity(0.35, unit="m/s", above=0.0, high=2.0)
     ground_time: float = quantity(0.25, unit="s", above=0.0, doc="descent has stopped for so long: on the ground")
     ground_gap: float = quantity(0.12, unit="m", above=0.0, doc="the descending reference is so far below the vehicle")

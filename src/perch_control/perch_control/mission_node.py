@@ -51,13 +51,14 @@ class MissionNode(PerchNode[MissionParameters]):
 
         self._participant = Participant(self, every=TICK_STEPS)
         self._trajectories = self._participant.publisher(Trajectory, "trajectory")
+        self._ways_out = self._participant.publisher(Trajectory, "recovery")
         self._commands = self._participant.publisher(ControllerCommand, "controller/command")
         self._participant.subscribe(PoseWithCovarianceStamped, "target/pose", self._receive_target)
         self._participant.subscribe(PowerlineArray, "powerlines", self._keep("_map"))
         self._participant.chain(ControllerStatus, "controller/status", self._keep("_status"), TICK_STEPS)
         self._participant.chain(EstimatorStatus, "estimator/status", self._keep("_estimator"), 5 * TICK_STEPS)
-        self._participant.chain(Imu, "imu/data_raw", self._imu.append, raw=True)
-        self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS, raw=True)
+        self._participant.chain(Imu, "imu/data_raw", self._imu.append, raw=True, backlog=True)
+        self._participant.chain(Odometry, "odometry", self._receive_odometry, TICK_STEPS, raw=True, backlog=True)
         self._participant.greet()
         self._planners = PlannerClients(self)
         self._server = GoalServer(self, Perch, "perch", self._begin, self._accept)
@@ -148,6 +149,10 @@ class MissionNode(PerchNode[MissionParameters]):
             msg.id = outputs.trajectory_id
             msg.contact_time = float(self.params.mission.contact_time)
             self._trajectories.publish(msg)
+        if outputs.way_out is not None:
+            msg = outputs.way_out.trajectory
+            msg.id = outputs.trajectory_id
+            self._ways_out.publish(msg)
         if outputs.query is not None:
             self._ask(now, outputs.query)
         if self._goal_handle is not None and self._machine.phase.value != "idle":
@@ -162,9 +167,7 @@ class MissionNode(PerchNode[MissionParameters]):
     def _ask(self, now: float, query: PlanQuery) -> None:
         future = self._planners.ask(query)
         future.add_done_callback(self._resume)
-        powerline = query.goal.mode is Mode.POWERLINE
-        settings = self.params.mission
-        self._pending = (now + (settings.powerline_latency if powerline else settings.planner_latency), future)
+        self._pending = (now + query.latency, future)
 
     # -- action ------------------------------------------------------------------------------------------------------
 

@@ -13,6 +13,11 @@ from perch_core.vehicle import GRAVITY
 from perch_control.mission.values import State, Target
 
 
+_LEAST = 0.8  # what vibration and a wrong attitude make of a vehicle at rest [m/s^2]
+_LEAST_TILT = np.radians(8.0)  # what a grip and the attitude's estimate leave
+_UP = np.array([0.0, 0.0, 1.0])
+
+
 @dataclass(frozen=True, kw_only=True)
 class AdhesionLimits:
     """Limits of the adhesion test."""
@@ -31,6 +36,9 @@ class AdhesionMonitor:
     In flight the only large force is the thrust, along b3: at a perch attitude it cannot carry the weight, so that the
     mean specific force differs from `R_WB^T g e3` by the vehicle's acceleration (at 90 degrees: 9.8 m/s^2 of fall).
     A vehicle that sticks is carried by the surface: the specific force is `R_WB^T g e3` whatever the motors do.
+
+    A small tilt shows less: at theta from the vertical no thrust comes closer to the weight than g sin(theta) (g beyond 90
+    degrees), so that what counts as balanced is at most half of that, and a hover must not count as aligned.
     """
 
     def __init__(self, limits: AdhesionLimits, imu_rate: float = 500.0) -> None:
@@ -64,10 +72,14 @@ class AdhesionMonitor:
         if not self.filled:
             return False
         limits = self._limits
-        b3 = so3.quat_rotate(state.q_WB, np.array([0.0, 0.0, 1.0]))
-        s3 = so3.quat_rotate(target.q_WS, np.array([0.0, 0.0, 1.0]))
+        b3, s3 = so3.quat_rotate(state.q_WB, _UP), so3.quat_rotate(target.q_WS, _UP)
         return bool(
             np.linalg.norm(state.p_WB - target.p_WS) < limits.distance
-            and so3.angle_between(b3, s3) < np.radians(limits.tilt_deg)
+            and so3.angle_between(b3, s3) < min(np.radians(limits.tilt_deg), max(_LEAST_TILT, 0.5 * so3.angle_between(s3, _UP)))
             and np.linalg.norm(state.v_WB) < limits.speed
-            and self.imbalance(state.q_WB) < limits.unbalanced)
+            and self.imbalance(state.q_WB) < min(limits.unbalanced, max(_LEAST, 0.5 * _unbalanced_in_flight(b3))))
+
+
+def _unbalanced_in_flight(b3: np.ndarray) -> float:
+    """Least acceleration of a vehicle in flight with its thrust along b3 (3,): min over T >= 0 of |T b3 - g e3| [m/s^2]."""
+    return GRAVITY * (float(np.hypot(b3[0], b3[1])) if b3[2] > 0.0 else 1.0)

@@ -9,6 +9,7 @@ import numpy as np
 from perch_core import so3
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.moves import LEAD, Moves, Place, place_of
+from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import (
     Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
@@ -140,7 +141,9 @@ class MissionMachine:
         if inputs.trajectory_id == self._perch_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"perch given up: {inputs.controller_message}")
             return
-        if self._goal.replan and self._goal.mode is Mode.SURFACE:
+        if self._goal.mode is Mode.POWERLINE:
+            self._look_ahead(inputs, outputs)
+        elif self._goal.replan:
             self._replan(inputs, outputs, end)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
@@ -187,10 +190,16 @@ class MissionMachine:
             outputs.commands.append((Command.HOVER, "came off the surface"))
             self._missed(inputs, "came off the surface after the motors stopped")
         elif self._elapsed(inputs) > self.settings.rest_time:
-            self._end(outputs, Result.PERCHED, "perched", contact_time=self._contact_time)
+            result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
+            self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
 
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
         resting = inputs.controller is ControllerState.HOVERING and self._moves.slow(inputs.state)
+        if self._gripped(inputs):
+            self._contact_time = inputs.time
+            outputs.commands.append((Command.ATTACHED, "the gripper has closed all the same"))
+            self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
+            return
         if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
             self._end(outputs, Result.CANCELLED if self._cancelled else Result.CRASHED, f"{self._failure}; on the ground or descending")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
@@ -207,13 +216,20 @@ class MissionMachine:
             else:
                 self._end(outputs, Result.MISSED, f"{self._failure}; recovered to a hover")
 
+    def _gripped(self, inputs: Inputs) -> bool:
+        """An abort came so late that the vehicle passed the wire on its way out, and holds it."""
+        if self._goal.mode is not Mode.POWERLINE or self._perch is None:
+            return False
+        after = inputs.time - self._perch.start_time - self._perch.duration
+        return -self.settings.contact_early < after < 1.0 and self._adhesion.attached(inputs.state, self.target)
+
     # -- planning ----------------------------------------------------------------------------------------------------
 
     def _ask_plan(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
         self.target = target
         zero = np.zeros(3)
         p, yaw = self._moves.hover
-        outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target, self._goal)
+        outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target, self._goal, self._latency)
         self._enter(Phase.PLANNING, inputs.time, "planning")
 
     @property
@@ -239,14 +255,28 @@ class MissionMachine:
                 and start > self._perch.start_time and inputs.time - self._replanned_at >= self.settings.replan_period):
             self._replanned_at, self._asked_target = inputs.time, inputs.target
             zero = np.zeros(3)
-            outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, self._goal,
+            outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, self._goal, self._latency,
                                       current=self._perch.trajectory)
+
+    def _look_ahead(self, inputs: Inputs, outputs: Outputs) -> None:
+        """On the way to a wire: follow the map as it gets better, and keep a way out ready."""
+        if inputs.plan is not None:
+            outputs.way_out, better = self._running.answered(inputs.plan, inputs.time)
+            outputs.trajectory_id = self._perch_id
+            if better is not None:
+                self._running, self.target = better, better.target
+                self._fly(better.plan, outputs)
+                self.message = f"re-planned, {better.plan.duration:.2f} s"
+        usable, _ = self._usable(inputs.target)
+        outputs.query = self._running.query(inputs.time, inputs.target if usable else None, self._goal)
 
     def _fly(self, plan: PlanAnswer, outputs: Outputs) -> None:
         self._perch, self._perch_id = plan, self._new_id()
         outputs.perch, outputs.trajectory_id = plan, self._perch_id
         if self.phase is Phase.PLANNING:
             self._asked_target, self._replanned_at = self.target, -math.inf
+            if self._goal.mode is Mode.POWERLINE:
+                self._running = RunningPlan(plan, self.target, self.settings)
 
     def _usable(self, target: Target | None) -> tuple[bool, str]:
         """Whether a target is fresh and certain enough to plan on, and why not."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perch_control.modes import Command, State as ControllerState
-from perch_core.trajectory import FlatTrajectory
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory, StateSample
 
 
 class Phase(str, Enum):
@@ -117,7 +117,11 @@ class PlanQuery:
         yaw: start yaw [rad].
         target: where to perch.
         goal: what was asked for.
+        latency: from the request to the use of the plan [s].
         current: the trajectory being flown, to be continued from `start_time`; None: start from p, v, a, j.
+        state: full state at the start, of a powerline plan that is being flown; None: level, with this yaw.
+        recovery: plan the way out from `state` alone.
+        perch_pose: where to end (position [m], attitude xyzw); None: as the target and the goal's pitch say.
     """
 
     start_time: float
@@ -128,7 +132,11 @@ class PlanQuery:
     yaw: float
     target: Target
     goal: Goal
+    latency: float = 0.0
     current: Any = None
+    state: StateSample | None = None
+    recovery: bool = False
+    perch_pose: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,7 @@ class PlanAnswer:
         trajectory: the message to pass on (opaque to the mission).
         start_time: when it starts [s].
         duration: from its start to the contact [s].
+        sampled: the states of a powerline plan.
     """
 
     success: bool
@@ -148,6 +157,7 @@ class PlanAnswer:
     trajectory: Any = None
     start_time: float = 0.0
     duration: float = 0.0
+    sampled: SampledTrajectory | None = None
 
 
 @dataclass(frozen=True)
@@ -183,6 +193,7 @@ class Outputs:
     commands: list[tuple[Command, str]] = field(default_factory=list)
     reference: FlatTrajectory | None = None    # a trajectory of the mission's own: take-off, search
     perch: PlanAnswer | None = None            # a planned perch to be flown
+    way_out: PlanAnswer | None = None          # a recovery to keep ready, out of the trajectory with this id
     trajectory_id: int = 0
     query: PlanQuery | None = None
     outcome: Outcome | None = None

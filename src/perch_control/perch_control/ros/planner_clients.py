@@ -11,6 +11,7 @@ from rclpy.task import Future
 
 from perch_core import so3
 from perch_core.ros.conversions import to_point, to_pose, to_seconds, to_stamp, to_vector
+from perch_core.ros.trajectories import from_message
 from perch_control.mission import Mode, PlanAnswer, PlanQuery
 
 _NAN = float("nan")
@@ -44,11 +45,16 @@ class PlannerClients:
 def plan_answer(response: PlanPerch.Response | PlanPowerline.Response) -> PlanAnswer:
     """What a planner's response means to the mission."""
     trajectory = response.trajectory
+    sampled = None
     if isinstance(response, PlanPowerline.Response):
-        trajectory.at_end, duration = Trajectory.AT_END_RECOVER, response.perch_time
+        duration = response.perch_time or response.recovery_time
+        if response.perch_time:  # a recovery alone ends in a hover
+            trajectory.at_end = Trajectory.AT_END_RECOVER
+        if response.success:
+            sampled = from_message(trajectory)
     else:
         trajectory.at_end, duration = Trajectory.AT_END_CONTACT, sum(s.duration for s in trajectory.segments)
-    return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp), duration)
+    return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp), duration, sampled)
 
 
 def _surface(query: PlanQuery) -> PlanPerch.Request:
@@ -63,11 +69,16 @@ def _surface(query: PlanQuery) -> PlanPerch.Request:
 
 
 def powerline_request(query: PlanQuery) -> PlanPowerline.Request:
-    """The request for a perch on a cable."""
-    q_WB = so3.quat_exp([0.0, 0.0, query.yaw])
+    """The request for a perch on a cable, or for the way out of one."""
+    q_WB = so3.quat_exp([0.0, 0.0, query.yaw]) if query.state is None else query.state.q
     request = PlanPowerline.Request(
         start_time=to_stamp(float(query.start_time)), start_pose=to_pose(query.p, q_WB), start_velocity=to_vector(query.v),
         target_line=query.target.line, perch_point=to_point(query.target.p_WS), perch_pitch=float(query.goal.perch_pitch),
-        perception_aware=query.goal.perception_aware, with_recovery=True)
+        perception_aware=query.goal.perception_aware, with_recovery=True, recovery_only=query.recovery)
+    if query.state is not None:
+        request.start_angular_velocity = to_vector(query.state.w)
+        request.start_rotor_thrust = query.state.rotor_thrust.tolist()
+    if query.perch_pose is not None:
+        request.use_pose, request.perch_pose = True, to_pose(*query.perch_pose)
     request.lines = list(query.target.lines)
     return request

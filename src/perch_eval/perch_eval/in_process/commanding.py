@@ -90,10 +90,11 @@ class Commanding:
             published_items.append(FlownTrajectory(outputs.trajectory_id, flat, AtEnd.HOLD))
         if outputs.perch is not None:
             published_items.append(self._flown(outputs.trajectory_id, outputs.perch))
+        if outputs.way_out is not None:
+            msg = outputs.way_out.trajectory
+            published_items.append(FlownTrajectory(outputs.trajectory_id, from_message(msg), AtEnd.HOLD, 0.0, 0.0, ready=True))
         if outputs.query is not None:
-            settings = self._settings
-            latency = settings.powerline_latency if self._goal.mode is Mode.POWERLINE else settings.planner_latency
-            self._pending = (time + latency, self._planning.answer(outputs.query))
+            self._pending = (time + outputs.query.latency, self._planning.answer(outputs.query))
         if outputs.outcome is not None:
             self.outcome = outputs.outcome
         self._note(time)

@@ -46,7 +46,7 @@ def events(trace: FlightTrace) -> Iterator[tuple[str, int, Any]]:
         msg: Trajectory = flat_message(flown.trajectory) if flat else sampled_message(flown.trajectory)
         msg.id, msg.at_end, msg.contact_time = flown.id, int(flown.at_end), float(flown.contact_time)
         msg.recovery_start = float(flown.recovery_start)
-        yield "trajectory", stamp_of(time), msg
+        yield "recovery" if flown.ready else "trajectory", stamp_of(time), msg
     for time, code, reason in trace.commands:
         yield "controller/command", stamp_of(time), _stamped(ControllerCommand(command=code, reason=reason), time)
     for time, lines in trace.maps:

@@ -34,6 +34,7 @@ class FlownTrajectory:
     at_end: AtEnd
     contact_time: float = 0.0
     recovery_start: float = -1.0
+    ready: bool = False  # not to be flown but to be kept ready: topic `recovery`
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +75,11 @@ class Piloting:
         flat = isinstance(order.trajectory, FlatTrajectory)
         source = FlatReference(order.trajectory) if flat else SampledReference(order.trajectory, self._vehicle.mass)
         try:
-            self._flight.follow(Order(order.id, source, order.trajectory.start_time, order.at_end, order.contact_time,
-                                      order.recovery_start))
+            take = self._flight.keep_ready if order.ready else self._flight.follow
+            take(Order(order.id, source, order.trajectory.start_time, order.at_end, order.contact_time, order.recovery_start))
         except PerchError as error:
-            self._flight.maneuvers.message = f"trajectory {order.id} refused: {error}"
+            if not order.ready:
+                self._flight.maneuvers.message = f"trajectory {order.id} refused: {error}"
 
     def step(self, time: float, imu: ImuSample, odometry: Odometry) -> StepResult:
         """The motor command of a step."""

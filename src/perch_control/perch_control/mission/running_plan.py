@@ -1,0 +1,99 @@
+"""What the mission asks while a powerline plan is flown: a better perch, and ways out of it. [P:V-B]
+
+A plan rests on a map that was made from metres away, by an odometry that has drifted since. On the way the wire comes near,
+and the map gets better: the rest of the perch is planned again from the running plan's own state, so that nothing jumps.
+Between these, recoveries are planned from states that lie ahead, one after the other: an abort at any time finds one ready.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perch_core.trajectory import StateSample
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, Target
+
+_DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
+
+
+class RunningPlan:
+    """A powerline plan in flight, with at most one query under way.
+
+    Attributes:
+        plan: what is flown.
+        target: the place that it was made for.
+        covered: start of the latest way out that is known [s].
+    """
+
+    def __init__(self, plan: PlanAnswer, target: Target, settings: MissionSettings, replanned_at: float = -math.inf) -> None:
+        self.plan, self.target, self.covered = plan, target, plan.start_time
+        self._settings, self._replanned_at = settings, replanned_at
+        self._asked: PlanQuery | None = None
+
+    @property
+    def end(self) -> float:
+        """Time of the planned contact [s]."""
+        return self.plan.start_time + self.plan.duration
+
+    def state(self, time: float) -> StateSample:
+        """The plan's state at a time [s]."""
+        return self.plan.sampled.sample(time - self.plan.start_time)
+
+    def query(self, time: float, target: Target | None, goal: Goal) -> PlanQuery | None:
+        """What to ask now, if anything.
+
+        Args:
+            time: of the tick [s].
+            target: as mapped now, when it is certain enough to plan on.
+            goal: what was asked of the mission.
+        """
+        if self._asked is not None:
+            return None
+        s, start = self._settings, time + self._settings.ahead_latency + _DECISION
+        if goal.replan and target is not None and self._better(target, time, start):
+            self._replanned_at = time
+            return self._ask(start, target, goal, perch_pose=self._perch_pose(target))
+        start = max(start, self.covered + s.way_out_spacing)
+        if start < self.end - s.way_out_until:
+            return self._ask(start, self.target, goal, recovery=True)
+        return None
+
+    def answered(self, plan: PlanAnswer, time: float) -> tuple[PlanAnswer | None, RunningPlan | None]:
+        """Take the answer to the last query.
+
+        Returns:
+            A way out to keep ready, or None; and the plan to fly instead of this one, or None.
+        """
+        query, self._asked = self._asked, None
+        if query is None:
+            return None, None
+        if query.recovery:
+            self.covered = query.start_time  # a refusal, too: the next one is asked for further on
+        if not plan.success or plan.start_time <= time:
+            return None, None
+        if query.recovery:
+            return plan, None
+        late = plan.start_time + plan.duration - self.end
+        if abs(late) > self._settings.replan_shift:
+            return None, None  # a detour: the wire is better met as planned, or missed and left
+        return None, RunningPlan(plan, query.target, self._settings, self._replanned_at)
+
+    def _better(self, target: Target, time: float, start: float) -> bool:
+        s = self._settings
+        return (target.time > self.target.time and self.end - start > s.powerline_replan_until
+                and start > self.plan.start_time + _DECISION and time - self._replanned_at >= s.powerline_replan_period
+                and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.replan_distance)
+
+    def _perch_pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
+        """The planned end, moved with the wire: position [m] and attitude xyzw. Its side of the wire stays the same."""
+        end = self.state(self.end)
+        return end.p + target.p_WS - self.target.p_WS, end.q
+
+    def _ask(self, start: float, target: Target, goal: Goal, recovery: bool = False,
+             perch_pose: tuple[np.ndarray, np.ndarray] | None = None) -> PlanQuery:
+        x, zero = self.state(start), np.zeros(3)
+        self._asked = PlanQuery(start, x.p, x.v, zero, zero, 0.0, target, goal, latency=self._settings.ahead_latency,
+                                state=x, recovery=recovery, perch_pose=perch_pose)
+        return self._asked

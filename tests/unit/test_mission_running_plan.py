@@ -1,0 +1,109 @@
+"""A powerline plan in flight: better perches and ways out are asked for, one at a time, from states that lie ahead. [P:V-B]"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, PlanAnswer, State, Target
+from perch_control.mission.running_plan import RunningPlan
+from perch_core import so3
+from perch_core.trajectory import SampledTrajectory
+from perch_core.vehicle import GRAVITY
+
+START, LENGTH = 10.0, 2.5
+GOAL = Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.array([5.0, 0.0, 4.75]), replan=True)
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+SETTINGS = MissionSettings()
+
+
+def states(duration: float) -> SampledTrajectory:
+    """Along x at 2 m/s, with a body rate and unequal rotors."""
+    t = np.linspace(0.0, duration, 200)
+    zero = np.zeros((200, 3))
+    return SampledTrajectory(t, np.stack([2.0 * t, 0 * t, 4.0 + 0 * t], 1), np.tile(LEVEL, (200, 1)), np.tile([2.0, 0, 0], (200, 1)),
+                             np.tile([0.0, 1.5, 0.0], (200, 1)), zero, zero, np.tile([1.0, 2.0, 3.0, 4.0], (200, 1)))
+
+
+def target(time: float, x: float = 5.0) -> Target:
+    return Target(time, np.array([x, 0.0, 4.75]), LEVEL, 0.02, 0.01)
+
+
+def running(length: float = LENGTH) -> RunningPlan:
+    return RunningPlan(PlanAnswer(True, "", object(), START, length, states(length + 0.8)), target(9.0), SETTINGS)
+
+
+def answer(start: float, length: float, success: bool = True) -> PlanAnswer:
+    return PlanAnswer(success, "", object(), start, length, states(length) if success else None)
+
+
+def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near():
+    plan, time, starts = running(), START - 0.03, []
+    while time < plan.end:
+        query = plan.query(time, None, GOAL)
+        if query is not None:
+            assert query.recovery and plan.query(time, None, GOAL) is None, "one query at a time"
+            np.testing.assert_allclose(query.state.p, [2.0 * (query.start_time - START), 0.0, 4.0], atol=1e-9)
+            np.testing.assert_allclose(query.state.w, [0.0, 1.5, 0.0])
+            np.testing.assert_allclose(query.state.rotor_thrust, [1.0, 2.0, 3.0, 4.0])
+            time += query.latency
+            assert query.start_time > time, "known before it is needed"
+            ready, better = plan.answered(answer(query.start_time, 1.0), time)
+            assert ready is not None and better is None
+            starts.append(query.start_time)
+        time += 0.02
+    gaps = np.diff([START, *starts, plan.end])
+    assert len(starts) >= 4 and gaps.max() < 0.65, "an abort finds one within the time that the controller flies on"
+
+
+def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
+    plan = running()
+    query = plan.query(START + 0.1, target(10.0, x=5.06), GOAL)
+    assert not query.recovery and query.target.p_WS[0] == 5.06
+    np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.end).p + [0.06, 0.0, 0.0], atol=1e-9)
+    ready, better = plan.answered(answer(query.start_time, plan.end - query.start_time + 0.05), START + 0.4)
+    assert ready is None and better.target.p_WS[0] == 5.06
+    assert better.end == pytest.approx(plan.end + 0.05)
+
+
+@pytest.mark.parametrize("length, success", [(4.0, True), (1.0, False)])
+def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
+    plan = running()
+    query = plan.query(START + 0.1, target(10.0, x=5.06), GOAL)
+    assert plan.answered(answer(query.start_time, length, success), START + 0.4) == (None, None)
+    assert plan.query(START + 0.42, None, GOAL).recovery, "the next thing is asked"
+
+
+@pytest.mark.parametrize("time, x, goal", [
+    (START + 0.1, 5.002, GOAL), (START + LENGTH - 0.6, 5.06, GOAL),
+    (START + 0.1, 5.06, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
+def test_no_new_perch_for_millimetres_nor_at_the_end_nor_unasked(time, x, goal):
+    query = running().query(time, target(10.0, x=x), goal)
+    assert query is None or query.recovery
+
+
+def test_an_answer_that_comes_too_late_is_not_used():
+    plan = running()
+    query = plan.query(START + 0.1, None, GOAL)
+    assert plan.answered(answer(query.start_time, 1.0), query.start_time + 0.01) == (None, None)
+
+
+def tilted(angle: float) -> np.ndarray:
+    return so3.quat_exp([0.0, -angle, 0.0])
+
+
+@pytest.mark.parametrize("pitch", np.radians([20.0, 80.0, 180.0]))
+def test_a_grip_is_felt_and_flight_beside_the_wire_is_not_taken_for_one(pitch):
+    wire = Target(0.0, np.zeros(3), tilted(pitch), 0.01, 0.01)
+    p, zero = np.array([-0.1, 0.0, 0.1]), np.zeros(3)
+
+    def felt(q: np.ndarray, force: np.ndarray) -> bool:
+        monitor = AdhesionMonitor(AdhesionLimits())
+        monitor.add(np.tile(force, (40, 1)))
+        return monitor.attached(State(p, q, zero, zero), wire)
+
+    carried = so3.quat_rotate(so3.quat_conjugate(tilted(pitch)), np.array([0.0, 0.0, GRAVITY]))
+    assert felt(tilted(pitch), carried + [0.2, -0.1, 0.3])
+    for thrust in np.linspace(0.0, 25.0, 26):  # no thrust looks like the wire's pull
+        assert not felt(tilted(pitch), np.array([0.0, 0.0, thrust]))
+    assert not felt(LEVEL, np.array([0.0, 0.0, GRAVITY])), "a hover beside the wire"
