@@ -20,6 +20,7 @@ EXAMPLES = """examples:
   python3 scripts/start_stack.py --scenario my.yaml --seed 3 --composed
   python3 scripts/start_stack.py --without mission recorder            start those yourself (run_node.py)
   python3 scripts/start_stack.py --only vehicle --realtime
+  python3 scripts/start_stack.py --composed --view                     watch it in Foxglove, ws://localhost:8765
   python3 scripts/start_stack.py -p vehicle.cameras:=none -p estimator.gate_probability:=0.99
   python3 scripts/start_stack.py --namespace /quad1 --domain 7
 
@@ -39,6 +40,8 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--only", nargs="+", default=[], metavar="NODE", help="start these instead of the scenario's nodes")
     parser.add_argument("--without", nargs="+", default=[], metavar="NODE", help="do not start these nodes")
     parser.add_argument("--realtime", action="store_true", help="pace by the wall clock instead of lockstep")
+    parser.add_argument("--view", nargs="?", type=int, const=8765, metavar="PORT",
+                        help="serve the flight to Foxglove at ws://localhost:PORT (8765); layout: config/foxglove_layout.json")
     parser.add_argument("--domain", type=int, metavar="N", help="ROS domain id, 0 to 101 (default: $ROS_DOMAIN_ID)")
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
     parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>)")
@@ -55,6 +58,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.domain is not None and not 0 <= arguments.domain <= 101:
         parser.error(f"--domain {arguments.domain} is outside [0, 101]")
+    if arguments.view is not None and not 0 <= arguments.view <= 65535:
+        parser.error(f"--view {arguments.view} is outside [0, 65535]")
     if arguments.namespace and not arguments.namespace.startswith("/"):
         parser.error(f"--namespace {arguments.namespace}: must begin with '/', as in /quad1")
     if arguments.domain is not None:
@@ -91,18 +96,24 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs
     from perch_eval.stack import Stack
+    from perch_eval.view.address import check_free
     from ros_graph.connection import visit
 
     source = config.find("scenarios", arguments.scenario).resolve()
     scenario = load_scenario(source)
     check_names(scenario, source)
+    overrides = parse_overrides(arguments.parameter)
+    if arguments.view is not None:
+        viewer = overrides["viewer"] = {"port": arguments.view} | overrides.get("viewer", {})
+        if viewer["port"] == arguments.view:
+            check_free(str(viewer.get("host", "127.0.0.1")), arguments.view)
     launches = node_launches(
         scenario,
-        choose_nodes(scenario, arguments.only, arguments.without),
+        choose_nodes(scenario, arguments.only, arguments.without, ("viewer",) if arguments.view is not None else ()),
         seed=arguments.seed,
         scenario_source=str(source),
         lockstep=not arguments.realtime,
-        overrides=parse_overrides(arguments.parameter),
+        overrides=overrides,
     )
     folder = (arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute()
     programs = node_programs(launches, folder, namespace=arguments.namespace, composed=arguments.composed)

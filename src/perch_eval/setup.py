@@ -22,6 +22,7 @@ setup(
     entry_points={
         "console_scripts": [
             "recorder = perch_eval.recorder_node:main",
+            "viewer = perch_eval.viewer_node:main",
             "composed = perch_eval.composed_node:main",
         ],
     },

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 
 import psutil
@@ -91,6 +92,7 @@ def test_nodes_in_a_namespace_become_ready(start):
     (["--only", "estimator", "-p", "controller.type:=nmpc"], "'controller', which is not started"),
     (["-p", "gain=2"], "expected NODE.PARAMETER:=VALUE"),
     (["--domain", "200"], "200 is outside [0, 101]"),
+    (["--view", "70000"], "70000 is outside [0, 65535]"),
     (["--namespace", "quad1"], "must begin with '/'"),
     (["--only", "estimator", "-p", "estimator.no_such_gain:=1"], "no_such_gain"),
     (["--only", "estimator", "-p", "estimator.gate_probability:=7.0"], "gate_probability: 7 is outside"),
@@ -100,6 +102,31 @@ def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, domain, tmp
     result = run_script("start_stack.py", *arguments, *more, "--log-dir", str(tmp_path))
     assert result.returncode == 2
     assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
+
+
+def test_the_live_view_is_served_until_the_stack_is_stopped(start):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = start("--view", str(port))
+    assert set(children(process)) == {*NODES, "viewer"}
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as client:
+        client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                       b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n")
+        assert client.recv(200).startswith(b"HTTP/1.1 101")
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, error) == (0, "")
+
+
+def test_a_port_in_use_is_the_callers_mistake(domain, tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        result = run_script("start_stack.py", "--only", "estimator", "--view", port, "--domain", domain, "--log-dir", str(tmp_path))
+    assert result.returncode == 2 and "Traceback" not in result.stderr + result.stdout
+    assert f"127.0.0.1:{port} cannot be served (Address already in use" in result.stderr and "choose another" in result.stderr
 
 
 def test_a_single_node(domain):

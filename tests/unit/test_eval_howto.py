@@ -1,7 +1,9 @@
 """What the how-to guides show is valid: files load, commands are accepted, the Python example flies."""
 
+import importlib
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,9 +16,22 @@ from perch_eval.campaign.specification import load_campaign
 from perch_eval.evaluation import command as evaluation
 from perch_eval.replay import command as replay
 
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+
+
+def start_stack_parser():
+    """The command line of start_stack.py, which is a script and not in a package."""
+    sys.path.insert(0, str(SCRIPTS))
+    try:
+        return importlib.import_module("start_stack").command_line()
+    finally:
+        sys.path.remove(str(SCRIPTS))
+
+
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
-PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser}
+PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
+           "start_stack.py": start_stack_parser}
 
 
 def blocks(language):

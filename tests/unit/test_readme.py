@@ -135,6 +135,8 @@ def nodes(tmp_path_factory):
                 arguments = ["--ros-args", "--params-file", str(ROOT / "config" / f"{node}.yaml")]
                 if node == "recorder":
                     arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
+                if node == "viewer":
+                    arguments += ["-p", "port:=0"]
                 create = importlib.import_module(f"{PACKAGES[node]}.{node}_node").create
                 created[node] = create(cli_args=arguments, use_global_arguments=False)
             yield created

@@ -18,7 +18,7 @@ Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 
 NODES = ("vehicle", "vio", "vio_model", "estimator", "target_localizer", "powerline_mapper",
-         "perching_planner", "powerline_planner", "controller", "mission", "recorder")
+         "perching_planner", "powerline_planner", "controller", "mission", "recorder", "viewer")
 
 
 @dataclass(frozen=True, kw_only=True)

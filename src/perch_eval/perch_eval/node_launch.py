@@ -29,6 +29,7 @@ PACKAGES = {
     "controller": "perch_control",
     "mission": "perch_control",
     "recorder": "perch_eval",
+    "viewer": "perch_eval",
 }
 """Node (which is also the name of its executable) -> package."""
 
@@ -181,6 +182,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
     every_step = [topic for node, topic in (("estimator", "odometry"), ("controller", "motor_command")) if node in nodes]
     return {
         "recorder": {"every_step": every_step if lockstep and every_step else [""]},
+        "viewer": {"scenario": source},
         "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants or [""]},
         "vio": vehicle | {"start_position": list(scenario.start.position), "start_yaw_deg": scenario.start.yaw_deg},
         "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,

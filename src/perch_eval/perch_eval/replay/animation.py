@@ -31,7 +31,7 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path,
         writer = PillowWriter(fps=fps)
     elif path.suffix == ".mp4":
         if not FFMpegWriter.isAvailable():
-            raise PerchError(f"{path}: MP4 needs ffmpeg, which is not installed; choose a .gif")
+            raise PerchError(f"{path}: MP4 needs ffmpeg, which is not installed: sudo apt install ffmpeg; or choose a .gif")
         writer = FFMpegWriter(fps=fps)
     else:
         raise PerchError(f"{path}: the ending is neither .gif nor .mp4")
