@@ -75,7 +75,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
         self._participant.subscribe(Trajectory, "recovery", self._receive_recovery)
         self._participant.subscribe(ControllerCommand, "controller/command", self._receive_command)
-        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, on_arrival=self._watch_imu)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, on_arrival=self._watch_imu, backlog=True)
         if self.params.nmpc.lines.any:
             self._participant.subscribe(PowerlineArray, "powerlines", self._receive_lines)
         self._participant.chain(Odometry, "odometry", self._receive_odometry, raw=True)

@@ -21,6 +21,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image, Imu
 
 from perch_core.config import quantity, text
+from perch_core.ros.backlog import Backlog
 from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import StepReading, stamp_of
@@ -37,6 +38,7 @@ TOPICS = {
 NOT_LATCHED = {"/diagnostics"}
 TRUTH = "ground_truth/odometry"
 REPORT_STEPS = 50
+LOOK = 0.1      # [s] wall clock; messages are written with each tick, and this often where none comes
 PATIENCE = 5.0  # [s] wall clock; messages that were sent long ago and have not come in this time never will
 
 
@@ -63,13 +65,14 @@ class RecorderNode(PerchNode[RecorderParameters]):
         self._waiting: StepReading | None = None
         self._waiting_since = 0.0
         self._next_image: dict[str, int] = {}
+        self._backlogs: list[tuple[str, str, Backlog]] = []
         for topic, msg_type in TOPICS.items():
             # Latched, because discovery may find a publisher only after its first messages.
             durability = DurabilityPolicy.VOLATILE if topic in NOT_LATCHED else DurabilityPolicy.TRANSIENT_LOCAL
             profile = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
             resolved = self.resolve_topic_name(topic)
             self._log.add_topic(resolved, type_name(msg_type))
-            self.create_subscription(msg_type, topic, self._writer(topic, resolved), profile, raw=True)
+            self._backlogs.append((topic, resolved, self.create_backlog(msg_type, topic, profile)))
         if self.params.image_rate > 0.0:
             for camera in ("down", "front"):
                 name = self.resolve_topic_name(f"camera_{camera}/image_raw/compressed")
@@ -78,18 +81,19 @@ class RecorderNode(PerchNode[RecorderParameters]):
                                          QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE), raw=True)
         self._participant = Participant(self, self._on_step, every=TICK_STEPS)
         self._participant.greet()
-        self.create_timer(1.0, self._lose_patience, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._lose_patience, clock=steady)
+        self.create_timer(LOOK, self._write, clock=steady)
 
-    def _writer(self, topic: str, resolved: str):
-        counted = topic in self._counts
-
-        def write(data: bytes) -> None:
-            self._log.write(resolved, data, stamp_of(data))
-            if counted and topic in self._counts:
-                self._counts[topic] += 1
-                self._report()
-
-        return write
+    def _write(self) -> None:
+        """Put on file what has come."""
+        for topic, resolved, backlog in self._backlogs:
+            messages = backlog.take()
+            for data in messages:
+                self._log.write(resolved, data, stamp_of(data))
+            if topic in self._counts:
+                self._counts[topic] += len(messages)
+        self._report()
 
     def _image_writer(self, topic: str):
         period = int(1e9 / self.params.image_rate)
@@ -113,7 +117,7 @@ class RecorderNode(PerchNode[RecorderParameters]):
     def _on_step(self, step: StepReading) -> None:
         if step.lockstep and step.index % REPORT_STEPS == 0:
             self._waiting, self._waiting_since = step, time.monotonic()
-            self._report()
+        self._write()
 
     def _report(self) -> None:
         """Report the tick once the truth of its step is on file, and what the nodes sent in all steps before."""
@@ -130,7 +134,8 @@ class RecorderNode(PerchNode[RecorderParameters]):
         self._report()
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file with what has come since the last tick."""
+        self._write()
         self._log.close()
 
 

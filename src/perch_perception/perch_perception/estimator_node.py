@@ -43,7 +43,7 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._status_publisher = self.create_publisher(EstimatorStatus, "estimator/status", qos.CHAIN)
         self._participant = Participant(self)
         self._participant.subscribe(Odometry, "vio/odometry", self._receive_vio)
-        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True)
+        self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, backlog=True)
 
     def _receive_vio(self, msg: Odometry) -> None:
         begin = time.perf_counter()

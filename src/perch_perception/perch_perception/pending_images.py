@@ -13,6 +13,7 @@ from typing import Any, Callable
 from perch_core.errors import PerchError
 
 FUTURE = 0.5      # an image stamped this much ahead of the odometry cannot be right [s]
+LOOK = 0.05       # odometry is taken with each image and tick, and this often where neither comes [s], wall clock
 QUEUE_LENGTH = 2  # images that wait in real time; older ones give way
 
 

@@ -18,11 +18,12 @@ from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.vehicle import load_vehicle
 from perch_msgs.msg import Powerline, PowerlineArray
+from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
 
 from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
-from perch_perception.pending_images import PendingImages
+from perch_perception.pending_images import LOOK, PendingImages
 from perch_perception.pose_buffer import PoseBuffer, StampError
 from perch_perception.ros.states import body_state
 
@@ -62,18 +63,22 @@ class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
         self._used = -np.inf
         self._costs: deque[float] = deque(maxlen=100)
         self._images, self._diagnosed = 0, -np.inf
-        self._participant = Participant(self, every=TICK_STEPS)
-        self.create_subscription(Odometry, "odometry", self._receive_odometry, qos.CHAIN, raw=True)
+        self._participant = Participant(self, lambda _: self._take_odometry(), every=TICK_STEPS)
+        self._odometry = self.create_backlog(Odometry, "odometry", qos.CHAIN)
         self._lines = self._participant.publisher(PowerlineArray, "powerlines")
         self._pending = PendingImages(mount.stamp_offset, self._handle)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
+        self.create_timer(LOOK, self._take_odometry, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._participant.greet()
 
-    def _receive_odometry(self, data: bytes) -> None:
-        if self._buffer.add(body_state(data)):
-            self._pending.advance(self._buffer.newest)
+    def _take_odometry(self) -> None:
+        """Take the states that have come, and handle the images whose exposure they have passed."""
+        for data in self._odometry.take():
+            self._buffer.add(body_state(data))
+        self._pending.advance(self._buffer.newest)
 
     def _receive_image(self, msg: Image) -> None:
+        self._take_odometry()
         self._pending.add(msg, self._buffer.newest, keep_all=self._participant.lockstep is not False)
 
     def _handle(self, msg: Image, exposed: float, refusal: str) -> None:

@@ -20,10 +20,11 @@ from perch_core.ros.node import PerchNode, spin_main
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_msgs.msg import TargetDetection
+from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
 
 from perch_perception.images import ImageError, mono_image
-from perch_perception.pending_images import PendingImages
+from perch_perception.pending_images import LOOK, PendingImages
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.ros.states import body_state
 from perch_perception.tags import (BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, LocalizerConfig,
@@ -70,19 +71,23 @@ class TargetLocalizerNode(PerchNode[TargetLocalizerConfig]):
         self._costs: deque[float] = deque(maxlen=300)
         self._counts = {"images": 0, "found": 0, "complete": 0}
         self._message, self._diagnosed = "", -np.inf
-        self._participant = Participant(self, every=TICK_STEPS)
-        self.create_subscription(Odometry, "odometry", self._receive_odometry, qos.CHAIN, raw=True)
+        self._participant = Participant(self, lambda _: self._take_odometry(), every=TICK_STEPS)
+        self._odometry = self.create_backlog(Odometry, "odometry", qos.CHAIN)
         self._detections = self._participant.publisher(TargetDetection, "target/detections")
         self._poses = self._participant.publisher(PoseWithCovarianceStamped, "target/pose")
         self._pending = PendingImages(self._mount.stamp_offset, self._handle)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
+        self.create_timer(LOOK, self._take_odometry, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._participant.greet()
 
-    def _receive_odometry(self, data: bytes) -> None:
-        if self._buffer.add(body_state(data)):
-            self._pending.advance(self._buffer.newest)
+    def _take_odometry(self) -> None:
+        """Take the states that have come, and handle the images whose exposure they have passed."""
+        for data in self._odometry.take():
+            self._buffer.add(body_state(data))
+        self._pending.advance(self._buffer.newest)
 
     def _receive_image(self, msg: Image) -> None:
+        self._take_odometry()
         self._pending.add(msg, self._buffer.newest, keep_all=self._participant.lockstep is not False)
 
     def _handle(self, msg: Image, exposed: float, refusal: str) -> None:

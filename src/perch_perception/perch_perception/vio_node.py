@@ -18,6 +18,7 @@ from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import read_imu
 from perch_core.vehicle import load_vehicle
+from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image, Imu
 
 from perch_perception.images import ImageError, mono_image
@@ -26,6 +27,7 @@ from perch_perception.vio import FrameOutcome, VioConfig, VioResult, VisualInert
 from perch_perception.vio.drawing import TrackPainter
 
 DIAGNOSTICS_PERIOD = 1_000_000_000  # [ns]
+LOOK = 0.05  # samples are taken with each image and tick, and this often where neither comes [s], wall clock
 QUEUE = 2  # images that wait in real time; older ones give way
 
 
@@ -63,16 +65,13 @@ class VioNode(PerchNode[VioNodeConfig]):
         self._dropped, self._diagnosed = 0, -DIAGNOSTICS_PERIOD
         self._painter = TrackPainter()
         self._outcome: FrameOutcome | None = None
-        self._participant = Participant(self, every=TICK_STEPS)
+        self._participant = Participant(self, lambda _: self._work(), every=TICK_STEPS)
         self._odometry = self._participant.publisher(Odometry, "vio/odometry")
         self._debug = self.create_publisher(Image, "vio/debug_image", qos.IMAGE)
-        self.create_subscription(Imu, "imu/data_raw", self._receive_imu, qos.CHAIN, raw=True)
+        self._imu = self.create_backlog(Imu, "imu/data_raw", qos.CHAIN)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
+        self.create_timer(LOOK, self._work, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._participant.greet()
-
-    def _receive_imu(self, data: bytes) -> None:
-        self._vio.add_imu(ImuSample(*read_imu(data)))
-        self._work()
 
     def _receive_image(self, msg: Image) -> None:
         self._waiting.append(msg)
@@ -82,7 +81,9 @@ class VioNode(PerchNode[VioNodeConfig]):
         self._work()
 
     def _work(self) -> None:
-        """Use every waiting frame whose exposure the IMU has passed."""
+        """Take the IMU's samples, and use every waiting frame whose exposure they have passed."""
+        for data in self._imu.take():
+            self._vio.add_imu(ImuSample(*read_imu(data)))
         while self._waiting and self._vio.covers(nanoseconds(self._waiting[0].header.stamp)):
             msg = self._waiting.popleft()
             try:

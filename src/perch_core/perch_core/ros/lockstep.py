@@ -20,15 +20,18 @@ from typing import Any, Callable
 
 from builtin_interfaces.msg import Time
 from perch_msgs.msg import Release, Step, StepReport
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from perch_core.ros import qos
+from perch_core.ros.backlog import Backlog
 from perch_core.ros.conversions import to_stamp
 from perch_core.ros.wire import StepReading, read_step, stamp_of
 
+RETRY = 0.005    # [s] wall clock
 TICK_STEPS = 10  # `tick` repeats every tenth step, for nodes that need no more
 
 
@@ -61,6 +64,8 @@ class _Chain:
     callback: Callable[[Any], None]
     period: int
     raw: bool
+    on_arrival: Callable[[bytes], None] | None
+    backlog: Backlog | None = None
     inbox: dict[int, bytes] = field(default_factory=dict)  # stamp -> serialised message, in order
 
     def deliver(self, data: bytes) -> None:
@@ -92,7 +97,7 @@ class Participant:
         self.lockstep: bool | None = None      # unknown until the first step
         self.step: StepReading | None = None   # the step handled last
         self._reports: Publisher | None = None
-        self._greeting = None
+        self._greeting = self._retry = None
         node.create_subscription(Step, "step" if every == 1 else "tick", self._receive_step, qos.STEP, raw=True)
 
     # -- wiring ------------------------------------------------------------------------------------------------------
@@ -106,7 +111,7 @@ class Participant:
         self._gated[subscription.topic_name] = gated
 
     def chain(self, msg_type: type, topic: str, callback: Callable[[Any], None], period: int = 1, raw: bool = False,
-              on_arrival: Callable[[bytes], None] | None = None) -> None:
+              on_arrival: Callable[[bytes], None] | None = None, backlog: bool = False) -> None:
         """Subscribe to a topic that carries one message with the step's stamp at every `period`-th step.
 
         Args:
@@ -117,16 +122,19 @@ class Participant:
             period: steps from one message that is wanted to the next.
             raw: give the message to the callback as it is on the wire (`perch_core.ros.wire` reads it).
             on_arrival: receives every serialised message as it comes, before its step is handled.
+            backlog: the node is not woken by the messages; they are taken when a step or another message has woken it.
+                For topics whose messages are sent before their step, or before another message of it. The node is a
+                `PerchNode`.
         """
-        chain = _Chain(msg_type, callback, period, raw)
+        chain = _Chain(msg_type, callback, period, raw, on_arrival)
         self._chains.append(chain)
-
-        def receive(data: bytes) -> None:
-            if on_arrival is not None:
-                on_arrival(data)
-            self._receive_chain(chain, data)
-
-        self._node.create_subscription(msg_type, topic, receive, qos.CHAIN, raw=True)
+        if backlog:
+            chain.backlog = self._node.create_backlog(msg_type, topic, qos.CHAIN)
+            if self._retry is None:  # a middleware may deliver in another order than was sent
+                self._retry = self._node.create_timer(RETRY, self._advance, clock=Clock(clock_type=ClockType.STEADY_TIME))
+                self._retry.cancel()
+        else:
+            self._node.create_subscription(msg_type, topic, lambda data: self._receive_chain(chain, data), qos.CHAIN, raw=True)
 
     def publisher(self, msg_type: type, topic: str, profile: QoSProfile = qos.GATED) -> GatedPublisher:
         """A publisher on a gated topic. Only slow participants, which send reports, have these."""
@@ -167,6 +175,7 @@ class Participant:
             self.step = step
             if self._on_step is not None:
                 self._on_step(step)
+            self._take_backlogs()
 
     def _receive_gated(self, gated: _Gated, msg: Any) -> None:
         gated.received += 1
@@ -177,12 +186,23 @@ class Participant:
         self._advance()
 
     def _receive_chain(self, chain: _Chain, data: bytes) -> None:
-        if self.lockstep is False:
-            chain.deliver(data)
-            return
-        chain.inbox[stamp_of(data)] = data
+        self._keep(chain, data)
         if self._steps:
             self._advance()
+
+    def _keep(self, chain: _Chain, data: bytes) -> None:
+        if chain.on_arrival is not None:
+            chain.on_arrival(data)
+        if self.lockstep is False:
+            chain.deliver(data)
+        else:
+            chain.inbox[stamp_of(data)] = data
+
+    def _take_backlogs(self) -> None:
+        for chain in self._chains:
+            if chain.backlog is not None:
+                for data in chain.backlog.take():
+                    self._keep(chain, data)
 
     def _flush(self) -> None:
         """Real time: deliver what came before the first step."""
@@ -201,10 +221,15 @@ class Participant:
             return  # a callback published to this very process (composed): the outer call goes on
         self._busy = True
         try:
-            while self._steps and self._ready(self._steps[0]):
+            while self._steps:
+                self._take_backlogs()
+                if not self._ready(self._steps[0]):
+                    break
                 self._handle(self._steps.popleft())
         finally:
             self._busy = False
+        if self._retry is not None and self._retry.is_canceled() != (not self._steps):
+            self._retry.reset() if self._steps else self._retry.cancel()
 
     def _ready(self, step: StepReading) -> bool:
         for topic, count in step.released:

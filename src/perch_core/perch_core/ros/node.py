@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from typing import Any, Callable, Generic, NoReturn, Sequence, TypeVar
+from typing import Any, Callable, Generic, Iterator, NoReturn, Sequence, TypeVar
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # one core per node; must be set before numpy is imported
@@ -14,11 +14,14 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
+from perch_core.ros.backlog import Backlog
 from perch_core.ros.conversions import to_stamp
 from perch_core.ros.parameters import Parameters
 
@@ -34,6 +37,7 @@ class PerchNode(Node, Generic[T]):
 
     def __init__(self, name: str, parameters: type[T], on_change: Callable[[T], None] | None = None,
                  **kwargs: Any) -> None:
+        self._unwatched: set[Subscription] = set()
         super().__init__(name, **kwargs)
         try:
             self._parameters_of_node = Parameters(self, parameters, on_change)
@@ -46,6 +50,17 @@ class PerchNode(Node, Generic[T]):
     def params(self) -> T:
         """The present parameters."""
         return self._parameters_of_node.value
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Those that the executor watches."""
+        return (subscription for subscription in super().subscriptions if subscription not in self._unwatched)
+
+    def create_backlog(self, msg_type: type, topic: str, profile: QoSProfile) -> Backlog:
+        """Subscribe to a topic without being woken by its messages; `profile.depth` of them are kept."""
+        subscription = self.create_subscription(msg_type, topic, lambda _: None, profile, raw=True)
+        self._unwatched.add(subscription)
+        return Backlog(subscription)
 
     def publish_diagnostics(self, time: float, values: dict[str, Any], level: int = 0, message: str = "ok") -> None:
         """Publish one status of this node on /diagnostics.
