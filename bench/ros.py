@@ -43,7 +43,7 @@ class Probe:
         self.time, self.misses = 0.0, {}
         for topic, kind in RATES.items():
             self.node.create_subscription(kind, topic, lambda _, topic=topic: self._count(topic), qos.CHAIN, raw=True)
-        self.node.create_subscription(Step, "step", self._step, qos.STEP)
+        self.node.create_subscription(Step, "tick", self._step, qos.STEP)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnose, qos.STATUS)
 
     def _count(self, topic: str) -> None:

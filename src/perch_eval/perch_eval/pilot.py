@@ -79,7 +79,7 @@ class Pilot:
         self._executor.add_node(self._node)
         self._client = ActionClient(self._node, Perch, "perch")
         self._time = 0.0
-        self._node.create_subscription(Step, "step", self._receive_step,
+        self._node.create_subscription(Step, "tick", self._receive_tick,
                                        QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
 
     @property
@@ -166,5 +166,5 @@ class Pilot:
             if time.monotonic() > last:
                 raise PerchError(f"{problem} within {timeout:g} s")
 
-    def _receive_step(self, step: Step) -> None:
+    def _receive_tick(self, step: Step) -> None:
         self._time = max(self._time, step.stamp.sec + 1e-9 * step.stamp.nanosec)
