@@ -15,7 +15,7 @@ from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       --quick: 5 seeds a condition
   python3 scripts/evaluate.py --full --jobs 2       100 seeds; interrupted, the same command goes on
-  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_cable)
+  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_inspection, p_cable)
 
 exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
 2 the caller's mistake, 130 interrupted"""
@@ -39,13 +39,20 @@ def _powerline(effort: Effort) -> list[Section]:
     return powerline_sections(effort)
 
 
+def _inspection(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.inspection import inspection_sections
+
+    return inspection_sections(effort)
+
+
 def _cable(effort: Effort) -> list[Section]:
     from perch_eval.evaluation.cable import cable_sections
 
     return cable_sections(effort)
 
 
-PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline, "p_cable": _cable}
+PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline,
+                          "p_inspection": _inspection, "p_cable": _cable}
 
 
 def parser() -> argparse.ArgumentParser:

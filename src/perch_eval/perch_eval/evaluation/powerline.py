@@ -1,4 +1,4 @@
-"""[P] Table I, Fig. 4-8: plans past powerlines; what is flown is added where the parts exist."""
+"""[P] Table I, Fig. 6-8: plans past powerlines; what is flown is added where the parts exist."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def powerline_sections(effort: Effort) -> list[Section]:
     try:
         from perch_planner.powerline import problem  # noqa: F401  (is it there at all?)
     except ImportError as error:
-        out = Section("p_table_1", "[P] Table I and Fig. 4-8", "The powerline planner cannot be loaded.")
+        out = Section("p_table_1", "[P] Table I and Fig. 6-8", "The powerline planner cannot be loaded.")
         out.missing("planning times, plans and flights", "", str(error))
         return [out]
-    return [_table(effort), _flown(effort), _published(), *_pictures(effort), _inspection()]
+    return [_table(effort), _flown(effort), _published(), *_pictures(effort)]
 
 
 def _table(effort: Effort) -> Section:
@@ -144,10 +144,3 @@ def _pictures(effort: Effort) -> list[Section]:
                 means["line_80_pa"]["mean_reprojection_px"] < means["line_80"]["mean_reprojection_px"], "as in Fig. 7")
     seven.data = means
     return [seven, eight]
-
-
-def _inspection() -> Section:
-    out = Section("p_fig_4_5", "[P] Fig. 4 and 5: inspection with the constraints in the NMPC", "")
-    out.missing("collisions avoided; mean reprojection error against the reference", "2 avoided; 500 % better (100 px)",
-                "inspection flights are not part of this evaluation yet")
-    return out

@@ -52,19 +52,23 @@ class Judgement:
         clearance: scaled clearance of the nearest line, shape (n,). [P:eq7]
         seen: measures of the watched line, n states.
         collisions: how often a line enters the body.
+        corner: distance of the image's corners from its centre [px].
     """
 
     clearance: np.ndarray
     seen: Visibility
     collisions: int
+    corner: float
 
     @property
     def reprojection(self) -> float:
-        """Mean distance of the watched line from the image centre [px]. [P:eq9]"""
-        return float(np.mean(self.seen.reprojection))
+        """Mean distance of the watched line from the image centre [px]; a line beyond the image's corners counts as at them,
+        so that a way into the line does not count for more than one past it. [P:eq9]"""
+        return float(np.mean(np.minimum(self.seen.reprojection, self.corner)))
 
 
 def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: Vehicle) -> Judgement:
     """Judge states p, q, ..., shape (n, >= 7), against the true lines, of which `line` is to be watched."""
-    return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, vehicle.mounts["front"]),
-                     collisions(states, lines, vehicle.body_radii))
+    mount = vehicle.mounts["front"]
+    return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, mount),
+                     collisions(states, lines, vehicle.body_radii), float(np.hypot(mount.camera.width, mount.camera.height)) / 2)

@@ -1,0 +1,127 @@
+"""Inspection [P:VI-A]: waypoint lines, the choice of lines, layouts, the mission's phase, and one layout flown."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from perch_control.mission import ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Phase, Result, State, Target
+from perch_control.mission.waypoints import waypoint_lines
+from perch_control.nmpc import LineWeights, chosen_lines
+from perch_core import config
+from perch_core.errors import ConfigError, PerchError
+from perch_core.lines import Segment
+from perch_core.scenario import Scenario, load_scenario
+from perch_core.vehicle import load_vehicle
+from perch_eval.in_process.parameters import NodeParameters
+from perch_eval.inspection.flight import fly
+from perch_eval.inspection.layout import random_layout, segments, watched
+from perch_eval.inspection.measures import collisions, judge, reference_of, reference_states
+from perch_control.mission.parameters import MissionParameters
+from perch_control.parameters import ControllerParameters
+
+BASE = load_scenario("inspection")
+RADII = load_vehicle("rpg").body_radii
+
+
+def test_waypoint_lines_are_straight_at_rest_at_each_and_turn_the_shorter_way():
+    places = [(np.array([0.0, 0.0, 1.0]), 3.0), (np.array([1.0, 2.0, 1.5]), -3.0), (np.array([1.0, 2.1, 1.5]), 0.5)]
+    lines = waypoint_lines(places, 0.5, start_time=7.0)
+    assert lines.start_time == 7.0 and lines.durations[0] == pytest.approx(np.sqrt(5.25) / 0.5)
+    ends = np.cumsum(lines.durations)
+    for time, (p, yaw) in zip([0.0, *ends], places):
+        sample = lines.sample(time)
+        np.testing.assert_allclose(sample.p, p, atol=1e-9)
+        np.testing.assert_allclose(np.concatenate([sample.v, sample.a]), 0.0, atol=1e-9)
+        assert math.remainder(sample.yaw - yaw, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+    middle = lines.sample(0.3 * ends[0])
+    assert np.linalg.norm(np.cross(middle.p - places[0][0], places[1][0] - places[0][0])) < 1e-9
+    assert abs(lines.sample(ends[0]).yaw - 3.0) < 0.3  # from 3 to -3 rad by +0.28, not by -6
+
+
+def test_the_watched_line_comes_first_whatever_is_nearer():
+    lines = [Segment.between((x, -2.0, 2.0), (x, 2.0, 2.0), 0.03, k) for k, x in enumerate((1.0, 2.0, 3.0, 4.0))]
+    p = np.array([0.0, 0.0, 2.0])
+    assert [line[0] for line in chosen_lines(lines, p, ())] == [1.0, 2.0, 3.0]
+    assert [line[0] for line in chosen_lines(lines, p, (4.1, 1.0, 2.2))] == [4.0, 1.0, 2.0]
+    assert chosen_lines([], p, ()) == ()
+    with pytest.raises(ConfigError, match="watched.*has 2 entries"):
+        LineWeights(watched=(1.0, 2.0))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_layouts_repeat_and_their_reference_collides_twice_and_looks_past_the_line(seed):
+    layout = random_layout(BASE, seed)
+    assert layout == random_layout(BASE, seed)
+    assert layout.world.cables != random_layout(BASE, seed + 10).world.cables
+    states, lines = reference_states(layout)[1], segments(layout)
+    assert collisions(states, lines, RADII) == 2
+    assert judge(states, lines, watched(layout, lines), load_vehicle("rpg")).reprojection > 60.0
+    assert collisions(states[[0, -1]], lines, RADII) == 0
+
+
+def test_collisions_are_counted_by_their_beginnings():
+    states = np.tile([0.0, 0, 0, 0, 0, 0, 1.0], (5, 1))
+    states[:, 0] = [0.0, 1.0, 0.0, 0.1, 1.0]
+    assert collisions(states, [Segment.between((0.0, -1, 0), (0.0, 1, 0), 0.03)], RADII) == 2
+
+
+def test_a_scenario_says_what_its_nodes_fly():
+    params = NodeParameters(BASE, 1)
+    places = params.of("mission", MissionParameters).mission.places
+    assert [tuple(p) for p, _ in places] == [w.position for w in BASE.inspection.waypoints]
+    assert places[0][1] == pytest.approx(math.radians(BASE.inspection.waypoints[0].yaw_deg))
+    assert params.of("controller", ControllerParameters).nmpc.lines.watched == BASE.inspection.watched
+    with pytest.raises(ConfigError, match="waypoints.*needs at least 2"):
+        config.from_mapping(Scenario, {"name": "x", "mode": "inspection"}, "x.yaml")
+    with pytest.raises(ConfigError, match="waypoints.*5 entries"):
+        MissionSettings(waypoints=(1.0,) * 5)
+    with pytest.raises(PerchError, match="not inspection"):
+        fly(dataclasses.replace(BASE, mode="powerline"), 1)
+
+
+@pytest.mark.parametrize("ends, result, message", [(True, Result.PERCHED, "inspected along 2 waypoints"),
+                                                   (False, Result.MISSED, "inspection given up: held up")])
+def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, result, message):
+    settings = MissionSettings(waypoints=(1.0, 0.0, 2.0, 0.0, 1.0, 2.0, 2.5, 10.0))
+    machine, controller, id, reference, seen, outcome = MissionMachine(settings), ControllerState.DISARMED, 0, None, [], None
+    machine.start(Goal(1.2, 10.0, mode=Mode.INSPECTION, perch_point=np.array([3.0, 0.0, 2.0])), 0.0)
+    p, time = np.zeros(3), 0.0
+    while outcome is None and time < 60.0:
+        time += 0.02
+        if reference is not None:
+            p = reference.sample(time - reference.start_time).p
+            share = (time - reference.start_time) / reference.duration
+            if share >= 1.0 or (machine.phase is Phase.INSPECTING and not ends and share > 0.5):
+                controller = ControllerState.HOVERING
+        target = Target(time, np.array([3.0, 0.0, 2.0]), np.array([0, 0, 0, 1.0]), 0.01, 0.01) if time > 6.0 else None
+        out = machine.tick(Inputs(time, State(p, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), True, controller, "held up", id, 0.0,
+                                  target, np.zeros((0, 3))))
+        if any(command.name == "ARM" for command, _ in out.commands):
+            controller = ControllerState.ARMED
+        if out.reference is not None:
+            reference, controller, id = out.reference, ControllerState.TRACKING, out.trajectory_id
+        assert out.query is None, "an inspection needs no planner"
+        seen.append(machine.phase)
+        outcome = out.outcome
+    assert outcome.result is result and message in outcome.message
+    assert Phase.SEARCHING in seen and Phase.INSPECTING in seen
+    if ends:
+        np.testing.assert_allclose(p, (1.0, 2.0, 2.5), atol=1e-6)
+
+
+def test_the_line_terms_avoid_both_collisions_and_keep_the_line_centred():
+    """Two legs of a layout, the estimated state and a map with errors: without the terms the cable is hit, with them it is not."""
+    layout = random_layout(BASE, 17)
+    with_terms = fly(layout, 1)
+    assert not with_terms.message and with_terms.collisions == 0
+    assert with_terms.reference.collisions == 2
+    assert with_terms.reference.reprojection > 5.0 * with_terms.flown.reprojection
+    assert with_terms.flown.seen.cheirality.all()
+    assert with_terms.times[-1] == pytest.approx(reference_of(layout).duration, abs=0.05)
+
+
+def test_without_the_line_terms_the_reference_is_followed_into_the_cable():
+    blind = fly(random_layout(BASE, 17), 1, with_lines=False)
+    assert blind.collisions > 0 and "crash" in " ".join(c.reason for c in blind.contacts)
