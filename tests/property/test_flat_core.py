@@ -178,3 +178,16 @@ def test_sampled_trajectory_passes_its_samples_and_turns_evenly():
     assert flight.sample(-1.0).p == pytest.approx(ramp[0]) and flight.sample(9.0).p == pytest.approx(ramp[-1])
     with pytest.raises(ValueError):
         SampledTrajectory(times[::-1], ramp, q, ramp, ramp, ramp, ramp, np.zeros((3, 4)))
+
+
+def test_one_sample_and_many_are_the_same_polynomial():
+    """The compiled evaluation at one time against the one in numpy at many."""
+    rng = np.random.default_rng(4)
+    trajectory = FlatTrajectory(np.array([0.7, 1.1, 0.4]), rng.normal(size=(3, 4, 10)))
+    times = np.linspace(0.0, trajectory.duration, 101)
+    many = trajectory.sample_many(times)
+    for k, t in enumerate(times):
+        one = trajectory.sample(float(t))
+        for name in ("p", "v", "a", "j", "s", "yaw", "yaw_rate", "yaw_acc"):
+            expected = getattr(many, name)
+            np.testing.assert_allclose(getattr(one, name), expected[k], rtol=1e-9, atol=1e-10 * np.abs(expected).max())

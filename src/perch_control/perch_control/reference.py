@@ -99,15 +99,13 @@ class FlatReference:
 
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]. Past the end the last acceleration holds: a contact is being awaited there."""
-        x = self.trajectory.sample(t)
+        (*p, yaw), (*v, yaw_rate), (*a, yaw_acc), (*j, _), (*s, _) = self.trajectory.values(t).tolist()
         over = t - self.trajectory.duration
-        p, v, a = x.p.tolist(), x.v.tolist(), x.a.tolist()
         if over > 0.0:
             p = [p[i] + over * (v[i] + 0.5 * over * a[i]) for i in range(3)]
             v = [v[i] + over * a[i] for i in range(3)]
-            return Setpoint(tuple(p), tuple(v), tuple(a), _ZERO, _ZERO, *heading(x.yaw))
-        return Setpoint(tuple(p), tuple(v), tuple(a), tuple(x.j.tolist()), tuple(x.s.tolist()),
-                        *heading(x.yaw, x.yaw_rate, x.yaw_acc))
+            return Setpoint(tuple(p), tuple(v), tuple(a), _ZERO, _ZERO, *heading(yaw))
+        return Setpoint(tuple(p), tuple(v), tuple(a), tuple(j), tuple(s), *heading(yaw, yaw_rate, yaw_acc))
 
 
 @dataclass(frozen=True)

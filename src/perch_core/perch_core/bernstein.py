@@ -11,6 +11,8 @@ from math import comb
 
 import numpy as np
 
+from perch_core.jit import compiled
+
 
 @lru_cache(maxsize=None)
 def binomials(n: int) -> np.ndarray:
@@ -33,6 +35,36 @@ def basis(degree: int, s: np.ndarray | float) -> np.ndarray:
     s = np.asarray(s, float)[..., None]
     i = np.arange(degree + 1)
     return binomials(degree) * s**i * (1.0 - s) ** (degree - i)
+
+
+@compiled
+def values_at(coefficients: np.ndarray, choose: np.ndarray, s: float) -> np.ndarray:
+    """Values of several polynomials of one degree at one argument, in one pass.
+
+    Args:
+        coefficients: shape (rows, columns, degree + 1).
+        choose: `binomials(degree)`.
+        s: argument in [0, 1].
+
+    Returns:
+        Array of shape (rows, columns).
+    """
+    degree = len(choose) - 1
+    weights = np.empty(degree + 1)
+    power = 1.0
+    for i in range(degree + 1):
+        weights[i] = choose[i] * power
+        power *= s
+    power = 1.0
+    for i in range(degree, -1, -1):
+        weights[i] *= power
+        power *= 1.0 - s
+    out = np.zeros(coefficients.shape[:2])
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            for i in range(degree + 1):
+                out[row, column] += coefficients[row, column, i] * weights[i]
+    return out
 
 
 def evaluate(coefficients: np.ndarray, s: np.ndarray | float) -> np.ndarray:

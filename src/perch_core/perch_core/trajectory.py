@@ -101,11 +101,15 @@ class FlatTrajectory:
         return index, min(max(float(s), 0.0), 1.0)
 
     def sample(self, t: float) -> FlatSample:
-        """Flat outputs with their derivatives at one time [s]; about 8 us."""
-        index, s = self.locate(t)
-        values = self._tables[index] @ bernstein.basis(self.degree, s)
+        """Flat outputs with their derivatives at one time [s]."""
+        values = self.values(t)
         yaw = values[:, 3].tolist()
         return FlatSample(values[0, :3], values[1, :3], values[2, :3], values[3, :3], values[4, :3], *yaw[:3])
+
+    def values(self, t: float) -> np.ndarray:
+        """(x, y, z, yaw) and their derivatives up to the fourth, one per row, at one time [s]."""
+        index, s = self.locate(t)
+        return bernstein.values_at(self._tables[index], bernstein.binomials(self.degree), s)
 
     def sample_many(self, times: np.ndarray) -> FlatSample:
         """Flat outputs at many times [s], shape (k,): every field gets the leading axis k."""
