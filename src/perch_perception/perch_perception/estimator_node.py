@@ -36,6 +36,7 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._step_costs: deque[float] = deque(maxlen=DIAGNOSTICS_PERIOD)
         self._update_costs: deque[float] = deque(maxlen=60)
         self._deadlines = Deadlines()
+        self._unused_vio: deque[Odometry] = deque()
         odometry = Odometry(child_frame_id="base_link")
         odometry.header.frame_id = "map"
         self._odometry = OdometryTemplate(odometry)
@@ -46,6 +47,13 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, backlog=True)
 
     def _receive_vio(self, msg: Odometry) -> None:
+        """In real time the update, which takes a whole period, waits until the present sample has been answered."""
+        if self._participant.lockstep is False:
+            self._unused_vio.append(msg)
+        else:
+            self._use_vio(msg)
+
+    def _use_vio(self, msg: Odometry) -> None:
         begin = time.perf_counter()
         p, q, v, _ = odometry_arrays(msg)
         covariance = np.array(msg.pose.covariance).reshape(6, 6)
@@ -72,6 +80,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
         if self._steps % DIAGNOSTICS_PERIOD == 0:
             self._publish_costs(sample.stamp * 1e-9)
         self._steps += 1
+        if self._unused_vio:
+            self._use_vio(self._unused_vio.popleft())
 
     def _publish(self, stamp: int) -> None:
         estimate = self._estimator.estimate

@@ -16,6 +16,7 @@ from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds
 from perch_core.ros.lockstep import TICK_STEPS
 from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
 from perch_core.scenario import load_scenario
 from perch_sim.camera_stream import Delivery
@@ -182,6 +183,10 @@ class VehicleNode(PerchNode[VehicleParameters]):
     # -- real time ---------------------------------------------------------------------------------------------------
 
     def _keep_pace(self) -> None:
+        if self._index == 0:
+            problem = priority.ask()
+            if problem:
+                self.get_logger().warning(problem)
         for _ in range(self._pacing.due(time.monotonic_ns())):
             self._times.end("waiting")
             if 0 < self._last_command < self._simulation.time:

@@ -29,6 +29,7 @@ from rclpy.serialization import deserialize_message
 from perch_core.ros import qos
 from perch_core.ros.backlog import Backlog
 from perch_core.ros.conversions import to_stamp
+from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_step, stamp_of
 
 RETRY = 0.005    # [s] wall clock
@@ -88,7 +89,7 @@ class Participant:
         """
         if every not in (1, TICK_STEPS):
             raise ValueError(f"every {every} is neither 1 nor {TICK_STEPS}")
-        self._node, self._on_step = node, on_step
+        self._node, self._on_step, self._every = node, on_step, every
         self._gated: dict[str, _Gated] = {}
         self._chains: list[_Chain] = []
         self._publishers: list[GatedPublisher] = []
@@ -167,7 +168,7 @@ class Participant:
         if self.lockstep is None:
             self.lockstep = step.lockstep
             if not step.lockstep:
-                self._flush()
+                self._begin_real_time()
         if step.lockstep:
             self._steps.append(step)
             self._advance()
@@ -204,8 +205,11 @@ class Participant:
                 for data in chain.backlog.take():
                     self._keep(chain, data)
 
-    def _flush(self) -> None:
-        """Real time: deliver what came before the first step."""
+    def _begin_real_time(self) -> None:
+        """Ask for real-time scheduling where every step has a deadline, and deliver what came before the first step."""
+        problem = priority.ask() if self._every == 1 else ""
+        if problem:
+            self._node.get_logger().warning(problem)
         for gated in self._gated.values():
             while gated.inbox:
                 gated.callback(gated.inbox.popleft())

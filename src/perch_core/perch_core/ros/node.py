@@ -24,6 +24,7 @@ from perch_core.ros import qos
 from perch_core.ros.backlog import Backlog
 from perch_core.ros.conversions import to_stamp
 from perch_core.ros.parameters import Parameters
+from perch_core.ros.priority import priority
 
 T = TypeVar("T")
 
@@ -121,6 +122,7 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
         _refuse(str(error))
     except RuntimeError as error:  # rcl refuses command lines and parameter files with this one
         _refuse(" ".join(str(error).split()))
+    priority.own_process = True
     executor = EventsExecutor()
     executor.add_node(node)
     try:

@@ -1,0 +1,31 @@
+"""Real-time scheduling: what is raised, and what is said where it is not allowed."""
+
+import os
+import subprocess
+import sys
+
+from perch_core.ros.priority import Priority
+
+ASK = """
+import os, threading
+from perch_core.ros.priority import Priority
+release = threading.Event()
+drawing = threading.Thread(target=release.wait); drawing.start()
+own = Priority(); own.own_process = True
+problem = own.ask()
+later = threading.Thread(target=release.wait); later.start()
+policy = [os.sched_getscheduler(t) & ~os.SCHED_RESET_ON_FORK for t in (os.getpid(), drawing.native_id, later.native_id)]
+release.set()
+assert policy == ([os.SCHED_OTHER] * 3 if problem else [os.SCHED_FIFO, os.SCHED_OTHER, os.SCHED_OTHER]), policy
+assert problem == "" or "no permission" in problem, problem
+"""
+
+
+def test_the_loop_is_raised_and_python_threads_are_not():
+    """Where it is not allowed nothing changes and the reason is told."""
+    subprocess.run([sys.executable, "-c", ASK], check=True, timeout=20)
+
+
+def test_a_process_with_other_work_is_left_alone():
+    assert Priority().ask() == ""
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
