@@ -91,6 +91,8 @@ ATTACHED, BOUNCED, COLLISION = ContactState.ATTACHED, ContactState.BOUNCED, Cont
     ("perched", [touch(ATTACHED)], "perched"),
     ("perched", [], "came_off"),
     ("perched", [touch(ATTACHED), touch(ContactState.NONE)], "came_off"),
+    ("inspected", [], "perched"),
+    ("inspected", [touch(COLLISION, "cable 0", reason="crashed: a cable in the rotors")], "crash"),
     ("not_found", [], "not_found"),
     ("refused", [], "refused"),
     ("timeout", [], "timeout"),

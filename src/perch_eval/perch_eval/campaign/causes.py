@@ -24,7 +24,8 @@ _BY_OUTCOME = {"not_found": "not_found", "refused": "refused", "timeout": "timeo
 
 
 def cause_of(outcome: str, contacts: Sequence[ContactEvent], adhesion: Adhesion) -> str:
-    """`perched`, or one of `CAUSES`. A perch counts only where the truth shows the vehicle attached at the end.
+    """`perched`, or one of `CAUSES`. A perch counts only where the truth shows the vehicle attached at the end; an inspection that
+    came to its end is a success too, where the truth shows no collision.
 
     Args:
         outcome: of the mission, in lower case.
@@ -33,6 +34,8 @@ def cause_of(outcome: str, contacts: Sequence[ContactEvent], adhesion: Adhesion)
     """
     if outcome == "perched":
         return SUCCESS if _holds(contacts) else "came_off"
+    if outcome == "inspected" and not any(c.state is ContactState.COLLISION for c in contacts):
+        return SUCCESS
     touches = [c for c in contacts if c.state in (ContactState.BOUNCED, ContactState.COLLISION)]
     if outcome in _BY_OUTCOME and not touches:
         return _BY_OUTCOME[outcome]
