@@ -10,18 +10,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
 from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.conversions import to_seconds
+from perch_core.ros.trajectories import flat_message
 from perch_core.scenario import Scenario, load_scenario
+from perch_core.trajectory import rest_to_rest
 from perch_eval.demo import fly
 from perch_eval.domain import reserved_domain
 from perch_eval.nodes import programs
 from perch_eval.stack import Stack
-from perch_msgs.msg import MotorCommand, Step
+from perch_msgs.msg import ControllerCommand, MotorCommand, Step, Trajectory
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import Imu
 
@@ -40,7 +43,10 @@ class Probe:
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
         self.counts = dict.fromkeys(RATES, 0)
-        self.time, self.misses = 0.0, {}
+        self.time = 0.0
+        self.diagnostics: dict[str, dict[str, str]] = {}
+        self.commands = self.node.create_publisher(ControllerCommand, "controller/command", qos.GATED)
+        self.trajectories = self.node.create_publisher(Trajectory, "trajectory", qos.GATED)
         for topic, kind in RATES.items():
             self.node.create_subscription(kind, topic, lambda _, topic=topic: self._count(topic), qos.CHAIN, raw=True)
         self.node.create_subscription(Step, "tick", self._step, qos.STEP)
@@ -54,9 +60,26 @@ class Probe:
 
     def _diagnose(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
-            if status.name == "/vehicle":
-                values = {item.key: item.value for item in status.values}
-                self.misses = {k: int(values[k]) for k in ("steps", "deadlines_missed", "commands_missed") if k in values}
+            self.diagnostics[status.name.rsplit("/", 1)[-1]] = {item.key: item.value for item in status.values}
+
+    def count(self, node: str, key: str) -> int:
+        """A count in a node's diagnostics."""
+        return int(self.diagnostics.get(node, {}).get(key, 0))
+
+    def take_off(self) -> None:
+        """Wait for the estimate, arm, and fly to a hover at 1 m."""
+        for _ in range(100):
+            if self.diagnostics.get("estimator", {}).get("state") == "RUNNING":
+                break
+            self.listen(0.1)
+        self.listen(2.0)
+        self.commands.publish(ControllerCommand(command=ControllerCommand.ARM, reason="bench"))
+        self.listen(0.2)
+        msg = flat_message(rest_to_rest(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 2.0, start_time=self.time + 0.2))
+        msg.id, msg.at_end = 1, Trajectory.AT_END_HOLD
+        self.trajectories.publish(msg)
+        self.listen(4.0)
+        assert self.diagnostics["controller"]["state"] == "HOVERING", self.diagnostics["controller"]
 
     def visible(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
@@ -96,22 +119,29 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[Probe]:
                 probe.close()
 
 
-def real_time(scenario: Scenario, folder: Path, windows: int) -> list[Figure]:
-    """Rates of the 500 Hz chain by the wall clock, without cameras, and what was missed."""
-    with running(scenario, folder, lockstep=False, overrides={"vehicle": {"cameras": "none"}}) as probe:
-        probe.listen(2.0)
-        before, rates = dict(probe.misses), {topic: [] for topic in RATES}
+def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geometric") -> list[Figure]:
+    """A hover without cameras by the wall clock: rates of the 500 Hz chain, and what was missed."""
+    overrides = {"vehicle": {"cameras": "none"}, "controller": {"controller.type": law}}
+    with running(scenario, folder, lockstep=False, overrides=overrides) as probe:
+        probe.take_off()
+        counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
+                     ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
+        before = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
+        rates = {topic: [] for topic in RATES}
         for _ in range(windows):
             counts = dict(probe.counts)
             span = probe.listen(WINDOW)
             for topic in RATES:
                 rates[topic].append((probe.counts[topic] - counts[topic]) / span)
-        after = probe.misses
-    steps = max(1, after["steps"] - before["steps"])
-    missed = {key: 100.0 * (after[key] - before[key]) / steps for key in ("deadlines_missed", "commands_missed")}
-    return ([figure(f"real time: rate of {topic}", "Hz", samples, bar=499.0, comparison="median >=")
-             for topic, samples in rates.items()]
-            + [figure(f"real time: {key.replace('_', ' ')}", "% of steps", [value]) for key, value in missed.items()])
+        after = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
+        delay = float(probe.diagnostics["vehicle"]["command_us_median"])
+    out = [figure(f"real time, {law}: rate of {topic}", "Hz", samples, bar=499.0, comparison="median >=")
+           for topic, samples in rates.items()]
+    for (node, part, _), (old, old_all), (new, new_all) in zip(counts_of, before, after):
+        share = 100.0 * (new - old) / max(1, new_all - old_all)
+        out.append(figure(f"real time, {law}: {part.replace('_', ' ')}, {node}", "% of steps", [share],
+                          bar=None if part == "commands_missed" else 0.1))
+    return [*out, figure(f"real time, {law}: command after its IMU sample", "us", [delay])]
 
 
 def lockstep(scenario: Scenario, folder: Path, windows: int, composed: bool) -> Figure:
@@ -139,5 +169,6 @@ def figures(quick: bool) -> list[Figure]:
         return [figure("whole stack, both cameras, lockstep", "x real time", flights, bar=0.7, comparison="median >="),
                 lockstep(scenario, folder / "processes", windows, composed=False),
                 lockstep(scenario, folder / "composed", windows, composed=True),
-                *real_time(scenario, folder / "real_time", windows)]
+                *real_time(scenario, folder / "real_time", windows),
+                *real_time(scenario, folder / "real_time_nmpc", windows, "nmpc")]
 

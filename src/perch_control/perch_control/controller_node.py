@@ -181,13 +181,13 @@ class ControllerNode(PerchNode[ControllerParameters]):
         result = self._flight.step(seconds(stamp), (*p, *v, *q, *w))
         self._costs.append(time.perf_counter() - begin)
         self._answer(stamp, result)
+        if self._participant.lockstep is False:
+            self._deadlines.answered(stamp, time.monotonic_ns())
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
     def _answer(self, stamp: int, result: StepResult) -> None:
         self._motors.publish(self._command.fill(stamp, result.armed, result.rotor_speed))
-        if self._participant.lockstep is False:
-            self._deadlines.answered(stamp, time.monotonic_ns())
         if result.event:
             self.get_logger().info(result.event)
         # In lockstep the vehicle counts steps; the same steps carry the status in every run.

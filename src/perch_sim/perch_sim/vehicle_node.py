@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
+import numpy as np
 from perch_msgs.msg import MotorCommand, Step, StepReport
 from rclpy.clock import Clock, ClockType
 
@@ -63,6 +65,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._asked: set[int] = set()          # images whose end of drawing will wake the node
         self._times = PhaseTimes()
         self._last_command = 0
+        self._published = 0.0                  # when the present step was, wall clock [s]
+        self._command_delays: deque[float] = deque(maxlen=500)
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
         self._busy = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -92,6 +96,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self._counts["commands_refused"] += 1
             self.get_logger().error(str(error), throttle_duration_sec=1.0)
         self._last_command = max(self._last_command, stamp)
+        if stamp == self._simulation.time:
+            self._command_delays.append(time.perf_counter() - self._published)
         if self._watch is not None:
             self._watch.command(stamp)
             self._advance()
@@ -211,6 +217,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         output, topics, index = self._output, self._topics, self._index
         topics.publish_imu(output.time, output.imu)
         self._steps.publish(self._step(released))
+        self._published = time.perf_counter()
         self._released |= released
         if index % TICK_STEPS == 0:
             self._ticks.publish(self._step(self._released))
@@ -247,6 +254,9 @@ class VehicleNode(PerchNode[VehicleParameters]):
                                   **self._times.report(PERIOD * 1e-9), **self._counts,
                                   "motors_timed_out": self._simulation.motors.timed_out,
                                   "crashed": self._simulation.plant.crashed}
+        if self._command_delays:
+            median, p99 = 1e6 * np.percentile(self._command_delays, (50, 99))
+            values |= {"command_us_median": float(median), "command_us_p99": float(p99)}
         level, message = 0, "ok"
         if self._watch is None:
             values |= {"deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
