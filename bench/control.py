@@ -1,6 +1,7 @@
-"""Speed of the control laws and how they fly: step times, tracking of the perch, L1 under wind and mass, both laws compared.
+"""Speed of the control laws and how they fly: step times, tracking of the perch, L1 under wind and mass, both laws compared,
+inspection.
 
-The flights run on the plant of the tests (`tests/closed_loop`), without ROS.
+The flights run on the plant of the tests (`tests/closed_loop`), those of the inspection on `perch_sim`, without ROS.
 """
 
 from __future__ import annotations
@@ -19,12 +20,15 @@ from harness import Figure, figure, measure  # noqa: E402
 
 from perch_control.geometric import GeometricController  # noqa: E402
 from perch_control.l1 import L1Augmentation, L1Settings  # noqa: E402
-from perch_control.nmpc import NmpcController, NmpcSettings  # noqa: E402
+from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings  # noqa: E402
 from perch_control.reference import FlatReference  # noqa: E402
 from perch_control.rotor_lag import RotorEstimate  # noqa: E402
 from perch_control.settings import GeometricGains  # noqa: E402
+from perch_core.scenario import load_scenario  # noqa: E402
 from perch_core.trajectory import rest_to_rest  # noqa: E402
 from perch_core.vehicle import load_vehicle  # noqa: E402
+from perch_eval.inspection.flight import fly  # noqa: E402
+from perch_eval.inspection.layout import random_layout  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 DISTURBED = {
@@ -118,6 +122,24 @@ def _comparison(quick: bool) -> list[Figure]:
     return out
 
 
+def _inspection(quick: bool) -> list[Figure]:
+    """[P:VI-A]: random layouts in which the reference collides twice, flown with estimated state and a map with errors."""
+    vehicle = load_vehicle("rpg")
+    law = NmpcController(vehicle, NmpcSettings(lines=LineWeights(perception=1500.0, visibility=200.0, collision=2000.0)),
+                         GeometricController(vehicle, GeometricGains()))
+    law.lines(tuple((x, 0.0, 1.5, 0.0, 1.0, 0.0, 4.0, 0.03) for x in (4.0, 5.0, 6.0)))
+    times, loop = _timed(law), make_loop(vehicle=vehicle, law=law)
+    loop.begin_in_hover()
+    loop.run(2.0)
+    flights = [fly(random_layout(load_scenario("inspection"), seed), seed) for seed in range(1, 3 if quick else 21)]
+    gain = np.mean([f.reference.reprojection for f in flights]) / np.mean([f.flown.reprojection for f in flights])
+    return [figure("nmpc step with three lines, 13 states", "ms", 1e3 * np.array(times)),
+            figure("inspection: collisions of the reference", "-", [f.reference.collisions for f in flights], 2, "min >="),
+            figure("inspection: collisions flown", "-", [f.collisions for f in flights], 0, "max <="),
+            figure("inspection: flights that ended early", "-", [float(bool(f.message)) for f in flights], 0, "max <="),
+            figure("inspection: mean reprojection error cut by", "times", [gain], 5.0, "min >=")]
+
+
 def figures(quick: bool) -> list[Figure]:
     """All figures of the group."""
-    return _speed(quick) + _perches(quick) + _comparison(quick)
+    return _speed(quick) + _perches(quick) + _comparison(quick) + _inspection(quick)

@@ -75,6 +75,9 @@ def test_a_scenario_says_what_its_nodes_fly():
     assert params.of("controller", ControllerParameters).nmpc.lines.watched == BASE.inspection.watched
     with pytest.raises(ConfigError, match="waypoints.*needs at least 2"):
         config.from_mapping(Scenario, {"name": "x", "mode": "inspection"}, "x.yaml")
+    with pytest.raises(ConfigError, match=r"waypoints\[1\].position: \(1, 0, 9\) m is outside the room"):
+        config.from_mapping(Scenario, {"name": "x", "mode": "inspection", "inspection": {
+            "waypoints": [{"position": [1.0, 0.0, 1.0]}, {"position": [1.0, 0.0, 9.0]}]}}, "x.yaml")
     with pytest.raises(ConfigError, match="waypoints.*5 entries"):
         MissionSettings(waypoints=(1.0,) * 5)
     with pytest.raises(PerchError, match="not inspection"):

@@ -179,14 +179,24 @@ class Scenario:
                 raise ConfigError("", f"parameters.{node}", f"is not one of {', '.join(NODES)}")
         if self.mode == "surface":
             self._check_target()
-        if self.mode == "inspection" and len(self.inspection.waypoints) < 2:
-            raise ConfigError("", "inspection.waypoints", f"has {len(self.inspection.waypoints)} entries, needs at least 2")
+        if self.mode == "inspection":
+            self._check_waypoints()
+
+    def _outside(self, p: np.ndarray) -> bool:
+        half = np.array(self.world.room) / 2
+        return bool(np.any(np.abs(p - np.array([*self.world.room_centre, half[2]])) > half + 1e-9))
+
+    def _check_waypoints(self) -> None:
+        waypoints = self.inspection.waypoints
+        if len(waypoints) < 2:
+            raise ConfigError("", "inspection.waypoints", f"has {len(waypoints)} entries, needs at least 2")
+        for k, (x, y, z) in enumerate(w.position for w in waypoints):
+            if self._outside(np.array([x, y, z])):
+                raise ConfigError("", f"inspection.waypoints[{k}].position", f"({x:g}, {y:g}, {z:g}) m is outside the room")
 
     def _check_target(self) -> None:
         p = self.surface.p_WS
-        half = np.array(self.world.room) / 2
-        centre = np.array([*self.world.room_centre, half[2]])
-        if np.any(np.abs(p - centre) > half + 1e-9):
+        if self._outside(p):
             raise ConfigError("", "target", f"pad centre ({p[0]:.2f}, {p[1]:.2f}, {p[2]:.2f}) m is outside the room")
         reach = math.hypot(self.target.distance, self.target.height - self.mission.takeoff_height)
         if reach > 3.6:
