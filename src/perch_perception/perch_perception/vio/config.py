@@ -16,6 +16,8 @@ class TrackerConfig:
     features: int = quantity(100, low=10, high=400, doc="tracks to keep up")
     refill: float = quantity(0.85, low=0.1, high=1.0, doc="detect new features below this share of them")
     spacing: float = quantity(18.0, unit="px", above=2.0, doc="least distance between features")
+    crowding: float = quantity(0.6, unit="-", low=0.0, high=1.0,
+                               doc="features nearer to an older one than this share of the spacing are let go; 0: none")
     quality: float = quantity(0.01, above=0.0, high=1.0, doc="least corner strength, share of the strongest")
     smoothing: float = quantity(1.5, unit="px", above=0.1, high=5.0, doc="sigma of the smoothing before detection and tracking")
     noise_factor: float = quantity(2.0, low=0.0, high=100.0, doc="least corner strength, in those that noise alone makes")
@@ -65,6 +67,8 @@ class StartConfig:
     rest_accel: float = quantity(0.32, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
     rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
     rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
+    ground_sigma: float = quantity(0.005, unit="m", above=0.0, doc="1 sigma of the ground about its plane")
+    ground_least_height: float = quantity(0.08, unit="m", above=0.0, doc="a camera standing lower sees no landmarks on the ground")
     unnoticed_velocity: float = quantity(0.02, unit="m/s", low=0.0, doc="1 sigma of a take-off that is not yet noticed")
     rest_velocity: float = quantity(0.005, unit="m/s", above=0.0, doc="1 sigma of zero velocity on the ground")
 

@@ -6,6 +6,7 @@ lost. Free of ROS; the same inputs give the same outputs.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
-from perch_perception.vio import motion_start, rest, start
+from perch_perception.vio import ground, motion_start, rest, start
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import observe
 from perch_perception.vio.config import VioConfig
@@ -33,13 +34,15 @@ class VisualInertialOdometry:
     Call `add_imu` with every sample; call `add_image` once `covers(stamp)` says that the IMU has passed the exposure.
     """
 
-    def __init__(self, config: VioConfig, mount: CameraMount, p_WB: np.ndarray = np.zeros(3), yaw: float = 0.0) -> None:
+    def __init__(self, config: VioConfig, mount: CameraMount, p_WB: np.ndarray = np.zeros(3), yaw: float = 0.0,
+                 floor: float | None = None) -> None:
         """
         Args:
             config: all settings.
             mount: the camera as calibrated.
             p_WB: position of the body in W at the start [m], shape (3,).
             yaw: of the body in W at the start [rad].
+            floor: height in W of the level ground that it stands on [m]; None: unknown.
         """
         self.config, self.mount = config, mount
         self.tracker = Tracker(config.tracker, mount.camera)
@@ -47,6 +50,8 @@ class VisualInertialOdometry:
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, config.faults, 2.0 + config.start.motion_time)
         self._known = start.told(config, p_WB, yaw)
+        self._floor = floor
+        self._views: deque[tuple[int, Features]] = deque()  # (exposed, features) of frames at rest that the filter has not passed
         self._gyro_bias = np.zeros(3)
         self._rest_accel: np.ndarray | None = None  # the force at rest, while the ground has not been left for good
         self._resting = self._seen = False
@@ -148,6 +153,8 @@ class VisualInertialOdometry:
         if self._rest_accel is not None and not self._seen:
             if self._is_still(exposed, features):
                 return self._hold(exposed, features)
+            if self._resting and self._floor is not None and not self.filter.state.landmarks:
+                self._stand_on(features)
             self._resting = False
         self.filter.propagate(self._imu.run(self.filter.state.stamp, exposed), exposed)
         report = self.filter.add_frame(self._frame, features.ids, observe(self.mount.camera, features.pixels))
@@ -179,12 +186,26 @@ class VisualInertialOdometry:
             self.filter.propagate(steps, until)
             rest.hold(self.filter, self.config.start)
         self._informed = exposed
+        self._views.append((exposed, features))
+        while len(self._views) > 1 and self._views[1][0] <= state.stamp:
+            self._views.popleft()
         result = self._result(FrameOutcome.RESTING, features, FrameReport())
         # what is said of now, not of `until`: a take-off may just have begun
         doubt = self.config.start.unnoticed_velocity**2 * np.eye(3)
         return replace(result, blind_for=0.0, estimate=replace(
             result.estimate, stamp=exposed, w_WB_B=np.zeros(3),
             velocity_covariance=result.estimate.velocity_covariance + doubt))
+
+    def _stand_on(self, features: Features) -> None:
+        """What was seen of the ground while the vehicle stood, and still is, becomes its first landmarks."""
+        exposed, view = self._views[0]
+        if exposed > self.filter.state.stamp:
+            return
+        known = np.isin(view.ids, features.ids)
+        known[len(view.ids) - view.new:] = False
+        s = self.config.start
+        ground.take_in(self.filter, view.ids[known], observe(self.mount.camera, view.pixels[known]), self._floor,
+                       s.ground_sigma, s.ground_least_height)
 
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
         """Whether the filter still sees, or has to start again."""

@@ -1,0 +1,67 @@
+"""Points of the ground as the first landmarks: a take-off begins with a scale.
+
+A vehicle that stands knows how high its camera is above the ground. Without that, the scale of the map comes from the first
+centimetres of the climb, flown on the IMU alone: from 13 cm above the floor a drift of 1 cm made the heights of whole flights
+wrong by 14 %. Where the camera stands so low that the ground is a blur, nothing is seen and nothing changes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_perception.vio import state as at
+from perch_perception.vio.bearing import Bearings, corrected, residuals
+from perch_perception.vio.landmark_choice import Spread
+from perch_perception.vio.msckf import Msckf
+from perch_perception.vio.state import Landmark
+
+_STEEP = 0.35        # least sine of a ray below the horizon
+_CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
+_POSE = np.r_[0:6]   # theta, p
+
+
+def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, sigma: float, least_height: float) -> int:
+    """Take points of the ground into the state of a vehicle that stands on it.
+
+    A point is where its ray meets the plane z = floor. Two rows of its bearing's residual and one of the plane determine it:
+    [H_X; e3^T] dX = -[H_x; 0] dx + (n_b, n_f), which gives its covariance with the pose and the calibration.
+
+    Args:
+        filter: its state is that of the standing vehicle.
+        ids: numbers of the features, shape (n,).
+        bearings: their bearings while it stood.
+        floor: height of the ground in W [m].
+        sigma: of a point of the ground about that plane [m].
+        least_height: of the camera above the ground; below, nothing is taken in [m].
+
+    Returns:
+        How many points were taken in.
+    """
+    s, limits = filter.state, filter.config.filter
+    centre = s.p_WB + s.R_WB @ s.p_BC
+    height = float(centre[2] - floor)
+    if height < least_height or not len(ids):
+        return 0
+    rays = corrected(bearings, s.focal) @ (s.R_WB @ s.R_BC).T
+    spread, chosen = Spread({}, limits.landmarks), []
+    for k in np.flatnonzero(rays[:, 2] < -_STEEP):
+        if len(chosen) < limits.landmarks and spread.admits(bearings.b_C[k]):
+            spread.add(int(ids[k]), bearings.b_C[k])
+            chosen.append(int(k))
+    if not chosen:
+        return 0
+    X = centre - height / rays[chosen, 2:3] * rays[chosen]
+    n = len(chosen)
+    seen = Bearings(bearings.b_C[chosen], bearings.by_focal[chosen])
+    linear = residuals(np.broadcast_to(s.R_WB, (n, 3, 3)), np.broadcast_to(s.p_WB, (n, 3)), X, s.R_BC, s.p_BC, seen, s.focal)
+    rows = np.concatenate([linear.by_camera_rotation, linear.by_camera_position, np.zeros((n, 2, 1)), linear.by_focal[:, :, None],
+                           linear.by_theta, linear.by_position], axis=2)
+    columns, variance = np.r_[_CALIBRATION, _POSE], np.diag([filter.sigma**2, filter.sigma**2, sigma**2])
+    for k, i in enumerate(chosen):
+        inverse = np.linalg.inv(np.vstack([linear.by_point[k], [0.0, 0.0, 1.0]]))
+        J = -inverse[:, :2] @ rows[k]
+        cross = J @ s.P[columns]
+        own = J @ s.P[np.ix_(columns, columns)] @ J.T + inverse @ variance @ inverse.T
+        s.P = np.block([[s.P, cross.T], [cross, own]])
+        s.landmarks[int(ids[i])] = Landmark(X[k], X[k].copy(), float(np.linalg.norm(X[k] - s.p_WB)))
+    return n
