@@ -61,7 +61,7 @@ def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
     query = plan.query(START + 0.1, target(10.0, x=5.06), GOAL)
     assert not query.recovery and query.target.p_WS[0] == 5.06
     np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.end).p + [0.06, 0.0, 0.0], atol=1e-9)
-    ready, better = plan.answered(answer(query.start_time, plan.end - query.start_time + 0.05), START + 0.4)
+    ready, better = plan.answered(answer(query.start_time, plan.end - query.start_time + 0.05), START + 0.3)
     assert ready is None and better.target.p_WS[0] == 5.06
     assert better.end == pytest.approx(plan.end + 0.05)
 
@@ -70,8 +70,8 @@ def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
 def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
     plan = running()
     query = plan.query(START + 0.1, target(10.0, x=5.06), GOAL)
-    assert plan.answered(answer(query.start_time, length, success), START + 0.4) == (None, None)
-    assert plan.query(START + 0.42, None, GOAL).recovery, "the next thing is asked"
+    assert plan.answered(answer(query.start_time, length, success), START + 0.3) == (None, None)
+    assert plan.query(START + 0.32, None, GOAL).recovery, "the next thing is asked"
 
 
 @pytest.mark.parametrize("time, x, goal", [

@@ -58,7 +58,8 @@ class VioNode(PerchNode[VioNodeConfig]):
             raise
         self._mount = vehicle.mounts[self.params.camera]
         standing = np.array(self.params.start_position) + [0.0, 0.0, vehicle.perch_offset]
-        self._vio = VisualInertialOdometry(self.params, self._mount, standing, float(np.radians(self.params.start_yaw_deg)))
+        self._vio = VisualInertialOdometry(self.params, self._mount, standing, float(np.radians(self.params.start_yaw_deg)),
+                                         float(self.params.start_position[2]))
         self._waiting: deque[Image] = deque()
         self._costs: deque[float] = deque(maxlen=300)
         self._counts = dict.fromkeys(FrameOutcome, 0)

@@ -104,6 +104,10 @@ class MissionMachine:
             return
         target = inputs.target
         usable, why = self._usable(target)
+        if self._goal.mode is Mode.POWERLINE and self._place < self.settings.mapping_legs:
+            if self._moves.arrived(inputs.time, inputs.state):
+                self._go_on_looking(inputs, outputs, "mapping the lines")
+            return
         if usable:
             if self._seen_since is None:
                 self._seen_since = inputs.time
@@ -118,11 +122,15 @@ class MissionMachine:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
             return
         if self._moves.arrived(inputs.time, inputs.state) and self._moves.dwelt(inputs.time):
-            offset, turn = self._pattern[self._place % len(self._pattern)]
-            self._place += 1
-            p, yaw = self._moves.search_place(self._goal, inputs.state)
-            self._go(inputs, outputs, (p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn))
-            self.message = f"looking for the target ({why})"
+            self._go_on_looking(inputs, outputs, f"looking for the target ({why})")
+
+    def _go_on_looking(self, inputs: Inputs, outputs: Outputs, message: str) -> None:
+        """Fly to the next place of the pattern."""
+        offset, turn = self._pattern[self._place % len(self._pattern)]
+        self._place += 1
+        p, yaw = self._moves.search_place(self._goal, inputs.state)
+        self._go(inputs, outputs, (p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn))
+        self.message = message
 
     def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._lost(inputs, outputs):

@@ -30,7 +30,7 @@ class MissionSettings:
     inclination_tolerance_deg: float = quantity(15.0, unit="deg", above=0.0, high=90.0, doc="allowed difference from the hint")
     planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")
     powerline_latency: float = quantity(1.0, unit="s", low=0.0, high=10.0, doc="the same for a powerline plan")
-    ahead_latency: float = quantity(0.3, unit="s", low=0.0, high=5.0, doc="the same for what is asked while a powerline plan is flown")
+    ahead_latency: float = quantity(0.2, unit="s", low=0.0, high=5.0, doc="the same for what is asked while a powerline plan is flown")
     way_out_spacing: float = quantity(0.3, unit="s", above=0.0, high=2.0, doc="between the starts of recoveries that are kept ready")
     way_out_until: float = quantity(0.3, unit="s", low=0.0, high=2.0,
                                     doc="closer to the contact the plan's own recovery is the way out")
@@ -39,6 +39,7 @@ class MissionSettings:
     replan_distance: float = quantity(0.01, unit="m", low=0.0, high=1.0, doc="a target that has moved less is left as it is")
     replan_shift: float = quantity(0.3, unit="s", above=0.0, high=5.0, doc="a new plan whose contact is earlier or later by more is not flown")
     mapping_reach: float = quantity(0.8, unit="m", above=0.0, high=3.0, doc="how far the vehicle moves to see lines from other places")
+    mapping_legs: int = quantity(2, low=0, high=4, doc="moves of the pattern that are flown before a plan: up by the reach and back")
     plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
     replan_period: float = quantity(0.1, unit="s", above=0.0, high=5.0)
     replan_until: float = quantity(0.7, unit="s", low=0.0, high=5.0, doc="no new plan closer than this to the contact")

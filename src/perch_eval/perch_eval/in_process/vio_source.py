@@ -52,7 +52,8 @@ class RenderedVio:
 
     def __init__(self, params: VioConfig, mount: CameraMount, perch_offset: float) -> None:
         standing = np.array(params.start_position) + [0.0, 0.0, perch_offset]
-        self._vio = VisualInertialOdometry(params, mount, standing, float(np.radians(params.start_yaw_deg)))
+        self._vio = VisualInertialOdometry(params, mount, standing, float(np.radians(params.start_yaw_deg)),
+                                         float(params.start_position[2]))
         self._wire = Wire()
 
     def see(self, state: TrueState, imu: ImuSample) -> None:

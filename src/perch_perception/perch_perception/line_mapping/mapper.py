@@ -30,6 +30,8 @@ class MapperConfig:
     max_observations: int = config.quantity(40, low=5, high=500, doc="sightings kept per wire")
     forget_after: float = config.quantity(2.0, unit="s", above=0.0, high=60.0,
                                           doc="a wire that was never triangulated and is not seen is dropped")
+    stale_after: float = config.quantity(0.4, unit="s", above=0.0, high=60.0, doc="a wire not seen for so long gives way ...")
+    superseded_within: float = config.quantity(0.3, unit="m", low=0.0, high=5.0, doc="... to one that is seen this close to it")
     max_range: float = config.quantity(8.0, unit="m", above=0.0, high=100.0, doc="ends are not believed beyond this distance")
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     straightness: float = config.quantity(0.02, unit="m", above=0.0, high=1.0,
@@ -116,6 +118,7 @@ class LineMapper:
         for index in sorted(changed):
             self._triangulate(self._tracks[index])
         self._merge()
+        self._supersede(time)
         self._tracks = [t for t in self._tracks
                         if t.estimate is not None or time - t.last.time <= self.settings.forget_after]
         return self.map(time)
@@ -197,6 +200,14 @@ class LineMapper:
             self._triangulate(twin)
         self._tracks = kept
 
+    def _supersede(self, time: float) -> None:
+        """Drop wires that are no longer where they were: the odometry was corrected, and they are seen again beside there."""
+        settings = self.settings
+        fresh = [t for t in self._tracks if t.estimate is not None and t.extent is not None and t.count >= MIN_OBSERVATIONS
+                 and time - t.last.time <= settings.stale_after]
+        self._tracks = [t for t in self._tracks if time - t.last.time <= settings.stale_after
+                        or not any(_beside(t, other, settings.superseded_within) for other in fresh)]
+
     def _segments(self, track: _Track, missing: list[str]) -> list[MappedLine]:
         """The wire as chords that stay within `straightness`; none where it is not known well enough."""
         estimate = track.estimate
@@ -251,6 +262,11 @@ def _thinned(observations: list[LineObservation]) -> list[LineObservation]:
 
 def _same_wire(a: _Track, b: _Track) -> bool:
     """Whether two triangulated wires coincide: within 6 cm where the second was seen, and 3 deg."""
+    return _beside(a, b, 0.06)
+
+
+def _beside(a: _Track, b: _Track, distance: float) -> bool:
+    """Whether two triangulated wires run together: within a distance [m] where the second was seen, and 3 deg."""
     if a.estimate is None or b.estimate is None or b.extent is None:
         return False
     if abs(a.estimate.curve.direction @ b.estimate.curve.direction) < np.cos(np.radians(3.0)):
@@ -258,4 +274,4 @@ def _same_wire(a: _Track, b: _Track) -> bool:
     points = b.estimate.curve.at(np.linspace(*b.extent, 3))
     along = a.estimate.curve.direction
     s = (points - a.estimate.curve.point) @ along
-    return bool(np.all(np.linalg.norm(points - a.estimate.curve.at(s), axis=1) < 0.06))
+    return bool(np.all(np.linalg.norm(points - a.estimate.curve.at(s), axis=1) < distance))

@@ -31,6 +31,8 @@ class TriangulationConfig:
                                        doc="least sigma2/sigma1 of the planes' normals; below it the depth is not determined")
     pose_position: float = config.quantity(0.003, unit="m", above=0.0, high=1.0,
                                            doc="error of the camera's position from image to image, 1 sigma")
+    pose_drift: float = config.quantity(0.03, unit="m/sqrt(s)", low=0.0, high=1.0,
+                                        doc="growth of that error with the age of a sighting; the wire is where the newest see it")
     pose_rotation: float = config.quantity(0.1, unit="deg", above=0.0, high=10.0, doc="the same for its attitude")
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
                                  doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
@@ -134,14 +136,17 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
 def _whitened(curve, observations, centres, rays, settings):
     """Residuals (n, k) in sigmas and their Jacobian (n, k, 5), decorrelated within each image.
 
-    All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together.
+    All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. The
+    odometry drifts: of two sightings that disagree the newer is right, as what is flown next starts from the newest pose.
     """
     n, k = len(observations), len(observations[0].rays_W)
     against = curve.offsets(centres, rays)
     by_rotation = np.cross(rays, against.normals)  # n . (dtheta x r)
     # a centre moved by dc sees the wire's point moved by -dc: across the plane by n . dc / distance
     by_position = against.normals / np.maximum(against.ahead, 0.1)[:, None]
-    by_pose = np.concatenate([by_rotation * np.radians(settings.pose_rotation), by_position * settings.pose_position],
+    age = observations[-1].time - np.array([o.time for o in observations])
+    position = np.repeat(np.sqrt(settings.pose_position**2 + settings.pose_drift**2 * np.maximum(age, 0.0)), k)
+    by_pose = np.concatenate([by_rotation * np.radians(settings.pose_rotation), by_position * position[:, None]],
                              axis=1).reshape(n, k, 6)
     sigma = np.array([o.sigma for o in observations])
     covariance = by_pose @ np.swapaxes(by_pose, 1, 2) + sigma[:, None, None] ** 2 * np.eye(k)
