@@ -34,14 +34,16 @@ def test_another_ros_distribution_is_refused_in_one_line():
 def test_sourcing_gives_a_shell_in_which_everything_is_found():
     line = ("set -eu; source ./setup.bash; source ./setup.bash; vehicle_path=$(command -v vehicle); "
             "python -c 'import rclpy, perch_msgs.msg, perch_core, perch_eval; print(perch_core.__file__)'; "
-            "echo $vehicle_path $ROS_AUTOMATIC_DISCOVERY_RANGE $OMP_NUM_THREADS $ROS_DOMAIN_ID; "
+            "echo $vehicle_path $ROS_AUTOMATIC_DISCOVERY_RANGE $OMP_NUM_THREADS $ROS_DOMAIN_ID "
+            "$FASTRTPS_DEFAULT_PROFILES_FILE; "
             "echo $PATH | tr : '\\n' | grep -c '^'$PWD/.venv/bin'$'")
     environment = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": os.environ.get("HOME", "/")}
     result = subprocess.run(["bash", "-c", line], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     module, shell, count = result.stdout.splitlines()
     assert module.startswith(str(ROOT))
-    assert shell.split() == [f"{ROOT}/install/perch_sim/lib/perch_sim/vehicle", "LOCALHOST", "1", "42"]
+    assert shell.split() == [f"{ROOT}/install/perch_sim/lib/perch_sim/vehicle", "LOCALHOST", "1", "42",
+                             f"{ROOT}/config/fastdds.xml"]
     assert count == "1"
 
 
