@@ -62,6 +62,8 @@ def start(node: str, folder: Path) -> subprocess.Popen:
     arguments = ["--ros-args", "-r", f"__ns:=/alone_{node}", *(["--params-file", str(file)] if file.exists() else [])]
     if node == "recorder":
         arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
+    if node == "viewer":
+        arguments += ["-p", "port:=0"]
     return subprocess.Popen([executable(PACKAGES[node], node), *arguments], env=dict(os.environ), stdin=subprocess.DEVNULL,
                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=folder)
 
