@@ -20,7 +20,8 @@ Q_PERCH = so3.quat_from_matrix(SURFACE.R_WS)
 class World:
     """What the mission sees: a controller that obeys, a pad that is visible or not, velcro that holds or not."""
 
-    def __init__(self, sees=True, plans=True, sticks=True, stays=True, recovers=True, ready=True):
+    def __init__(self, sees=True, plans=True, sticks=True, stays=True, recovers=True, ready=True, detour=0.0):
+        self.detour, self.flown = detour, []  # what a new plan's contact is late by [s]; starts and durations of perches
         self.sees, self.plans, self.sticks, self.stays, self.recovers, self.ready = sees, plans, sticks, stays, recovers, ready
         self.machine = MissionMachine(MissionSettings())
         self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -50,7 +51,8 @@ class World:
         plan = None
         if self.query is not None:
             plan = PlanAnswer(self.plans, "thrust floor 5.2 N > 4.05 N" if not self.plans else "ok", object(),
-                              self.query.start_time, 1.2)
+                              self.query.start_time,
+                              1.2 if self.query.duration is None else self.query.duration + self.detour)
             self.query = None
         target = Target(self.time, SURFACE.p_WS, Q_PERCH, 0.01, 0.01) if self.sees and self.time > 2.0 else None
         out = self.machine.tick(Inputs(
@@ -70,6 +72,7 @@ class World:
         if out.reference is not None:
             self.reference, self.controller, self.trajectory_id = out.reference, ControllerState.TRACKING, out.trajectory_id
         if out.perch is not None:
+            self.flown.append((out.perch.start_time, out.perch.duration))
             self.reference, self.perch_end, self.trajectory_id = None, out.perch.start_time + out.perch.duration, out.trajectory_id
         if out.query is not None:
             self.query, self.queries = out.query, self.queries + 1
@@ -103,6 +106,21 @@ def test_motors_stay_on_until_adhesion_is_felt():
     assert world.outcome.result is Result.MISSED and "recovered to a hover" in world.outcome.message
     assert Command.ATTACHED not in world.commands
     assert world.controller is ControllerState.HOVERING
+
+
+def test_a_replanned_perch_keeps_its_contact_time():
+    world = World()
+    world.run(Goal(takeoff_height=1.2, search_timeout=6.0, replan=True))
+    assert world.outcome.result is Result.PERCHED
+    assert len(world.flown) > 2 and world.queries > 2
+    assert np.ptp([start + duration for start, duration in world.flown]) < 1e-9
+
+
+def test_a_replanned_detour_is_not_flown():
+    world = World(detour=0.5)
+    world.run(Goal(takeoff_height=1.2, search_timeout=6.0, replan=True))
+    assert world.outcome.result is Result.PERCHED
+    assert world.queries > 2 and len(world.flown) == 1
 
 
 def test_a_second_attempt_is_flown():

@@ -252,10 +252,13 @@ class MissionMachine:
 
     def _replan(self, inputs: Inputs, outputs: Outputs, end: float) -> None:
         """Refine the target in flight and continue from the running plan's future (M's future work)."""
-        if inputs.plan is not None and inputs.plan.success and inputs.plan.start_time > inputs.time:
+        plan = inputs.plan
+        if plan is not None and plan.success and plan.start_time > inputs.time:
+            if abs(plan.start_time + plan.duration - end) > self.settings.replan_shift:
+                return  # a detour: the running plan is better
             self.target = self._asked_target
-            self._fly(inputs.plan, outputs)
-            self.message = f"re-planned, {inputs.plan.duration:.2f} s"
+            self._fly(plan, outputs)
+            self.message = f"re-planned, {plan.duration:.2f} s"
             return
         usable, _ = self._usable(inputs.target)
         start = inputs.time + self._lead
@@ -264,7 +267,7 @@ class MissionMachine:
             self._replanned_at, self._asked_target = inputs.time, inputs.target
             zero = np.zeros(3)
             outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, self._goal, self._latency,
-                                      current=self._perch.trajectory)
+                                      current=self._perch.trajectory, duration=end - start)
 
     def _look_ahead(self, inputs: Inputs, outputs: Outputs) -> None:
         """On the way to a wire: follow the map as it gets better, and keep a way out ready."""

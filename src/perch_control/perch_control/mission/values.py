@@ -119,6 +119,7 @@ class PlanQuery:
         goal: what was asked for.
         latency: from the request to the use of the plan [s].
         current: the trajectory being flown, to be continued from `start_time`; None: start from p, v, a, j.
+        duration: time from the start to contact [s] that the new plan should keep; None: chosen by the planner.
         state: full state at the start, of a powerline plan that is being flown; None: level, with this yaw.
         recovery: plan the way out from `state` alone.
         perch_pose: where to end (position [m], attitude xyzw); None: as the target and the goal's pitch say.
@@ -134,6 +135,7 @@ class PlanQuery:
     goal: Goal
     latency: float = 0.0
     current: Any = None
+    duration: float | None = None
     state: StateSample | None = None
     recovery: bool = False
     perch_pose: tuple[np.ndarray, np.ndarray] | None = None

@@ -65,6 +65,8 @@ def _surface(query: PlanQuery) -> PlanPerch.Request:
         impact_acceleration=_NAN, impact_speed_min=_NAN, impact_speed_max=_NAN, thrust_max=_NAN, thrust_min=_NAN)
     if query.current is not None:
         request.from_trajectory, request.current = True, query.current
+    if query.duration is not None:
+        request.segment_times = [float(query.duration)]
     return request
 
 

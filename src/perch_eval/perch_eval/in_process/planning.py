@@ -38,7 +38,8 @@ class Planning:
                 start = StartState.on(query.current, start_time - query.current.start_time)
             else:
                 start = StartState(query.p, query.v, query.a, query.j, float(query.yaw))
-            planned = plan(PerchProblem(start, surface), self._settings, self._vehicle)
+            times = None if query.duration is None else (query.duration,)
+            planned = plan(PerchProblem(start, surface, segment_times=times), self._settings, self._vehicle)
         except PerchError as error:
             return PlanAnswer(False, str(error))
         flat = FlatTrajectory(planned.trajectory.durations, planned.trajectory.coefficients, start_time)
