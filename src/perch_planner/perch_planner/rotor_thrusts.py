@@ -23,7 +23,7 @@ from perch_core.vector3 import axpy, cross, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.bounds import derivative, derivatives_at, value
 
-_PLACES = np.linspace(0.0, 1.0, 41)
+_PLACES = np.linspace(0.0, 1.0, 49)
 _AT10, _AT11, _AT12, _AT13, _AT14 = (np.ascontiguousarray(bernstein.basis(n, _PLACES).T) for n in range(10, 15))
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
@@ -60,21 +60,22 @@ def _heading_at(yaw, duration, s):
 
 @compiled
 def _vertex(values, k, sign):
-    """Place between the samples where the parabola through sample k and its neighbours is extreme, and that value."""
-    n = len(values) - 1
-    if k == 0 or k == n:
-        return k / n, values[k]
-    before, here, after = values[k - 1], values[k], values[k + 1]
+    """Place near sample k where the parabola through it and its neighbours is extreme, and that value."""
+    last = len(values) - 1
+    middle = min(max(k, 1), last - 1)
+    before, here, after = values[middle - 1], values[middle], values[middle + 1]
     bend = before - 2.0 * here + after
     if sign * bend >= 0.0:
-        return k / n, here
+        return k / last, values[k]
     shift = 0.5 * (before - after) / bend
-    return (k + shift) / n, here - 0.25 * (before - after) * shift
+    if abs(shift) > 1.0:
+        return k / last, values[k]
+    return (middle + shift) / last, here - 0.25 * (before - after) * shift
 
 
 @compiled
 def sampled(coefficients, yaw, durations, mass, J, mixing):
-    """Rotor thrusts of a plan on 41 places of each segment.
+    """Rotor thrusts of a plan on 49 places of each segment.
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
@@ -83,7 +84,7 @@ def sampled(coefficients, yaw, durations, mass, J, mixing):
         mass, J, mixing: of `rotor_model`.
 
     Returns:
-        (thrusts, row): thrusts, shape (f, 41, 4) [N]; row: least and its time, greatest and its time, refined between
+        (thrusts, row): thrusts, shape (f, 49, 4) [N]; row: least and its time, greatest and its time, refined between
         the samples, shape (4,) [N, s].
     """
     f = len(durations)
