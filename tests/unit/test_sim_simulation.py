@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -106,3 +106,20 @@ def test_vio_stand_in_has_its_documented_drift_and_noise():
     assert np.std(np.array(last)[:, 2]) == pytest.approx(expected, rel=0.15)
     np.testing.assert_allclose(estimate.pose_variance[2], expected**2, rtol=1e-6)
     np.testing.assert_allclose(np.std(tilt, axis=0)[:2], params.attitude_noise, rtol=0.15)
+
+
+class Stuck(Executor):
+    """A pool that never gets anything done."""
+
+    def submit(self, *_):
+        return Future()
+
+
+@pytest.mark.parametrize("limit, given_up", [(None, 0), (2, 3)])
+def test_a_slow_machine_gives_up_images_in_real_time_and_none_in_lockstep(limit, given_up):
+    flight = Simulation(load_scenario("surface_90"), seed=1, render=("front",), pool=Stuck())
+    camera = flight.cameras["front"]
+    camera.most_waiting = limit
+    while flight.time < SECOND + 5 * SECOND // 30:  # five exposures
+        flight.advance()
+    assert camera.dropped == given_up

@@ -25,7 +25,13 @@ class Delivery(NamedTuple):
 
 
 class CameraStream:
-    """The frames of one camera in order. Drawing runs on a pool and overlaps with the flight."""
+    """The frames of one camera in order. Drawing runs on a pool and overlaps with the flight.
+
+    Attributes:
+        most_waiting: a frame that begins while so many of this camera are still being drawn goes without its image; None: every
+            image is drawn, however long it takes.
+        dropped: images that were given up.
+    """
 
     def __init__(self, mount: CameraMount, timing: CameraTiming, renderer: Renderer | None, pool: Executor | None,
                  noise: np.random.Generator, target_velocity: np.ndarray, start: int) -> None:
@@ -42,6 +48,8 @@ class CameraStream:
         self.mount = mount
         self._timing, self._renderer, self._pool, self._noise = timing, renderer, pool, noise
         self._velocity, self._start = target_velocity, start
+        self.most_waiting: int | None = None
+        self.dropped = 0
         self._next = timing.next()
         self._coming: deque[Delivery] = deque()
 
@@ -49,7 +57,11 @@ class CameraStream:
         """Start to draw every frame whose exposure has ended by `time` [ns]."""
         while self._next.end <= time:
             frame, self._next = self._next, self._timing.next()
-            image = None if self._renderer is None else self._draw(frame, history)
+            image = None
+            if self._renderer is not None and self._overloaded():
+                self.dropped += 1
+            elif self._renderer is not None:
+                image = self._draw(frame, history)
             self._coming.append(Delivery(frame, image))
 
     def due(self, time: int) -> Delivery | None:
@@ -59,6 +71,10 @@ class CameraStream:
     def take(self) -> Delivery:
         """Remove the oldest frame."""
         return self._coming.popleft()
+
+    def _overloaded(self) -> bool:
+        waiting = sum(d.image is not None and not d.image.done() for d in self._coming)
+        return self.most_waiting is not None and waiting >= self.most_waiting
 
     def _draw(self, frame: Frame, history: StateHistory) -> Future[np.ndarray]:
         instants = np.linspace(frame.start, frame.end, POSES)

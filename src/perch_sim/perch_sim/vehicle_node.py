@@ -32,6 +32,7 @@ from perch_sim.plant import PERIOD
 from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 from perch_sim.ros.vehicle_topics import VehicleTopics
 
+MOST_WAITING = 2        # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
 SWITCH_INTERVAL = 2e-4  # the drawing threads give way to a step sooner than Python's 5 ms [s]
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
@@ -83,6 +84,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self.create_subscription(StepReport, "step_report", self._receive_report, qos.GATED)
             self.create_timer(0.05, self._look_after, clock=steady)
         else:
+            for camera in self._simulation.cameras.values():
+                camera.most_waiting = MOST_WAITING
             self._pacing = Pacing(PERIOD, time.monotonic_ns())
             self.create_timer(PERIOD * 1e-9, self._keep_pace, clock=steady)
 
@@ -259,6 +262,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             values |= {"command_us_median": float(median), "command_us_p99": float(p99)}
         level, message = 0, "ok"
         if self._watch is None:
+            values["images_dropped"] = sum(camera.dropped for camera in self._simulation.cameras.values())
             values |= {"deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
         elif self._watch.waiting:
             message = f"waiting for {self._watch.waiting}"
