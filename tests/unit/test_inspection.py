@@ -16,8 +16,9 @@ from perch_core.scenario import Scenario, load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.inspection.flight import fly
-from perch_eval.inspection.layout import random_layout, segments, watched
-from perch_eval.inspection.measures import collisions, judge, reference_of, reference_states
+from perch_eval.inspection.figures import metrics_figure, paths_figure
+from perch_eval.inspection.layout import random_layout
+from perch_eval.inspection.measures import collisions, inspected, judge, reference_of, reference_states, segments, watched
 from perch_control.mission.parameters import MissionParameters
 from perch_control.parameters import ControllerParameters
 
@@ -114,6 +115,19 @@ def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, res
         np.testing.assert_allclose(p, (1.0, 2.0, 2.5), atol=1e-6)
 
 
+def test_a_way_that_is_the_reference_is_judged_as_the_reference_and_drawn(tmp_path):
+    times, states = reference_states(BASE)
+    found = inspected(BASE, times, states)
+    assert found.collisions == found.reference.collisions == 2 and found.flown.reprojection == found.reference.reprojection
+    assert inspected(BASE, times[:100], states[:100], crashes=1).collisions == 1
+    away = states.copy()
+    away[:, 0] -= 2.0
+    assert inspected(BASE, times, away).collisions == 0
+    for name, figure in (("paths", paths_figure(found)), ("metrics", metrics_figure(found))):
+        figure.savefig(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
 def test_the_line_terms_avoid_both_collisions_and_keep_the_line_centred():
     """Two legs of a layout, the estimated state and a map with errors: without the terms the cable is hit, with them it is not."""
     layout = random_layout(BASE, 17)
@@ -127,4 +141,4 @@ def test_the_line_terms_avoid_both_collisions_and_keep_the_line_centred():
 
 def test_without_the_line_terms_the_reference_is_followed_into_the_cable():
     blind = fly(random_layout(BASE, 17), 1, with_lines=False)
-    assert blind.collisions > 0 and "crash" in " ".join(c.reason for c in blind.contacts)
+    assert blind.collisions > 0 and "a cable in the rotors" in blind.message

@@ -15,7 +15,7 @@ from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.nodes import programs
 from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
-from perch_eval.report import build_report
+from perch_eval.report import build_report, inspection_words
 from perch_eval.stack import Stack, StackError
 
 READY_TIMEOUT = 180.0  # [s] compiled functions that a changed source invalidated are built while nodes start
@@ -116,6 +116,8 @@ def summary(report: dict) -> str:
         c = report["contact"]
         lines.append(f"  contact: {c['normal_speed_m_s']:.2f} m/s normal, {c['tangential_speed_m_s']:.2f} m/s tangential, "
                      f"tilt error {c['tilt_error_deg']:.1f} deg, {100 * c['offset_m']:.1f} cm off centre")
+    if report.get("inspection"):
+        lines.append(f"  {inspection_words(report['inspection'])}")
     if report.get("max_body_rate_deg_s"):
         lines.append(f"  largest body rate {report['max_body_rate_deg_s']:.0f} deg/s; real-time factor {report['real_time_factor']:.2f}")
     return "\n".join(lines)

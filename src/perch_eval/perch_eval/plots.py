@@ -22,7 +22,8 @@ from perch_eval.metrics import perch_window, thrust_history, tilt_degrees, touch
 TRUTH, ESTIMATE, WANTED, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
 
 
-def _encode(figure: Any) -> str:
+def encode(figure: Any) -> str:
+    """A figure as PNG in base64, for a page."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=95, bbox_inches="tight")
     plt.close(figure)
@@ -67,7 +68,7 @@ def tracking_figure(flight: Flight) -> str:
     axes[0, 0].legend(loc="best", fontsize=8)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
-    return _encode(figure)
+    return encode(figure)
 
 
 def path_figure(flight: Flight) -> str:
@@ -101,7 +102,7 @@ def path_figure(flight: Flight) -> str:
     axis.set_ylabel("z [m]")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
-    return _encode(figure)
+    return encode(figure)
 
 
 def rates_figure(flight: Flight) -> str:
@@ -124,7 +125,7 @@ def rates_figure(flight: Flight) -> str:
     axes[0, 0].legend(fontsize=8)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
-    return _encode(figure)
+    return encode(figure)
 
 
 def thrust_figure(flight: Flight, vehicle: Vehicle) -> str:
@@ -145,7 +146,7 @@ def thrust_figure(flight: Flight, vehicle: Vehicle) -> str:
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, ncol=3)
     _mark(axis, flight)
-    return _encode(figure)
+    return encode(figure)
 
 
 def error_figure(flight: Flight) -> str:
@@ -168,7 +169,7 @@ def error_figure(flight: Flight) -> str:
         axis.set_title(f"estimate - truth, {name} [cm], with 3 sigma", fontsize=9)
         axis.grid(alpha=0.3)
         _mark(axis, flight)
-    return _encode(figure)
+    return encode(figure)
 
 
 def camera_frames(flight: Flight, times: list[float]) -> list[tuple[str, str]]:

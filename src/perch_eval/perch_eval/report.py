@@ -12,6 +12,9 @@ from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.flight import Flight
+from perch_eval.inspection.figures import metrics_figure, paths_figure
+from perch_eval.inspection.measures import Inspected
+from perch_eval.inspection.recorded import recorded
 from perch_eval.metrics import contact_report, diagnostics, flight_metrics, node_durations, perch_window, rates
 from perch_eval.pilot import SUCCESSES
 
@@ -56,8 +59,14 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         "flight_hash": flight.digest(end_time),
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
     }
+    inspection = recorded(flight, scenario)
+    if inspection is not None:
+        report["inspection"] = {
+            "reference_collisions": inspection.reference.collisions, "collisions": inspection.collisions,
+            "reference_reprojection_px": inspection.reference.reprojection, "reprojection_px": inspection.flown.reprojection,
+            "least_clearance": float(inspection.flown.clearance.min())}
     (folder / "report.json").write_text(json.dumps(_finite(report), indent=2) + "\n")
-    (folder / "report.html").write_text(_page(flight, scenario, report, vehicle))
+    (folder / "report.html").write_text(_page(flight, scenario, report, vehicle, inspection))
     return report
 
 
@@ -101,7 +110,14 @@ def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
     return ", ".join("-" if v is None or not math.isfinite(v) else f"{scale * v:.1f}" for v in values) + f" {unit}"
 
 
-def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Any) -> str:
+def inspection_words(figures: dict[str, Any]) -> str:
+    """What came of an inspection, in a line."""
+    return (f"{figures['collisions']} collisions ({figures['reference_collisions']} of the reference); mean reprojection error "
+            f"{figures['reprojection_px']:.0f} px ({figures['reference_reprojection_px']:.0f} px of the reference); "
+            f"least scaled clearance {figures['least_clearance']:.2f}")
+
+
+def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Any, inspection: Inspected | None) -> str:
     good = report["outcome"] in SUCCESSES
     contact = contact_report(flight)
     rows = [
@@ -122,11 +138,16 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
     if report.get("target_error"):
         e = report["target_error"]
         rows.insert(3, _row("target error", f"{100 * e['position_m']:.1f} cm, {e['attitude_deg']:.2f} deg"))
+    if inspection is not None:
+        rows.insert(3, _row("inspection", inspection_words(report["inspection"])))
     images = [("Tracking and estimation through the perch", plots.tracking_figure(flight)),
               ("Path, seen from the side", plots.path_figure(flight)),
               ("Body rates and tilt", plots.rates_figure(flight)),
               ("Thrust against its bounds", plots.thrust_figure(flight, vehicle)),
               ("Estimation error over the flight", plots.error_figure(flight))] if flight.states("ground_truth/odometry") else []
+    if inspection is not None:
+        images = [("Reference and flown path", plots.encode(paths_figure(inspection))),
+                  ("Clearance, reprojection error and visibility of the watched line", plots.encode(metrics_figure(inspection))), *images]
     window = perch_window(flight)
     moments = [window[0], window[0] + 0.6 * (window[1] - window[0]), window[1] - 0.05, window[1] + 0.3] if window else []
     frames = "".join(f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'

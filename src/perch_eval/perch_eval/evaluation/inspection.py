@@ -13,7 +13,7 @@ from perch_core.scenario import load_scenario
 from perch_eval.campaign.progress import Progress
 from perch_eval.evaluation.perching import source_digest
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.inspection.figures import draw_metrics, draw_paths
+from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.flight import MAP_ERROR, fly
 from perch_eval.inspection.layout import random_layout
 from perch_eval.statistics import Spread
@@ -36,9 +36,9 @@ def _figures(effort: Effort) -> Section:
                   f"their error models (map: {100 * MAP_ERROR:g} cm at each end and axis). Judged by the true lines; "
                   "a line beyond the image's corners counts as at them. "
                   "The reference is the straight lines between the waypoints.")
-    for name, draw, caption in (("p_fig_4.png", draw_paths, "Reference (dashed, collisions red) and flown path with the heading (green)"),
-                                ("p_fig_5.png", draw_metrics, "Clearance (14j), reprojection error (9), cheirality (14h) and segment visibility (14i)")):
-        draw(flight, effort.out / name)
+    for name, draw, caption in (("p_fig_4.png", paths_figure, "Reference (dashed, collisions red) and flown path with the heading (green)"),
+                                ("p_fig_5.png", metrics_figure, "Clearance (14j), reprojection error (9), cheirality (14h) and segment visibility (14i)")):
+        draw(flight).savefig(effort.out / name, dpi=130)
         out.figures.append((name, caption))
     out.claim("collisions", f"{flight.reference.collisions} of the reference, {flight.collisions} flown", "2, 0",
               flight.reference.collisions == REFERENCE_COLLISIONS and flight.collisions == 0, "the reference collides twice, the flight does not")

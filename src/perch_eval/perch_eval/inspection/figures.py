@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import matplotlib
 import numpy as np
 
 from perch_core import so3
-from perch_eval.inspection.flight import Inspected
+from perch_eval.inspection.measures import Inspected
 
 matplotlib.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402  (the backend must be chosen first)
@@ -17,7 +15,7 @@ FLOWN, REFERENCE, HEADING, WIRE, COLLISION = "#1f5fa8", "#555555", "#3a9a4b", "#
 SIGHT_LENGTH = 0.35  # of the drawn camera axis [m]
 
 
-def draw_paths(flight: Inspected, path: Path) -> None:
+def paths_figure(flight: Inspected) -> Figure:
     """Reference and flight in space, as the paper's Fig. 4: where the reference collides it is red, the camera's axis green."""
     figure = Figure(figsize=(9, 6.5), layout="constrained")
     axes = figure.add_subplot(projection="3d")
@@ -38,10 +36,10 @@ def draw_paths(flight: Inspected, path: Path) -> None:
     axes.set_box_aspect(high - low)
     axes.view_init(elev=22, azim=-150)
     axes.legend(loc="upper left", fontsize=8)
-    figure.savefig(path, dpi=130)
+    return figure
 
 
-def draw_metrics(flight: Inspected, path: Path) -> None:
+def metrics_figure(flight: Inspected) -> Figure:
     """Clearance, reprojection error, cheirality and segment visibility over time, as the paper's Fig. 5."""
     figure = Figure(figsize=(8, 7.5), layout="constrained")
     panels = figure.subplots(4, 1, sharex=True)
@@ -62,4 +60,4 @@ def draw_metrics(flight: Inspected, path: Path) -> None:
     panels[3].set(xlabel="time [s]")
     panels[0].legend(fontsize=8, loc="upper right")
     panels[1].legend(fontsize=8, loc="upper right")
-    figure.savefig(path, dpi=130)
+    return figure

@@ -5,9 +5,7 @@ The controller knows the state that the estimator has and a map with an error; t
 
 from __future__ import annotations
 
-import dataclasses
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,8 +23,7 @@ from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.piloting import FlownTrajectory, Piloting
 from perch_eval.in_process.stamps import seconds
 from perch_eval.in_process.vio_source import ModelledVio
-from perch_eval.inspection.layout import segments, watched
-from perch_eval.inspection.measures import Judgement, judge, reference_of, reference_states
+from perch_eval.inspection.measures import Inspected, inspected, reference_of, segments
 from perch_perception.ukf import Health, ImuSample, UkfConfig
 from perch_sim import seeding
 from perch_sim.contact_event import ContactEvent, ContactState
@@ -39,37 +36,6 @@ MAP_STEPS = 50     # the map is published at 10 Hz
 LEAD = 0.04        # from an order to its start [s]
 SETTLE = 1.0       # hover before the line terms begin [s]
 RECORD = 5         # every so many steps
-
-
-@dataclass(frozen=True)
-class Inspected:
-    """A flown inspection beside its reference.
-
-    Attributes:
-        times: since the start of the reference [s], shape (n,).
-        states: true p, q, v, w, shape (n, 13).
-        flown: the flight, judged by the true lines.
-        reference_times, reference_states, reference: the same of the waypoint lines, as if flown exactly.
-        lines, line: the true lines, and the watched one.
-        contacts: what the plant reports.
-        message: why the flight ended early; empty: it came to its end.
-    """
-
-    times: np.ndarray
-    states: np.ndarray
-    flown: Judgement
-    reference_times: np.ndarray
-    reference_states: np.ndarray
-    reference: Judgement
-    lines: list[Segment]
-    line: Segment
-    contacts: list[ContactEvent]
-    message: str
-
-    @property
-    def collisions(self) -> int:
-        """Of the flight, by the plant or by the geometry of the recorded states, whichever counts more."""
-        return max(self.flown.collisions, sum(c.state is ContactState.COLLISION for c in self.contacts))
 
 
 def mapped(lines: list[Segment], rng: np.random.Generator) -> list[Segment]:
@@ -157,15 +123,12 @@ def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
     flight.run(LEAD)
     flight.rows.clear()
     flight.run(trajectory.duration)
-    status = flight.piloting.status
-    flying = State(status.state) in (State.TRACKING, State.HOVERING) and not flight.simulation.plant.crashed
     table = np.array(flight.rows)
-    times, states = table[:, 0] - start, table[:, 1:]
-    vehicle, line = flight.simulation.vehicle, watched(scenario, lines)
-    reference_times, reference = reference_states(scenario)
-    return Inspected(times, states, judge(states, lines, line, vehicle), reference_times, reference,
-                     judge(reference, lines, line, vehicle), lines, line, flight.contacts,
-                     "" if flying else status.message)
+    crashes = [c.reason for c in flight.contacts if c.state is ContactState.COLLISION]
+    status = flight.piloting.status
+    flying = State(status.state) in (State.TRACKING, State.HOVERING)
+    message = "; ".join(crashes) or ("" if flying else status.message)
+    return inspected(scenario, table[:, 0] - start, table[:, 1:], len(crashes), message)
 
 
 def _take_off(flight: _Flight, scenario: Scenario) -> None:

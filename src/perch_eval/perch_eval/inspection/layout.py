@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.lines import Segment, scaled_clearance, segment_distance
 from perch_core.scenario import Cable, Inspection, Scenario, Start, Waypoint, World
 from perch_core.vehicle import load_vehicle
-from perch_eval.inspection.measures import collisions, reference_states
+from perch_eval.inspection.measures import collisions, reference_states, segments
 
 RADIUS = 0.03           # of the cables [m]
 WAYPOINTS = 6
@@ -45,16 +45,6 @@ def random_layout(base: Scenario, seed: int) -> Scenario:
         if apart > APART and clear > CLEAR and _way_up(scenario, cables, vehicle.body_radii) and collisions(states, cables, vehicle.body_radii) == 2:
             return dataclasses.replace(scenario, name=f"{base.name}_{seed}")
     raise RuntimeError(f"no layout within {DRAWS} draws of seed {seed}")
-
-
-def segments(scenario: Scenario) -> list[Segment]:
-    """The cables of a scenario, which are straight here, in W."""
-    return [Segment.between(c.start, c.end, c.radius, k) for k, c in enumerate(scenario.world.cables)]
-
-
-def watched(scenario: Scenario, lines: list[Segment]) -> Segment:
-    """The line that the scenario's rough point means."""
-    return min(lines, key=lambda s: float(s.distance(np.array(scenario.inspection.watched))))
 
 
 def _draw(base: Scenario, rng: np.random.Generator) -> Scenario:

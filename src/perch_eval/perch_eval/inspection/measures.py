@@ -20,6 +20,16 @@ from perch_planner.powerline.visibility import Visibility, visibility
 SAMPLE = 0.01  # of the reference's states [s]
 
 
+def segments(scenario: Scenario) -> list[Segment]:
+    """The cables of a scenario, which are straight here, in W."""
+    return [Segment.between(c.start, c.end, c.radius, k) for k, c in enumerate(scenario.world.cables)]
+
+
+def watched(scenario: Scenario, lines: list[Segment]) -> Segment:
+    """The line that the scenario's rough point means."""
+    return min(lines, key=lambda s: float(s.distance(np.array(scenario.inspection.watched))))
+
+
 def reference_of(scenario: Scenario, start_time: float = 0.0) -> FlatTrajectory:
     """The waypoint lines of a scenario."""
     places = [(np.array(w.position), float(np.radians(w.yaw_deg))) for w in scenario.inspection.waypoints]
@@ -72,3 +82,43 @@ def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: 
     mount = vehicle.mounts["front"]
     return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, mount),
                      collisions(states, lines, vehicle.body_radii), float(np.hypot(mount.camera.width, mount.camera.height)) / 2)
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """A flown inspection beside its reference.
+
+    Attributes:
+        times: since the start of the reference [s], shape (n,).
+        states: true p, q, ..., shape (n, >= 7).
+        flown: the flight, judged by the true lines.
+        reference_times, reference_states, reference: the same of the waypoint lines, as if flown exactly.
+        lines, line: the true lines, and the watched one.
+        crashes: how often the plant reports a collision.
+        message: why the flight ended early; empty: it came to its end.
+    """
+
+    times: np.ndarray
+    states: np.ndarray
+    flown: Judgement
+    reference_times: np.ndarray
+    reference_states: np.ndarray
+    reference: Judgement
+    lines: list[Segment]
+    line: Segment
+    crashes: int
+    message: str
+
+    @property
+    def collisions(self) -> int:
+        """Of the flight, by the plant or by the geometry of the states, whichever counts more."""
+        return max(self.flown.collisions, self.crashes)
+
+
+def inspected(scenario: Scenario, times: np.ndarray, states: np.ndarray, crashes: int = 0, message: str = "") -> Inspected:
+    """A flight of a scenario, judged; arguments as the fields of `Inspected`."""
+    vehicle, lines = load_vehicle(scenario.vehicle), segments(scenario)
+    line = watched(scenario, lines)
+    reference_times, reference = reference_states(scenario)
+    return Inspected(times, states, judge(states, lines, line, vehicle), reference_times, reference,
+                     judge(reference, lines, line, vehicle), lines, line, crashes, message)
