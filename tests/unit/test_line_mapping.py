@@ -304,3 +304,33 @@ def test_false_sightings_are_forgotten():
     assert len(mapper._tracks) == 1
     mapper.update(1.5, body, [])
     assert mapper._tracks == []
+
+
+def test_the_map_follows_an_odometry_that_drifts():
+    """What the newest sightings say counts more than what the oldest did: the vehicle will fly there from where it is now."""
+    wire, errors = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), {}
+    for drift in (0.0, 0.01):  # of the mapper; the odometry's own is 1 cm/s
+        rng, mapper = np.random.default_rng(10), LineMapper(MapperConfig(triangulation=TriangulationConfig(pose_drift=drift)))
+        for k in range(100):
+            time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])  # up and down
+            believed = true + time * np.array([0.003, 0.0, -0.01])
+            body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+            seen = observe(rng, wire, true, 2e-4, time=time)
+            lines = mapper.update(time, body, [LineObservation(time, believed, seen.rays_W, seen.ends_W, seen.sigma, seen.width)]).lines
+        assert len(lines) == 1
+        errors[drift] = np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - believed + true)[[0, 2]])
+    assert errors[0.01] < 0.7 * errors[0.0] and errors[0.01] < 0.04
+
+
+def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
+    """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles."""
+    rng, mapper = np.random.default_rng(11), LineMapper(MapperConfig())
+    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.25])
+    for k in range(80):
+        time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
+        believed = true + (jump if k >= 30 else 0.0)
+        body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        seen = observe(rng, wire, true, 2e-4, time=time)
+        lines = mapper.update(time, body, [LineObservation(time, believed, seen.rays_W, seen.ends_W, seen.sigma, seen.width)]).lines
+    assert len(lines) == 1
+    assert np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - jump)[[0, 2]]) < 0.03

@@ -31,7 +31,7 @@ class TriangulationConfig:
                                        doc="least sigma2/sigma1 of the planes' normals; below it the depth is not determined")
     pose_position: float = config.quantity(0.003, unit="m", above=0.0, high=1.0,
                                            doc="error of the camera's position from image to image, 1 sigma")
-    pose_drift: float = config.quantity(0.03, unit="m/sqrt(s)", low=0.0, high=1.0,
+    pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="growth of that error with the age of a sighting; the wire is where the newest see it")
     pose_rotation: float = config.quantity(0.1, unit="deg", above=0.0, high=10.0, doc="the same for its attitude")
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
