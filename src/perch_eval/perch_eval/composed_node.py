@@ -1,4 +1,4 @@
-"""Several nodes in one process, on one executor: the same classes, four times the lockstep rate.
+"""Several nodes in one process, on one executor: the same classes.
 
     composed PLAN.json
 

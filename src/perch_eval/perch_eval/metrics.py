@@ -176,6 +176,17 @@ def node_durations(flight: Flight) -> dict[str, dict[str, float]]:
     return out
 
 
+def missed_deadlines(flight: Flight) -> dict[str, dict[str, float]]:
+    """In real time: how many deadlines each node of the loop had, how many it missed, and their share [%]; empty in lockstep."""
+    out: dict[str, dict[str, float]] = {}
+    for node, reports in diagnostics(flight).items():
+        counts = [values for values in reports if values.get("deadlines", 0.0) > 0.0]
+        if counts:
+            had, missed = counts[-1]["deadlines"], counts[-1]["missed_deadlines"]
+            out[node] = {"deadlines": had, "missed": missed, "missed_percent": 100.0 * missed / had}
+    return out
+
+
 def tilt_degrees(q: np.ndarray) -> np.ndarray:
     """Angle of b3 from the vertical, (n, 4) -> (n,) [deg]."""
     b3 = so3.quat_rotate(q, np.array([0.0, 0.0, 1.0]))

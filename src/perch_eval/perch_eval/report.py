@@ -15,7 +15,7 @@ from perch_eval.flight import Flight
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected
 from perch_eval.inspection.recorded import recorded
-from perch_eval.metrics import contact_report, diagnostics, flight_metrics, node_durations, perch_window, rates
+from perch_eval.metrics import contact_report, diagnostics, flight_metrics, missed_deadlines, node_durations, perch_window, rates
 from perch_eval.pilot import SUCCESSES
 
 _STYLE = """
@@ -58,6 +58,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         **flight_metrics(flight, vehicle, end_time),
         "flight_hash": flight.digest(end_time),
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
+        "missed_deadlines": missed_deadlines(flight),
     }
     inspection = recorded(flight, scenario)
     if inspection is not None:
