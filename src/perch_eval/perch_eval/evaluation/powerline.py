@@ -68,7 +68,7 @@ def _table(effort: Effort) -> Section:
 
 
 def _flown(effort: Effort) -> Section:
-    """The errors at the perching point, flown by the real nodes."""
+    """The errors at the perching point, flown."""
     from perch_eval.evaluation.perching import source_digest
     from perch_eval.evaluation.powerline_flights import SEEDS, flights
 
@@ -78,7 +78,8 @@ def _flown(effort: Effort) -> Section:
             out.missing(f"{WORDS[case]}: position, pitch-roll error", f"{paper_p} cm, {paper_q} deg", "flown by --full only")
         return out
     out = Section("p_table_1_flown", "[P] Table I: errors at the perching point",
-                  f"Real nodes, composed, in lockstep; cables mapped by the front camera; seeds {SEEDS.start} to {SEEDS.stop - 1}; truth against "
+                  "In-process engine: what the nodes fly, to the last bit; both cameras rendered, cables mapped by the front one; "
+                  f"seeds {SEEDS.start} to {SEEDS.stop - 1}; truth against "
                   "plan when the gripper closes, or where it should have. The paper: an optical tracking system instead of VIO.")
     found = flights(effort, tuple(TABLE), source_digest())
     for case, (paper_p, paper_q, *_) in TABLE.items():

@@ -1,4 +1,4 @@
-"""[P] Table I, the flown half: perches on lines with the real nodes, and their errors at the perching point."""
+"""[P] Table I, the flown half: perches on lines, cameras rendered, and their errors at the perching point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perch_core import config, so3
 from perch_core.ros.trajectories import from_message
 from perch_core.trajectory import SampledTrajectory
 from perch_eval.campaign.causes import SUCCESS
-from perch_eval.campaign.engines import Task, fly_on_the_stack
+from perch_eval.campaign.engines import Task, fly_in_process
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import Results, RunResult
 from perch_eval.campaign.specification import Run
@@ -23,12 +23,13 @@ from perch_eval.flight import Flight
 from perch_eval.metrics import touch_of
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
-SEEDS = range(1, 21)
+RENDERED = {"vio": "rendered", "target": "rendered"}
+SEEDS = range(1, 11)
 
 
 def fly_line(task: Task) -> RunResult:
-    """One perch on a line by the real nodes, with the errors at the perching point among its metrics."""
-    result = fly_on_the_stack(task)
+    """One perch on a line, the same as by the real nodes, with the errors at the perching point among its metrics."""
+    result = fly_in_process(task)
     return dataclasses.replace(result, metrics=result.metrics | perching_errors(Flight(Path(task.keep) / "flight.mcap")))
 
 
@@ -53,18 +54,18 @@ def perching_errors(flight: Flight) -> dict[str, float | None]:
 
 
 def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, list[RunResult]]:
-    """Flights of each case by the real nodes; finished ones of the same code are not flown again."""
+    """Flights of each case; finished ones of the same code are not flown again."""
     effort.state.mkdir(parents=True, exist_ok=True)
     results = Results(effort.state / f"line_flights_{digest[:12]}.sqlite", "line flights", digest, resume=True)
     try:
         tasks = []
         for number, (seed, case) in enumerate((seed, case) for seed in SEEDS for case in cases):
             mapping: dict[str, Any] = config.read_yaml(config.find("scenarios", case))
-            tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, {},
+            tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, RENDERED,
                               str((effort.state / "lines" / f"{case}_{seed}").absolute())))
         known = {r.number for r in results.all()}
         progress = Progress(len(tasks), len(known), what="line flights")
-        for result in in_pool([t for t in tasks if t.run.number not in known], 1):  # each is a stack of processes itself
+        for result in in_pool([t for t in tasks if t.run.number not in known], 1):
             results.add(result)
             progress.add(result.cause == SUCCESS)
         progress.close()
