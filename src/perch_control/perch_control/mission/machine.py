@@ -129,6 +129,9 @@ class MissionMachine:
         offset, turn = self._pattern[self._place % len(self._pattern)]
         self._place += 1
         p, yaw = self._moves.search_place(self._goal, inputs.state)
+        if self._goal.mode is Mode.POWERLINE and offset[0] > 0.0:
+            room = 0.0 if inputs.target is None else float(np.linalg.norm(inputs.target.p_WS - p)) - self.settings.mapping_standoff
+            offset = np.array([min(offset[0], max(room, 0.0)), *offset[1:]])
         self._go(inputs, outputs, (p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn))
         self.message = message
 

@@ -46,12 +46,13 @@ class Moves:
         """Places around the search hover (forward, left, up [m], turn [rad]).
 
         A pad may be out of view: the vehicle turns and rises. Lines have to be seen from different places: it moves
-        up and down, and a little to the sides. The first `mapping_legs` of these are flown before any plan.
+        up and down, and nearer, as the error of a distance grows with its square, and back. The first `mapping_legs` of these
+        are flown before any plan.
         """
         rise, turn = self.settings.search_rise, math.radians(self.settings.search_yaw_deg)
         if goal.mode is not Mode.SURFACE:
-            reach = self.settings.mapping_reach
-            return [(np.array(v), 0.0) for v in ((0, 0, reach), (0, 0, 0), (0, reach / 2, 0), (0, -reach / 2, reach))]
+            reach, near = self.settings.mapping_reach, self.settings.mapping_approach
+            return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
         return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
                 (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
 
