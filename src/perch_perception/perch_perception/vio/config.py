@@ -16,7 +16,7 @@ class TrackerConfig:
     features: int = quantity(100, low=10, high=400, doc="tracks to keep up")
     refill: float = quantity(0.85, low=0.1, high=1.0, doc="detect new features below this share of them")
     spacing: float = quantity(18.0, unit="px", above=2.0, doc="least distance between features")
-    crowding: float = quantity(0.6, unit="-", low=0.0, high=1.0,
+    crowding: float = quantity(0.0, unit="-", low=0.0, high=1.0,
                                doc="features nearer to an older one than this share of the spacing are let go; 0: none")
     quality: float = quantity(0.01, above=0.0, high=1.0, doc="least corner strength, share of the strongest")
     smoothing: float = quantity(1.5, unit="px", above=0.1, high=5.0, doc="sigma of the smoothing before detection and tracking")
