@@ -156,6 +156,9 @@ def test_a_client_sees_topics_with_their_definitions_scene_and_time(flight):
     flight.publish("controller/status", status, qos.CHAIN)
     wanted = {"room", "surface", "pad", "vehicle", "camera_axis", "status", "truth", "plan", "flown", "target"}
     flight.until(lambda: wanted <= set(flight.markers()) and flight.markers()["flown"][0].points and client.of("/tf"), "the scene", flight.odometry)
+    client.subscribe("/trajectory")  # after it was sent
+    flight.until(lambda: client.of("/trajectory"), "the trajectory")
+    assert deserialize_message(client.of("/trajectory")[0][1], Trajectory) == trajectory
     shown = flight.markers()
     hubs = np.mean([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in shown["vehicle"].values() if m.type == Marker.CYLINDER], axis=0)
     assert np.allclose(hubs[1:], P[1:], atol=1e-6)

@@ -115,7 +115,7 @@ class ViewerNode(PerchNode[ViewerParameters]):
                 look(data)
             stamp = stamp_of(data)
             if pace is None or pace(stamp):
-                self._server.send(resolved, data, stamp)
+                self._server.send(resolved, data, stamp, latched)
 
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         # What is fast may get lost on the way to a person; the rest must not.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import foxglove
+import foxglove.websocket
 from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
 
 from perch_core.errors import ConfigError
@@ -16,7 +17,7 @@ Frame = tuple[str, str, Sequence[float], Sequence[float]]
 """Parent, child, position of the child [m] (3,), its attitude xyzw (4,)."""
 
 
-class LiveServer:
+class LiveServer(foxglove.websocket.ServerListener):
     """Serves topics until it is closed. Time is simulation time."""
 
     def __init__(self, host: str, port: int, name: str) -> None:
@@ -25,12 +26,13 @@ class LiveServer:
             ConfigError: the port is taken, or the address is none of this machine's.
         """
         self._context = foxglove.Context()
+        self._channels: dict[str, foxglove.Channel] = {}
+        self._latched: dict[str, tuple[bytes, int]] = {}  # topic -> its last message, for those who come later
         try:
-            self._server = foxglove.start_server(name=name, host=host, port=port, context=self._context,
+            self._server = foxglove.start_server(name=name, host=host, port=port, context=self._context, server_listener=self,
                                                  capabilities=[foxglove.Capability.Time])
         except RuntimeError as error:
             raise ConfigError("viewer", "port", f"{host}:{port} cannot be served ({str(error).split(': ')[-1]}); {ADVICE}") from None
-        self._channels: dict[str, foxglove.Channel] = {}
         self._frames = foxglove.channels.FrameTransformsChannel("/tf", context=self._context)
 
     @property
@@ -47,9 +49,17 @@ class LiveServer:
         """Somebody looks at the topic."""
         return self._channels[topic].has_sinks()
 
-    def send(self, topic: str, data: bytes, time: int) -> None:
-        """Send one serialised message; `time` is simulation time [ns]."""
+    def send(self, topic: str, data: bytes, time: int, latched: bool = False) -> None:
+        """Send one serialised message; `time` is simulation time [ns]. A latched one is sent again to who subscribes later."""
+        if latched:
+            self._latched[topic] = data, time
         self._channels[topic].log(data, log_time=time)
+
+    def on_subscribe(self, client: foxglove.websocket.Client, channel: foxglove.websocket.ChannelView) -> None:
+        """Somebody begins to look; called by the server's thread."""
+        last = self._latched.get(channel.topic)
+        if last is not None:
+            self._channels[channel.topic].log(last[0], log_time=last[1])
 
     def send_frames(self, time: int, frames: Sequence[Frame]) -> None:
         """Send where frames are, as /tf."""
