@@ -51,7 +51,10 @@ class _Flight:
         self.vio = ModelledVio(params.of("vio_model", VioModelParameters), mount)
         self.latency = round(scenario.latency.vio * 1e9)
         self.estimation = Estimation(params.of("estimator", UkfConfig))
-        self.piloting = Piloting(params.of("controller", ControllerParameters), self.simulation.vehicle)
+        controller = params.of("controller", ControllerParameters)
+        self.piloting = Piloting(controller, self.simulation.vehicle)
+        self.ramp = controller.nmpc.lines.ramp_time
+        self.believed: np.ndarray = np.zeros(3)  # position as estimated
         self.poses: Mailbox = Mailbox()
         self.waiting: deque = deque()
         self.map: list[Segment] = []
@@ -71,6 +74,7 @@ class _Flight:
         for pose in self.poses.released(stamp):
             self.estimation.add_vio(pose)
         odometry = self.estimation.step(imu)
+        self.believed = odometry.estimate.p_WB
         if self.map and self.index % MAP_STEPS == 0:
             self.piloting.see(self.map)
         result = self.piloting.step(time, imu, odometry)
@@ -111,12 +115,10 @@ def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
     if scenario.mode != "inspection":
         raise PerchError(f"scenario {scenario.name}: mode {scenario.mode!r} is not inspection")
     flight = _Flight(scenario, seed)
-    lines = segments(scenario)
     _take_off(flight, scenario)
     if with_lines:
-        flight.map = mapped(lines, seeding.stream(seed, "line_map"))
-    ramp = (scenario.parameters or {}).get("controller", {}).get("nmpc.lines.ramp_time", 3.0)
-    flight.run(ramp + SETTLE)
+        flight.map = mapped(segments(scenario), seeding.stream(seed, "line_map"))
+    flight.run(flight.ramp + SETTLE)
     start = flight.time + LEAD
     trajectory = reference_of(scenario, start)
     flight.piloting.follow(FlownTrajectory(2, trajectory, AtEnd.HOLD))
@@ -140,10 +142,9 @@ def _take_off(flight: _Flight, scenario: Scenario) -> None:
     flight.run(0.2)
     flight.piloting.command(Command.ARM, "inspection")
     flight.run(0.2)
-    e = flight.simulation.state
     yaw = float(np.radians(first.yaw_deg))
     duration = max(2.0, first.position[2] / 0.8)
-    flight.piloting.follow(FlownTrajectory(1, rest_to_rest(e.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD),
+    flight.piloting.follow(FlownTrajectory(1, rest_to_rest(flight.believed, np.array(first.position), yaw, yaw, duration, flight.time + LEAD),
                                            AtEnd.HOLD))
     flight.run(duration + LEAD + SETTLE)
     if State(flight.piloting.status.state) is not State.HOVERING:
