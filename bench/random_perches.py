@@ -7,7 +7,7 @@ import numpy as np
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import Vehicle
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint
-from perch_planner.verifier import Requirements
+from perch_planner.verifier import Requirements, Rotors
 
 
 def random_problem(rng: np.random.Generator, waypoints: int | None = None, moving_start: bool = True) -> PerchProblem:
@@ -42,6 +42,7 @@ def random_problem(rng: np.random.Generator, waypoints: int | None = None, movin
 def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
     """What was asked, in the plain numbers of the verifier."""
     limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
+    rotors = Rotors(np.array(vehicle.inertia), vehicle.allocation, (vehicle.thrust_min, vehicle.thrust_max))
     return Requirements(
         start=np.array([start.p, start.v, start.a, start.j]), start_yaw=(start.yaw, start.yaw_rate),
         waypoints=np.array([w.p for w in problem.waypoints]).reshape(-1, 3), p_S=surface.p_WS, s1=surface.R_WS[:, 0],
@@ -49,8 +50,8 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         mass=vehicle.mass, impact_acceleration=settings.impact_acceleration,
         impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
         tube=(settings.tube_time, settings.tube_step, settings.tube_tolerance, settings.tube_floor), thrust=limits.thrust,
-        body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension)
-
+        body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
+        rotors=rotors if settings.rotors else None)
 
 
 

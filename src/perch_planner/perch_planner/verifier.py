@@ -16,6 +16,22 @@ from numpy.polynomial import chebyshev
 from numpy.polynomial import polynomial as power
 
 _G = 9.81
+_TURN = 1e-4  # [s] between the rotations from which rates and accelerations are taken
+
+
+@dataclass(frozen=True)
+class Rotors:
+    """What the rotors must keep.
+
+    Attributes:
+        inertia: principal moments [kg m^2], shape (3,).
+        allocation: rotor thrusts to collective thrust and moments, shape (4, 4).
+        thrust: least and greatest of each rotor [N].
+    """
+
+    inertia: np.ndarray
+    allocation: np.ndarray
+    thrust: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -39,6 +55,7 @@ class Requirements:
         speed: greatest [m/s].
         height: least and greatest [m].
         extension: radius of the rim [m].
+        rotors: limits of the single rotors, or None.
     """
 
     start: np.ndarray
@@ -60,6 +77,7 @@ class Requirements:
     speed: float
     height: tuple[float, float]
     extension: float
+    rotors: Rotors | None = None
 
 
 @dataclass(frozen=True)
@@ -152,6 +170,8 @@ def verify(durations, segments, need: Requirements, step: float = 1e-4, toleranc
     for piece, begin in zip(pieces, begins):
         _check_exact(piece, float(begin), need, at_most)
         _check_dense(piece, float(begin), need, step, at_most)
+        if need.rotors is not None:
+            _check_rotors(piece, float(begin), need, step, at_most)
     return found
 
 
@@ -213,3 +233,29 @@ def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float,
     gap = distance - need.extension * sine
     worst = int(gap.argmin())
     at_most("clearance", 0.0, float(gap[worst]), float(times[worst]), 1e-9)
+
+
+def _turn_rates(before: np.ndarray, after: np.ndarray, step: float) -> np.ndarray:
+    """Body rates between rotations `step` seconds apart, shape (n, 3)."""
+    turn = np.einsum("nji,njk->nik", before, after)
+    sine = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+    size = np.linalg.norm(sine, axis=1, keepdims=True)
+    return sine * np.where(size < 1e-9, 1.0, np.arcsin(np.clip(size, 0.0, 1.0)) / np.maximum(size, 1e-300)) / step
+
+
+def _check_rotors(piece: _Segment, begin: float, need: Requirements, step: float, at_most) -> None:
+    """Rotor thrusts on samples: Euler's equation with rates and accelerations from three rotations `_TURN` apart."""
+    rotors, h = need.rotors, _TURN / piece.duration
+    count = max(int(np.ceil(piece.duration / step)), 2)
+    s = h + (np.arange(count) + 0.5) / count * (1.0 - 2.0 * h)
+    force = [piece.at(s + k * h, 2)[:, :3] + (0.0, 0.0, _G) for k in (-1.0, 0.0, 1.0)]
+    R = [_rotations(f, piece.at(s + k * h, 0)[:, 3]) for f, k in zip(force, (-1.0, 0.0, 1.0))]
+    first, second = _turn_rates(R[0], R[1], _TURN), _turn_rates(R[1], R[2], _TURN)
+    rate, acceleration = 0.5 * (first + second), (second - first) / _TURN
+    moment = rotors.inertia * acceleration + np.cross(rate, rotors.inertia * rate)
+    collective = need.mass * np.linalg.norm(force[1], axis=1, keepdims=True)
+    thrust = np.linalg.solve(rotors.allocation, np.hstack([collective, moment]).T)
+    low, high = thrust.min(axis=0), thrust.max(axis=0)
+    least, most = int(low.argmin()), int(high.argmax())
+    at_most("rotor thrust, least [P:eq2]", rotors.thrust[0], float(low[least]), begin + s[least] * piece.duration, 1e-4)
+    at_most("rotor thrust, greatest [P:eq2]", float(high[most]), rotors.thrust[1], begin + s[most] * piece.duration, 1e-4)
