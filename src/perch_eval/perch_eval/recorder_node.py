@@ -32,7 +32,8 @@ TOPICS = {
     "imu/data_raw": Imu, "rotor_state": RotorState, "motor_command": MotorCommand,
     "odometry": Odometry, "vio/odometry": Odometry, "estimator/status": EstimatorStatus,
     "target/pose": PoseWithCovarianceStamped, "target/detections": TargetDetection, "powerlines": PowerlineArray,
-    "trajectory": Trajectory, "controller/command": ControllerCommand, "controller/status": ControllerStatus,
+    "trajectory": Trajectory, "recovery": Trajectory, "controller/command": ControllerCommand,
+    "controller/status": ControllerStatus,
     "controller/reference": ControlReference, "/diagnostics": DiagnosticArray,
 }
 NOT_LATCHED = {"/diagnostics"}
