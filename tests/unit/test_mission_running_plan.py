@@ -25,8 +25,8 @@ def states(duration: float) -> SampledTrajectory:
                              np.tile([0.0, 1.5, 0.0], (200, 1)), zero, zero, np.tile([1.0, 2.0, 3.0, 4.0], (200, 1)))
 
 
-def target(time: float, x: float = 5.0) -> Target:
-    return Target(time, np.array([x, 0.0, 4.75]), LEVEL, 0.02, 0.01)
+def target(time: float, x: float = 5.0, sigma: float = 0.02) -> Target:
+    return Target(time, np.array([x, 0.0, 4.75]), LEVEL, sigma, 0.01)
 
 
 def running(length: float = LENGTH) -> RunningPlan:
@@ -80,6 +80,11 @@ def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
 def test_no_new_perch_for_millimetres_nor_at_the_end_nor_unasked(time, x, goal):
     query = running().query(time, target(10.0, x=x), goal)
     assert query is None or query.recovery
+
+
+def test_a_target_known_worse_than_the_planned_one_is_not_followed():
+    query = running().query(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL)
+    assert query.recovery
 
 
 def test_an_answer_that_comes_too_late_is_not_used():

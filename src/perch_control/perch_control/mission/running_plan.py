@@ -82,7 +82,7 @@ class RunningPlan:
 
     def _better(self, target: Target, time: float, start: float) -> bool:
         s = self._settings
-        return (target.time > self.target.time and self.end - start > s.powerline_replan_until
+        return (target.time > self.target.time and target.position_sigma <= self.target.position_sigma and self.end - start > s.powerline_replan_until
                 and start > self.plan.start_time + _DECISION and time - self._replanned_at >= s.powerline_replan_period
                 and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.replan_distance)
 
