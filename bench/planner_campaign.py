@@ -32,7 +32,7 @@ from perch_planner.verifier import verify
 
 _RELAXED = {
     "thrust": {"thrust_min": 1e-3, "thrust_max": 1e3}, "body_rate": {"body_rate_max": 1e3}, "speed": {"speed_max": 1e3},
-    "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3},
+    "rotor_thrust": {"rotors": "free"}, "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3},
 }
 
 
@@ -54,11 +54,12 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=10000, help="problems (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
     parser.add_argument("--step", type=float, default=1e-4, help="sampling of the verifier [s] (default: %(default)s)")
+    parser.add_argument("--rotors", action="store_true", help="the thrust of each rotor keeps its range, too")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     arguments = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
+    vehicle, settings = load_vehicle("snapdragon"), PerchSettings(rotors="required" if arguments.rotors else "free")
     codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
     begin = time.time()
     try:
@@ -76,7 +77,7 @@ def main() -> int:
             else:
                 times.append(time.perf_counter() - started)
                 durations.append(answer.duration)
-                need = requirements(problem, settings, vehicle)
+                need = requirements(problem, settings, vehicle, rotors=arguments.rotors)
                 findings = verify(answer.trajectory.durations, answer.trajectory.coefficients, need, arguments.step)
                 broken += [[seed, f.requirement, f.excess, f.time] for f in findings]
             done += 1
@@ -86,7 +87,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     ms = 1e3 * np.array(times or [np.nan])
-    result = {"problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
+    result = {"problems": done, "first_seed": arguments.first, "rotors": arguments.rotors, "plans": len(times), "refusals": dict(codes),
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
               "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}

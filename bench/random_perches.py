@@ -39,10 +39,10 @@ def random_problem(rng: np.random.Generator, waypoints: int | None = None, movin
     return PerchProblem(start, surface, tuple(Waypoint(p) for p in points), velocity)
 
 
-def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
-    """What was asked, in the plain numbers of the verifier."""
+def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, rotors: bool = True) -> Requirements:
+    """What was asked, in the plain numbers of the verifier; with or without the thrusts of the single rotors."""
     limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
-    rotors = Rotors(np.array(vehicle.inertia), vehicle.allocation, (vehicle.thrust_min, vehicle.thrust_max))
+    each = Rotors(np.array(vehicle.inertia), vehicle.allocation, (vehicle.thrust_min, vehicle.thrust_max))
     return Requirements(
         start=np.array([start.p, start.v, start.a, start.j]), start_yaw=(start.yaw, start.yaw_rate),
         waypoints=np.array([w.p for w in problem.waypoints]).reshape(-1, 3), p_S=surface.p_WS, s1=surface.R_WS[:, 0],
@@ -51,7 +51,7 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
         tube=(settings.tube_time, settings.tube_step, settings.tube_tolerance, settings.tube_floor), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
-        rotors=rotors if settings.rotors else None)
+        rotors=each if rotors else None)
 
 
 

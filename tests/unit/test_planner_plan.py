@@ -22,6 +22,7 @@ from random_perches import random_problem, requirements  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 HOVER = StartState((0.0, 0.0, 1.5))
+ROTORS = PerchSettings(rotors="preferred")
 
 
 def surface(inclination_deg: float, heading_deg: float = 0.0, p=(1.7, 0.0, 1.5)) -> PerchSurface:
@@ -35,10 +36,10 @@ def surface(inclination_deg: float, heading_deg: float = 0.0, p=(1.7, 0.0, 1.5))
 def checked(problem: PerchProblem, settings: PerchSettings = PerchSettings()):
     """A plan that the verifier accepts and whose certificates all hold."""
     planned = plan(problem, settings, VEHICLE)
-    need = requirements(problem, settings, VEHICLE)
+    kept = {c.quantity: c.holds for c in planned.certificates}
+    need = requirements(problem, settings, VEHICLE, rotors=kept.pop("rotor_thrust", False))
     assert verify(planned.trajectory.durations, planned.trajectory.coefficients, need, step=5e-4) == []
-    assert {c.quantity for c in planned.certificates} == {"thrust", "speed", "height", "clearance", "body_rate"}
-    assert all(c.holds for c in planned.certificates)
+    assert set(kept) == {"thrust", "speed", "height", "clearance", "body_rate"} and all(kept.values())
     return planned
 
 
@@ -50,6 +51,34 @@ def test_every_inclination_is_reached(inclination):
     state = flat_to_state(end.p, end.v, end.a, end.j, end.s, end.yaw, end.yaw_rate, end.yaw_acc, VEHICLE.mass)
     assert state.R_WB == pytest.approx(target.R_WS, abs=1e-6)  # B coincides with S at contact
     assert state.thrust == pytest.approx(VEHICLE.mass * 3.3)
+
+
+def test_turning_to_a_wall_stays_within_what_each_rotor_can_do():
+    """With the collective thrust bounded alone, stopping the rotation asks rotors for thrust below zero."""
+    problem = PerchProblem(HOVER, surface(90.0))
+    free = plan(problem, PerchSettings(), VEHICLE)
+    assert "rotor_thrust" not in {c.quantity for c in free.certificates}
+    need = requirements(problem, PerchSettings(), VEHICLE)
+    found = verify(free.trajectory.durations, free.trajectory.coefficients, need, step=5e-4)
+    assert {f.requirement for f in found} == {"rotor thrust, least [P:eq2]"}
+    assert max(f.excess for f in found) > 0.1
+    kept = {c.quantity: c for c in checked(problem, ROTORS).certificates}["rotor_thrust"]
+    assert kept.holds and kept.method == "dense" and "kept" in kept.describe()
+    assert kept.lower_limit > VEHICLE.thrust_min and kept.upper_limit < VEHICLE.thrust_max
+
+
+def test_a_ceiling_takes_more_than_the_rotors_have():
+    """Preferred limits give way, and the certificate says so; required ones are refused by name."""
+    problem = PerchProblem(HOVER, surface(180.0))
+    assert not {c.quantity: c for c in checked(problem, ROTORS).certificates}["rotor_thrust"].holds
+    with pytest.raises(PerchRefusal, match="single rotors") as refusal:
+        plan(problem, PerchSettings(rotors="required", duration_max=6.0), VEHICLE)
+    assert "rotor_thrust" in refusal.value.limits
+
+
+@pytest.mark.parametrize("inclination", [60, 75, 90, 105, 120])
+def test_walls_and_overhangs_keep_the_rotors(inclination):
+    assert all(c.holds for c in checked(PerchProblem(HOVER, surface(inclination)), ROTORS).certificates)
 
 
 @pytest.mark.parametrize("heading", [-90.0, 90.0, 180.0])
@@ -184,7 +213,7 @@ def test_random_problems_end_in_verified_plans_or_typed_refusals(chunk):
         except PerchRefusal as refusal:
             assert refusal.margin < 0.0 and refusal.constraint
             continue
-        need = requirements(problem, PerchSettings(), VEHICLE)
+        need = requirements(problem, PerchSettings(), VEHICLE, rotors=False)
         assert verify(answer.trajectory.durations, answer.trajectory.coefficients, need, step=2e-3) == []
         planned += 1
     assert planned >= 40  # these problems are generous: most have a plan

@@ -24,8 +24,9 @@ from random_perches import requirements  # noqa: E402
 VEHICLE = load_vehicle("snapdragon")
 PROBLEM = PerchProblem(StartState((0.0, 0.0, 1.5)), PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), np.radians(70.0)),
                        (Waypoint((0.7, 0.1, 1.4)),))
-PLAN = plan(PROBLEM, PerchSettings(), VEHICLE)
-NEED = requirements(PROBLEM, PerchSettings(), VEHICLE)
+ROTORS = PerchSettings(rotors="required")
+PLAN = plan(PROBLEM, ROTORS, VEHICLE)
+NEED = requirements(PROBLEM, ROTORS, VEHICLE)
 
 
 def findings(coefficients=None, durations=None, **changes):
@@ -47,7 +48,9 @@ def test_the_untouched_plan_is_accepted():
     ({"impact_acceleration": 3.31}, "acceleration at contact"), ({"perch_offset": 0.05}, "position at contact"),
     ({"v_S": np.array([0.01, 0.0, 0.0])}, "position at contact"), ({"waypoints": np.array([[0.7, 0.1, 1.41]])}, "waypoint 0"),
     ({"start": np.array([[0.0, 0.0, 1.5], [0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3])}, "start, derivative 1"),
-    ({"start_yaw": (0.1, 0.0)}, "start yaw")])
+    ({"start_yaw": (0.1, 0.0)}, "start yaw"),
+    ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.4, 1.1))}, "rotor thrust, least"),
+    ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.1, 0.7))}, "rotor thrust, greatest")])
 def test_a_broken_requirement_is_found(changes, words):
     assert words in findings(**changes)
 

@@ -97,16 +97,16 @@ def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarra
     return cuts
 
 
-def rotor_cuts(thrusts: np.ndarray, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, low: float,
-               high: float, rotors: tuple) -> list[Cut]:
-    """Cuts where a rotor's thrust leaves [low, high] [N]: linear in acceleration, jerk and snap at the present plan.
+def rotor_bounds(thrusts: tuple[np.ndarray, np.ndarray], coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray,
+                 low: float, high: float, rotors: tuple) -> list[Cut]:
+    """Bounds where a rotor's thrust leaves [low, high] [N] or is near to it: linear at the present plan, and good near it.
 
     Args:
         thrusts: of `rotor_thrusts.sampled`.
         coefficients, yaw, durations: the plan.
         rotors: of `rotor_thrusts.rotor_model`.
     """
-    where, gradients, bounds = linear_bounds(thrusts, coefficients, yaw, durations, low, high, *rotors)
+    where, gradients, bounds = linear_bounds(*thrusts, coefficients, yaw, durations, low, high, *rotors)
     return [Cut(int(i), s, ((2, g[0]), (3, g[1]), (4, g[2])), lower, upper)
             for (i, s), g, (lower, upper) in zip(where.tolist(), gradients, bounds.tolist())]
 

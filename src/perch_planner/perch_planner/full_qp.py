@@ -73,7 +73,8 @@ class FullProgram:
         norms = np.linalg.norm(equalities, axis=1, keepdims=True)
         self._equalities = np.kron(np.eye(3), equalities / norms)
         self._right = (right / norms).T.ravel()
-        self._rows, self._lower, self._upper = [], [], []
+        self._bounds: list[tuple[np.ndarray, float, float]] = []  # rows, lower, upper
+        self._local: list[tuple[np.ndarray, float, float]] = []
 
     def _place(self, segment: int, s: float, order: int) -> np.ndarray:
         row = np.zeros(self._count)
@@ -82,17 +83,23 @@ class FullProgram:
 
     def bound(self, segment: int, place: float, terms, lower: float, upper: float) -> None:
         """Add `lower <= sum of direction . derivative <= upper`, scaled to unit length; terms as in `Cut`."""
+        self._bounds.append(self._scaled(segment, place, terms, lower, upper))
+
+    def replace(self, bounds) -> None:
+        """Set the bounds near the present plan, each the arguments of `bound`."""
+        self._local = [self._scaled(*bound) for bound in bounds]
+
+    def _scaled(self, segment: int, place: float, terms, lower: float, upper: float) -> tuple[np.ndarray, float, float]:
         row = sum(np.kron(direction, self._place(int(segment), float(place), int(order))) for order, direction in terms)
         norm = np.linalg.norm(row)
-        self._rows.append(row / norm)
-        self._lower.append(lower / norm)
-        self._upper.append(upper / norm)
+        return row / norm, lower / norm, upper / norm
 
     def solve(self, solver: str) -> tuple[np.ndarray, Solution]:
         """Coefficients, shape (f, 3, 15), and the answer; solved only where every row holds to 1e-6."""
-        rows = np.vstack([self._equalities, np.array(self._rows)])
-        lower = np.concatenate([self._right, self._lower])
-        upper = np.concatenate([self._right, self._upper])
+        bounds, least, most = zip(*self._bounds, *self._local)
+        rows = np.vstack([self._equalities, np.array(bounds)])
+        lower = np.concatenate([self._right, least])
+        upper = np.concatenate([self._right, most])
         x, status = _SOLVERS[solver](self._cost, rows, lower, upper, len(self._right))
         if x is None or not np.isfinite(x).all():
             return np.zeros((len(self._durations), 3, _SIZE)), Solution(np.zeros(3 * self._count), False, np.inf, status)

@@ -7,7 +7,7 @@ loops is bounded, so that a plan ends after at most `iterations_max` programs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -21,6 +21,7 @@ from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Attempt, Outcome, Search
 from perch_planner.time_allocation import split_last
 
+_PREFERRED = 60  # programs in which a plan that keeps the rotors' limits must be found where they are preferred
 _CODES = {"": refusals.INFEASIBLE_WINDOW, "thrust": refusals.THRUST_FLOOR, "speed": refusals.BOX, "height": refusals.BOX,
           "clearance": refusals.BOX, "body_rate": refusals.BODY_RATE, "rotor_thrust": refusals.THRUST_FLOOR,
           "solver": refusals.SOLVER}
@@ -42,7 +43,7 @@ class PerchPlan:
 
     Attributes:
         trajectory: flat outputs, degree 14, from time 0 to contact.
-        certificates: one for each limit; of the rotors, which are sampled, where `settings.rotors`.
+        certificates: one for each limit; that of the rotors is sampled, and may not hold where they are `preferred`.
         iterations: QPs solved.
         solve_time: wall-clock time [s].
         attempts: what was tried on the way, in order.
@@ -77,8 +78,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     begin = perf_counter()
     limits = Limits.of(settings, vehicle)
     refusals.refuse_hopeless(problem, settings, limits, vehicle)
-    search = Search(problem, settings, vehicle, limits)
-    durations, outcome = search.run()
+    search, durations, outcome = _search(problem, settings, vehicle, limits)
     if not outcome.proved:
         raise _refusal(search, outcome)
     if settings.minimum_time:
@@ -96,10 +96,26 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))
 
 
+def _search(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle,
+            limits: Limits) -> tuple[Search, np.ndarray, Outcome]:
+    """The search, its durations and its outcome; where the rotors' limits are preferred and none is soon found, without them."""
+    if settings.rotors != "preferred":
+        search = Search(problem, settings, vehicle, limits)
+        return search, *search.run()
+    first = Search(problem, replace(settings, iterations_max=min(_PREFERRED, settings.iterations_max)), vehicle, limits)
+    durations, outcome = first.run()
+    if outcome.proved:
+        return first, durations, outcome
+    search = Search(problem, settings, vehicle, limits.without("rotor_thrust"))
+    search.attempts += first.attempts
+    return search, *search.run()
+
+
 def _refusal(search: Search, best: Outcome) -> PerchRefusal:
     """Find out what stands in the way: limits are taken away, the most often violated first, until there is a plan."""
     limits, taken, failures = search.limits, [], search.failures
-    proofs = () if best.results is None else certificates(best.results, search.limits, search.vehicle.mass)
+    asked = Limits.of(search.settings, search.vehicle)
+    proofs = () if best.results is None else certificates(best.results, asked, search.vehicle.mass)
     tried = f"{search.iterations} programs up to {search.attempts[-1].duration:.2f} s"
     while True:
         name = next((n for n, _ in failures.most_common() if n in plan_checks.NAMES and n not in taken), None)
@@ -111,8 +127,7 @@ def _refusal(search: Search, best: Outcome) -> PerchRefusal:
         _, outcome = relaxed.run()
         failures = relaxed.failures
         if outcome.proved:
-            needed = certificates(outcome.results, search.limits, search.vehicle.mass)
-            margin, words = _needed(needed, taken, search.limits)
+            margin, words = _needed(certificates(outcome.results, asked, search.vehicle.mass), taken)
             constraint = " and ".join(_WORDS[n] for n in taken)
             return PerchRefusal(_CODES[taken[0]], constraint, margin,
                                 f"no plan keeps the {constraint} ({tried}); without it there is one that takes {words}; "
@@ -123,7 +138,7 @@ def _refusal(search: Search, best: Outcome) -> PerchRefusal:
                         search.iterations)
 
 
-def _needed(proofs: tuple[Certificate, ...], names: list[str], limits: Limits) -> tuple[float, str]:
+def _needed(proofs: tuple[Certificate, ...], names: list[str]) -> tuple[float, str]:
     """By how much the first named limit is exceeded by a plan without it, and its figures in words."""
     by_name = {proof.quantity: proof for proof in proofs}
     first = by_name[names[0]]

@@ -154,7 +154,8 @@ class PerchSettings:
     decider: str = choice("bernstein", options=("bernstein", "sturm"), doc="thrust bound: subdivision, or [M:alg1]")
     stretching: str = choice("adaptive", options=("adaptive", "whole", "segments"),
                              doc="what grows when a bound is violated: the approach or all, all, or as in [M:IV-C.3]")
-    rotors: bool = quantity(True, doc="keep the thrust of each rotor within its range too, on samples")
+    rotors: str = choice("free", options=("required", "preferred", "free"),
+                         doc="each rotor's thrust stays in its range, on samples: always, where a plan is soon found, or not")
     rotor_margin: float = quantity(0.005, low=0.0, high=0.4, doc="share of a rotor's range kept free at both its ends")
     cuts: bool = quantity(True, doc="add linear bounds where a limit is violated, before the time is stretched")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")

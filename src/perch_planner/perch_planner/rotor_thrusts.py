@@ -27,8 +27,9 @@ _PLACES = np.linspace(0.0, 1.0, 49)
 _AT10, _AT11, _AT12, _AT13, _AT14 = (np.ascontiguousarray(bernstein.basis(n, _PLACES).T) for n in range(10, 15))
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
-_NEAR = 0.02        # rotors this near to a limit are bounded too where another place breaks it; share of the range
-_KEEP = 2e-3        # bounds are set inside by this share of the range
+_NEAR = 0.1         # rotors this near to a limit are bounded; share of the range
+_KEEP = 2e-3        # bounds are set inside by this share of the range,
+_BETWEEN = 1.5      # and by this multiple of what was seen between the samples
 
 
 def rotor_model(vehicle: Vehicle) -> tuple[float, tuple[float, float, float], np.ndarray]:
@@ -117,11 +118,11 @@ def sampled(coefficients, yaw, durations, mass, J, mixing):
 
 
 @compiled
-def linear_bounds(thrusts, coefficients, yaw, durations, low, high, mass, J, mixing):
-    """Linearised bounds on the rotors that leave [low, high], and on those near to it.
+def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J, mixing):
+    """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:
-        thrusts: of `sampled`.
+        thrusts, row: of `sampled`; what lies beyond the limits between the samples is made up for at the samples.
         coefficients, yaw, durations, mass, J, mixing: as for `sampled`.
         low, high: limits of a rotor's thrust [N].
 
@@ -129,16 +130,17 @@ def linear_bounds(thrusts, coefficients, yaw, durations, low, high, mass, J, mix
         (where, gradients, bounds): segment and place, shape (n, 2); gradients by acceleration, jerk and snap, shape (n, 3, 3); lower
         and upper bound of the sum of gradients times derivatives, shape (n, 2).
     """
-    near = _NEAR * (high - low)
+    near, keep = _NEAR * (high - low), _KEEP * (high - low)
+    above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
+    below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
     chosen = np.zeros(thrusts.shape, np.int8)
     count = 0
     for i in range(thrusts.shape[0]):
-        broken = thrusts[i].min() < low or thrusts[i].max() > high
         for k in range(thrusts.shape[1]):
             for q in range(4):
-                if broken and thrusts[i, k, q] < low + near:
+                if thrusts[i, k, q] < low + near:
                     chosen[i, k, q] = 1
-                elif broken and thrusts[i, k, q] > high - near:
+                elif thrusts[i, k, q] > high - near:
                     chosen[i, k, q] = 2
                 count += chosen[i, k, q] > 0
     where, gradients, bounds = np.empty((count, 2)), np.empty((count, 3, 3)), np.empty((count, 2))
@@ -164,8 +166,7 @@ def linear_bounds(thrusts, coefficients, yaw, durations, low, high, mass, J, mix
                     known = (slopes[q] * x).sum() - thrusts[i, k, q]
                     where[n, 0], where[n, 1] = i, place
                     gradients[n] = slopes[q]
-                    inside = _KEEP * (high - low)
-                    bounds[n, 0] = low + inside + known if chosen[i, k, q] == 1 else -np.inf
-                    bounds[n, 1] = high - inside + known if chosen[i, k, q] == 2 else np.inf
+                    bounds[n, 0] = above + known if chosen[i, k, q] == 1 else -np.inf
+                    bounds[n, 1] = below + known if chosen[i, k, q] == 2 else np.inf
                     n += 1
     return where, gradients, bounds

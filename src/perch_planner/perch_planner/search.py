@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks
 from perch_planner.contact_constraints import Contact
-from perch_planner.cutting import limit_cuts, preventive_cuts, rotor_cuts, thrust_cuts, turning_side
+from perch_planner.cutting import limit_cuts, preventive_cuts, rotor_bounds, thrust_cuts, turning_side
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.rotor_thrusts import rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, FORMULATIONS
@@ -69,7 +69,7 @@ class Search:
         self.contact = Contact(problem, settings, vehicle.perch_offset)
         self.first = allocate(problem, settings, self.contact.p_contact)
         self.end_yaw = contact_heading(problem.surface)
-        self.rotors = rotor_model(vehicle) if settings.rotors else None
+        self.rotors = rotor_model(vehicle) if settings.rotors != "free" else None
         self.attempts: list[Attempt] = []
         self.failures: Counter[str] = Counter()
 
@@ -91,7 +91,7 @@ class Search:
             return Outcome(None, None, None, "solver")
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
-        best, count = None, 0
+        best, count, turning = None, 0, False
         if settings.cuts and len(durations) > 1:
             program.add(preventive_cuts(durations, self.high, turning_side(self.problem)))
         for rounds in range(_CUT_ROUNDS + 1):
@@ -107,15 +107,21 @@ class Search:
             if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
                 return outcome
             if not outcome or rounds and outcome.margin > -_NEAR * self.limits.thrust[1]:
-                results, where, further = self._check(coefficients, yaw, durations, extrema)
+                results, where, thrusts = self._check(coefficients, yaw, durations, extrema)
                 if results[:, plan_checks.HOLDS].all():
                     return Outcome(coefficients, yaw, results)
-                cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits) + further
+                cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits)
+                turning = turning or thrusts is not None and not results[plan_checks.ROTOR_THRUST, plan_checks.HOLDS]
+                if turning and settings.cuts:
+                    bounds = rotor_bounds(thrusts, coefficients, yaw, durations, *self.limits.rotor_thrust, self.rotors)
+                    program.replace(bounds)
+                    count += len(bounds)
                 outcome = outcome or self._limit(coefficients, yaw, results)
             best = outcome
-            if not cuts or not settings.cuts:
+            if not (cuts or turning) or not settings.cuts:
                 break
-            program.add(cuts)
+            if cuts:
+                program.add(cuts)
             count += len(cuts)
         # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
         return replace(best, stretch=_PLAIN_STRETCH) if best and count else best or Outcome(None, None, None)
@@ -144,19 +150,17 @@ class Search:
         return Outcome(coefficients, yaw, results, name, self._margin(results, name))
 
     def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
-        """Rows of `plan_checks.NAMES`, first doubts of the proved ones, cuts for the rotors."""
+        """Rows of `plan_checks.NAMES`, first doubts of the proved ones, samples of the rotors' thrusts (or None)."""
         surface, limits = self.problem.surface, self.limits
         results, where = plan_checks.check(
             coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity,
             np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed, limits.height[0], limits.height[1],
             limits.extension, limits.clearance, limits.body_rate)
         if self.rotors is None:
-            return results, where, []
+            return results, where, None
         low, high = limits.rotor_thrust
         thrusts, row = sampled(coefficients, yaw, durations, *self.rotors)
-        keeps = low <= row[0] and row[2] <= high
-        results = np.vstack([results, [*row, keeps]])
-        return results, where, [] if keeps else rotor_cuts(thrusts, coefficients, yaw, durations, low, high, self.rotors)
+        return np.vstack([results, [*row, low <= row[0] and row[2] <= high]]), where, (thrusts, row)
 
     def _margin(self, results: np.ndarray, name: str) -> float:
         row, limits = results[plan_checks.NAMES.index(name)], self.limits

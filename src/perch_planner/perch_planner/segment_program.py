@@ -36,6 +36,9 @@ class SegmentProgram(Protocol):
     def add(self, cuts: list[Cut]) -> None:
         """Add linear bounds to the program."""
 
+    def replace(self, bounds: list[Cut]) -> None:
+        """Set the bounds that hold near the present plan alone, instead of those set before."""
+
     def solve(self) -> tuple[np.ndarray, Solution]:
         """Bernstein coefficients, shape (f, 3, 15) [m], and the solver's answer; valid where it is `solved`."""
 
@@ -50,21 +53,29 @@ class ReducedSegments:
             durations, linear, settings.objective == "jerk" or settings.bubbles == "everywhere")
         self._program = reduced_qp.assemble(durations, *contact.knots(durations), self._bubbles, linear.segments,
                                             linear.places, linear.orders, COST_ORDER[settings.objective])
+        self._local: tuple[np.ndarray, ...] | None = None
         self._rows = reduced_qp.constraint_rows(self._program, linear.functional, linear.direction, linear.lower, linear.upper)
 
     def add(self, cuts: list[Cut]) -> None:
         """Add linear bounds; only their own rows are computed."""
+        self._rows = tuple(np.concatenate(pair) for pair in zip(self._rows, self._further(cuts)))
+
+    def replace(self, bounds: list[Cut]) -> None:
+        """Set the bounds near the present plan."""
+        self._local = self._further(bounds) if bounds else None
+
+    def _further(self, cuts: list[Cut]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         terms = [(k, cut, *term) for k, cut in enumerate(cuts) for term in cut.terms]
-        rows = reduced_qp.further_rows(
+        return reduced_qp.further_rows(
             self._program, self._durations, self._bubbles, np.array([k for k, *_ in terms]),
             np.array([cut.segment for _, cut, *_ in terms]), np.array([cut.place for _, cut, *_ in terms]),
             np.array([order for *_, order, _ in terms]), np.array([direction for *_, direction in terms]),
             np.array([cut.lower for cut in cuts]), np.array([cut.upper for cut in cuts]))
-        self._rows = tuple(np.concatenate(pair) for pair in zip(self._rows, rows))
 
     def solve(self) -> tuple[np.ndarray, Solution]:
         """Coefficients and the solver's answer."""
-        solution = solvers.least_norm(*self._rows, self._solver)
+        rows = self._rows if self._local is None else map(np.concatenate, zip(self._rows, self._local))
+        solution = solvers.least_norm(*rows, self._solver)
         return reduced_qp.coefficients(self._program, self._durations, self._bubbles, solution.w), solution
 
 
@@ -82,6 +93,10 @@ class FullSegments:
         """Add linear bounds."""
         for cut in cuts:
             self._program.bound(*cut)
+
+    def replace(self, bounds: list[Cut]) -> None:
+        """Set the bounds near the present plan."""
+        self._program.replace(bounds)
 
     def solve(self) -> tuple[np.ndarray, Solution]:
         """Coefficients and the solver's answer."""

@@ -13,7 +13,6 @@ from perch_planner.problem import PerchProblem, PerchSettings
 CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints
 CRUISE_ACCELERATION = 2.8  # [m/s^2]
 TURN_ACCELERATION = 1.2    # [m/s^2]
-MANOEUVRE_TIME = 0.45     # [s] for the rotation before contact, on top of the way
 FINAL_TIME = 0.5          # [s] of the last piece, where the rotation happens
 PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
@@ -66,7 +65,7 @@ def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) 
     else:
         points = np.array([problem.start.p, *(w.p for w in problem.waypoints), p_end])
         closing = problem.target_velocity - problem.start.v
-        extra = MANOEUVRE_TIME + sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
+        extra = sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
         durations = _along_waypoints(points, extra, CRUISE_SPEED, CRUISE_ACCELERATION, TURN_ACCELERATION)
         durations = np.maximum(durations, SEGMENT_MIN)
         durations[-1] = max(durations[-1], APPROACH_TIME)
