@@ -63,6 +63,16 @@ vary:
     assert len({r.seed for r in campaign.runs}) == 12
 
 
+def test_seeds_are_no_axis_of_a_map(tmp_path):
+    file = tmp_path / "seeds.yaml"
+    head = "name: seeds\nruns: 1\nvary:\n  mission.replan: {grid: [true]}\n  seed: {grid: [1, 2]}\n"
+    file.write_text(head)
+    assert load_campaign(file).axes == ()
+    file.write_text(head + "map: [mission.replan, seed]\n")
+    with pytest.raises(ConfigError, match="'seed' is not varied"):
+        load_campaign(file)
+
+
 def test_more_runs_keep_the_first_ones(tmp_path):
     file = write(tmp_path, "name: g\nruns: 5\nvary: {target.distance: {uniform: [1.0, 3.0]}}\n")
     assert load_campaign(file, runs=20).runs[:5] == load_campaign(file).runs

@@ -112,15 +112,16 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     content = config.load(_File, file)
     base = config.read_yaml(config.find("scenarios", content.scenario))
     vary = {name: parse(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
+    mappable = [name for name in vary if name != "seed"]  # one run a seed: no rate
     for axis in content.map:
-        if axis not in vary:
-            raise ConfigError(str(file), "map", f"{axis!r} is not varied; varied: {', '.join(vary) or 'nothing'}")
+        if axis not in mappable:
+            raise ConfigError(str(file), "map", f"{axis!r} is not varied; varied: {', '.join(mappable) or 'nothing'}")
     if len(content.map) not in (0, 2):
         raise ConfigError(str(file), "map", f"needs two names, has {len(content.map)}")
     engine = engine or content.engine
     sensing = {"vio": content.sensing.vio, "target": content.sensing.target}
     drawn = _draw(vary, runs or content.runs, content.seed)
-    axes = content.map or tuple(vary)[:2]
+    axes = content.map or tuple(mappable[:2])
     decisive = json.dumps([engine, sensing, base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
     campaign = Campaign(content.name, content.description, engine, sensing, axes if len(axes) == 2 else (),
                         content.keep_worst, base, vary, drawn, hashlib.sha256(decisive.encode()).hexdigest())
