@@ -1,8 +1,8 @@
 """The controller flown on the model before it flies: where will it end?
 
-A perch asks for more moment at low thrust than the rotors have without extra thrust: stopping the rotation at the wall
-pushes the vehicle away from it by 0.2-0.3 m/s, every time, in the same way. No feedback can undo that in the last tenth of
-a second, but it can be known beforehand: the flight is rehearsed with rotor lag and limits, and the reference is offset
+Near contact the thrust is low, and so is the moment that the rotors have without extra thrust: with their lag, or with a
+plan that asks for more, stopping the rotation pushes the vehicle away from the wall by up to 0.3 m/s, every time, in the
+same way. No feedback can undo that in the last tenth of a second, but it can be known beforehand: the flight is rehearsed with rotor lag and limits, and the reference is offset
 so that the *rehearsed* vehicle arrives as planned.
 """
 
