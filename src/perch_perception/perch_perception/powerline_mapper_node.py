@@ -7,25 +7,18 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
-from nav_msgs.msg import Odometry
 from perch_core import config
-from perch_core.errors import ConfigError
-from perch_core.ros import qos
+from perch_core.camera import CameraMount
 from perch_core.ros.conversions import to_point, to_stamp
-from perch_core.ros.lockstep import TICK_STEPS, Participant
-from perch_core.ros.node import PerchNode, spin_main
-from perch_core.vehicle import load_vehicle
+from perch_core.ros.node import spin_main
 from perch_msgs.msg import Powerline, PowerlineArray
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
 
 from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
-from perch_perception.pending_images import LOOK, PendingImages
-from perch_perception.pose_buffer import PoseBuffer, StampError
-from perch_perception.ros.states import body_state
+from perch_perception.pose_buffer import StampError
+from perch_perception.ros.camera_node import CameraNode
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
@@ -43,52 +36,25 @@ class PowerlineMapperConfig:
     mapper: MapperConfig = config.part(MapperConfig)
 
 
-class PowerlineMapperNode(PerchNode[PowerlineMapperConfig]):
+class PowerlineMapperNode(CameraNode[PowerlineMapperConfig]):
     """Publishes the whole map on `powerlines` for every image that is used; every image gets a step report."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("powerline_mapper", PowerlineMapperConfig, **kwargs)
-        cv2.setNumThreads(1)
-        vehicle = load_vehicle(self.params.vehicle)
-        mount = vehicle.mounts.get(self.params.camera)
         self._red = self.params.detection.appearance == "red"
-        if mount is None or (self._red and not mount.colour):
-            usable = [name for name, m in vehicle.mounts.items() if m.colour or not self._red]
-            self.destroy_node()
-            raise ConfigError("powerline_mapper", "camera", f"{self.params.camera!r} is no {'colour ' * self._red}camera "
-                              f"of {self.params.vehicle}; there are: {', '.join(usable) or 'none'}")
-        self._mount = mount
         self._mapper = LineMapper(self.params.mapper)
-        self._buffer = PoseBuffer(reach=0.0)
         self._used = -np.inf
         self._costs: deque[float] = deque(maxlen=100)
         self._images, self._diagnosed = 0, -np.inf
-        self._participant = Participant(self, lambda _: self._take_odometry(), every=TICK_STEPS)
-        self._odometry = self.create_backlog(Odometry, "odometry", qos.CHAIN)
         self._lines = self._participant.publisher(PowerlineArray, "powerlines")
-        self._pending = PendingImages(mount.stamp_offset, self._handle)
-        self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
-        self.create_timer(LOOK, self._take_odometry, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._participant.greet()
+        self.begin()
 
-    def _take_odometry(self) -> None:
-        """Take the states that have come, and handle the images whose exposure they have passed."""
-        for data in self._odometry.take():
-            self._buffer.add(body_state(data))
-        self._pending.advance(self._buffer.newest)
+    def unusable(self, mount: CameraMount) -> str:
+        """Red wires need colour."""
+        return "no colour camera" if self.params.detection.appearance == "red" and not mount.colour else ""
 
-    def _receive_image(self, msg: Image) -> None:
-        self._take_odometry()
-        self._pending.add(msg, self._buffer.newest, keep_all=self._participant.lockstep is not False)
-
-    def _handle(self, msg: Image, exposed: float, refusal: str) -> None:
-        """Map one image where it is its turn, publish, and report, whatever happens.
-
-        Args:
-            msg: the image.
-            exposed: middle of its exposure on the IMU's clock [s].
-            refusal: why the image must not be used; empty when it may.
-        """
+    def use(self, msg: Image, exposed: float, refusal: str) -> None:
+        """Map one image where it is its turn, publish, and report."""
         if not refusal and exposed - self._used >= 1.0 / self.params.rate - 1e-3:
             self._used = exposed
             begin = time.perf_counter()

@@ -7,26 +7,18 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from perch_core import config, so3
-from perch_core.errors import ConfigError
-from perch_core.ros import qos
 from perch_core.ros.conversions import to_pose, to_stamp
-from perch_core.ros.lockstep import TICK_STEPS, Participant
-from perch_core.ros.node import PerchNode, spin_main
+from perch_core.ros.node import spin_main
 from perch_core.tag_board import load_board
-from perch_core.vehicle import load_vehicle
 from perch_msgs.msg import TargetDetection
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
 
 from perch_perception.images import ImageError, mono_image
-from perch_perception.pending_images import LOOK, PendingImages
-from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
-from perch_perception.ros.states import body_state
+from perch_perception.pose_buffer import BodyState, StampError
+from perch_perception.ros.camera_node import CameraNode
 from perch_perception.tags import (BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, LocalizerConfig,
                                    MapPose, fuse, start_fusion, to_map)
 
@@ -51,53 +43,24 @@ class TargetLocalizerConfig:
     calibration: CalibrationSigma = config.part(CalibrationSigma)
 
 
-class TargetLocalizerNode(PerchNode[TargetLocalizerConfig]):
+class TargetLocalizerNode(CameraNode[TargetLocalizerConfig]):
     """Publishes `target/detections` for every image and `target/pose` whenever the target is known well enough."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("target_localizer", TargetLocalizerConfig, **kwargs)
-        cv2.setNumThreads(1)
-        vehicle = load_vehicle(self.params.vehicle)
-        if self.params.camera not in vehicle.mounts:
-            self.destroy_node()
-            raise ConfigError("target_localizer", "camera", f"{self.params.camera!r} is not one of "
-                              f"{', '.join(vehicle.mounts)} of {self.params.vehicle}")
-        self._mount = vehicle.mounts[self.params.camera]
         board = load_board(self.params.board)
         self._localizer = BoardLocalizer(board, self._mount, self.params.localizer,
                                          averaging=self.params.mode == "average")
-        self._buffer = PoseBuffer(reach=0.0)
         self._target: FusedTarget | MapPose | None = None
         self._costs: deque[float] = deque(maxlen=300)
         self._counts = {"images": 0, "found": 0, "complete": 0}
         self._message, self._diagnosed = "", -np.inf
-        self._participant = Participant(self, lambda _: self._take_odometry(), every=TICK_STEPS)
-        self._odometry = self.create_backlog(Odometry, "odometry", qos.CHAIN)
         self._detections = self._participant.publisher(TargetDetection, "target/detections")
         self._poses = self._participant.publisher(PoseWithCovarianceStamped, "target/pose")
-        self._pending = PendingImages(self._mount.stamp_offset, self._handle)
-        self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
-        self.create_timer(LOOK, self._take_odometry, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._participant.greet()
+        self.begin()
 
-    def _take_odometry(self) -> None:
-        """Take the states that have come, and handle the images whose exposure they have passed."""
-        for data in self._odometry.take():
-            self._buffer.add(body_state(data))
-        self._pending.advance(self._buffer.newest)
-
-    def _receive_image(self, msg: Image) -> None:
-        self._take_odometry()
-        self._pending.add(msg, self._buffer.newest, keep_all=self._participant.lockstep is not False)
-
-    def _handle(self, msg: Image, exposed: float, refusal: str) -> None:
-        """Localise the board in one image, publish, and report, whatever happens.
-
-        Args:
-            msg: the image.
-            exposed: middle of its exposure on the IMU's clock [s].
-            refusal: why the image must not be used; empty when it may.
-        """
+    def use(self, msg: Image, exposed: float, refusal: str) -> None:
+        """Localise the board in one image, publish, and report."""
         begin = time.perf_counter()
         body, problem = None, ""
         try:
