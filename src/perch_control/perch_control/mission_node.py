@@ -228,7 +228,7 @@ class MissionNode(PerchNode[MissionParameters]):
     def _problem(request: Perch.Goal, settings: MissionSettings) -> str:
         """Why a goal cannot be flown, or nothing."""
         if request.mode not in tuple(Mode):
-            return f"mode {request.mode} is neither MODE_SURFACE (0) nor MODE_POWERLINE (1) nor inspection (2)"
+            return f"mode {request.mode} is none of MODE_SURFACE (0), MODE_POWERLINE (1), MODE_INSPECTION (2)"
         if request.mode == Mode.INSPECTION and len(settings.places) < 2:
             return f"inspection: the parameter mission.waypoints holds {len(settings.places)} waypoints, needs at least 2"
         if request.mode != Mode.SURFACE:

@@ -23,7 +23,6 @@ from perch_core.scenario import Scenario
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
 """Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
 PLANNER_PATIENCE = 300.0  # [s] a planner whose sources changed compiles first
-MODE_INSPECTION = 2        # of the goal: fly along the mission's waypoints, the NMPC keeps the line in view
 OUTCOMES = {code: name for code, name in enumerate(
     ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed"))}
 
@@ -62,7 +61,7 @@ def goal_of(scenario: Scenario) -> Perch.Goal:
         goal.mode = Perch.Goal.MODE_POWERLINE
         goal.perch_point = Point(x=mission.perch_point[0], y=mission.perch_point[1], z=mission.perch_point[2])
     if scenario.mode == "inspection":
-        goal.mode = MODE_INSPECTION
+        goal.mode = Perch.Goal.MODE_INSPECTION
         x, y, z = scenario.inspection.watched
         goal.perch_point = Point(x=x, y=y, z=z)
     return goal
