@@ -13,7 +13,7 @@ from perch_planner.problem import PerchProblem, PerchSettings
 CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints
 CRUISE_ACCELERATION = 2.8  # [m/s^2]
 TURN_ACCELERATION = 1.2    # [m/s^2]
-FINAL_TIME = 0.5          # [s] of the last piece, where the rotation happens
+FINAL_TIME = 0.45          # [s] of the last piece, where the rotation happens
 PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
