@@ -1,7 +1,8 @@
-"""Controlled descent without position: level attitude, thrust slightly under the weight, motors off when the ground is felt.
+"""Controlled descent without position: speed braked, thrust slightly under the weight, motors off when the ground is felt.
 
-The attitude comes from the gyroscope, corrected by the accelerometer while the vehicle flies steadily, or from odometry
-whose attitude is still good.
+The attitude comes from the gyroscope, corrected by the accelerometer while the vehicle flies steadily; the velocity from the
+last odometry and the accelerometer, with a leak: what it knows is what the vehicle had when odometry stopped, and that is
+braked, since a wall may be near.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import sqrt
 
-from perch_core.vector3 import axes_of, cross, norm, scale, turned
+from perch_core.vector3 import axes_of, axpy, cross, dot, limited, norm, scale, turned
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric.controller import packed_vehicle
@@ -20,6 +21,10 @@ from perch_control.settings import GeometricGains
 
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]
 _SETTLE_TIME = 0.3  # the change of thrust at the beginning is over [s]
+_LEAK = 4.0         # the velocity is forgotten with this time constant [s]
+_BOUNCE = 0.5       # after a touch nothing has to be said for so long [s]
+_TOUCHED_SHARE = 0.4  # thrust / weight after a touch
+_KNOWN_SPEED = 6.0  # faster is no velocity to be believed [m/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,40 +61,62 @@ class BlindDescent:
     """The descent itself; owns the attitude and decides when the ground is felt."""
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, q: tuple[float, ...],
-                 w: tuple[float, ...], now: float) -> None:
-        """`q`, `w`: last attitude (xyzw) and body rates [rad/s] that could be trusted; `now`: time of the beginning [s]."""
+                 w: tuple[float, ...], now: float, v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
+        """`q`, `w`, `v`: last attitude (xyzw), body rates [rad/s] and velocity in W [m/s] that could be trusted, zero where none
+        could; `now`: time of the beginning [s]."""
         self._gains, self._settings, self._constants = gains, settings, packed_vehicle(vehicle)
         self._mass = vehicle.mass
         self.attitude = AttitudeByImu(tuple(q), tuple(w))
+        self.v_W = tuple(v) if norm(v) < _KNOWN_SPEED else (0.0, 0.0, 0.0)
         self._stamp, self._start = now, now
         self._rest, self._force = Persistent(_REST_TIME), GRAVITY
+        self._touched: float | None = None  # when the ground was hit [s]
         self.landed = False
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take one IMU sample: time [s], angular velocity [rad/s] and specific force [m/s^2] in B."""
-        self.attitude = self.attitude.after(gyro, accel, min(max(stamp - self._stamp, 0.0), 0.02))
+        dt = min(max(stamp - self._stamp, 0.0), 0.02)
+        self.attitude = self.attitude.after(gyro, accel, dt)
         self._stamp = stamp
-        force = norm(accel)
-        # On the ground the accelerometer reads 1 g; in this descent it reads `descent_share` of it.
+        b1, b2, b3 = axes_of(self.attitude.q)
+        f_W = axpy(accel[0], b1, axpy(accel[1], b2, scale(accel[2], b3)))
+        self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))
+        # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `descent_share` of it.
         middle = 0.5 * (1.0 + self._settings.descent_share) * GRAVITY
-        self._force += 0.02 * (force - self._force)  # 0.1 s mean: rotor vibration is ten times the difference
-        resting = self._rest.update(middle < self._force < 1.1 * GRAVITY and norm(gyro) < 0.5, stamp)
+        self._force += 0.02 * (norm(accel) - self._force)  # 0.1 s mean: rotor vibration is ten times the difference
+        calm = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
+        resting = self._rest.update(calm and middle < self._force < 1.1 * GRAVITY, stamp)
         begun = stamp - self._start > _SETTLE_TIME
-        self.landed = self.landed or (begun and (resting or force > self._settings.impact_acceleration))
+        if begun and f_W[2] > self._settings.impact_acceleration:  # a wall pushes sideways, the ground upwards
+            self._touched = stamp
+        elif self._touched is not None and stamp - self._touched > _BOUNCE and self._force < 0.7 * GRAVITY:
+            self._touched = None  # nothing carries the vehicle
+        self.landed = self.landed or (begun and resting)
+
+    def _specific_thrust(self) -> tuple[float, float, float]:
+        """Wanted thrust per mass in W [m/s^2]: speed across is braked, a climb and a fall are bounded."""
+        s, (vx, vy, vz) = self._settings, self.v_W
+        if self._touched is not None:  # held upright by the rotors until it has come to rest
+            return 0.0, 0.0, _TOUCHED_SHARE * GRAVITY
+        across = limited((-s.descent_gain * vx, -s.descent_gain * vy, 0.0), s.descent_braking)
+        fall = min(s.descent_gain * max(-vz - s.descent_speed, 0.0), s.descent_braking)
+        climb = min(s.descent_gain * max(vz, 0.0), s.descent_braking)
+        return across[0], across[1], s.descent_share * GRAVITY + fall - climb
 
     def wanted(self) -> tuple[float, float, float, float]:
-        """Collective thrust [N] and moments in B [N m]: level, no rotation, a little less than the weight."""
+        """Collective thrust [N] and moments in B [N m]."""
         q, w = self.attitude.q, self.attitude.w
         b1, b2, b3 = axes_of(q)
-        up_B = (b1[2], b2[2], b3[2])
-        # e_R of the shortest turn to level, 2 sin(angle / 2) about b3 x e3 in B; it leaves the heading free.
-        lean = norm((up_B[0], up_B[1], 0.0))
-        half = sqrt(max(0.5 * (1.0 - up_B[2]), 0.0))
-        e_R = scale(2.0 * half / lean, (up_B[1], -up_B[0], 0.0)) if lean > 1e-9 else (2.0 * half, 0.0, 0.0)
+        f_W = self._specific_thrust()
+        d = scale(1.0 / norm(f_W), f_W)
+        d_B = (dot(b1, d), dot(b2, d), dot(b3, d))
+        # e_R of the shortest turn from b3 to d, 2 sin(angle / 2) about b3 x d in B; it leaves the heading free.
+        lean = norm((d_B[0], d_B[1], 0.0))
+        half = sqrt(max(0.5 * (1.0 - d_B[2]), 0.0))
+        e_R = scale(2.0 * half / lean, (d_B[1], -d_B[0], 0.0)) if lean > 1e-9 else (2.0 * half, 0.0, 0.0)
         g = self._gains
         M = moment(w, e_R, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), self._constants[0][1:4], g.attitude, g.rate, (0.0, 0.0, 0.0))
-        share = self._settings.descent_share
-        thrust = self._mass * GRAVITY * share / max(b3[2], 0.5) if b3[2] > 0.0 else 0.2 * self._mass * GRAVITY
+        thrust = self._mass * f_W[2] / max(b3[2], 0.5) if b3[2] > 0.0 else 0.2 * self._mass * GRAVITY
         return (thrust, *M)
 
     def rotors(self, speed: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:

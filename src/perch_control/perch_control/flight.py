@@ -55,6 +55,7 @@ class FlightController:
         self.position_error = 0.0
         self.compensator: L1Augmentation | None = None
         self._ground_height = -inf  # where the vehicle was armed [m]
+        self._imu_stamp = -inf
         self._constants = packed_vehicle(vehicle)
         self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
         self._refused = ""
@@ -189,9 +190,15 @@ class FlightController:
         return self.maneuvers.message
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
-        """Take an IMU sample; used in a descent without position alone. Time [s], in B [rad/s, m/s^2]."""
+        """Take an IMU sample; used in a descent without position, and kept for its beginning. Time [s], in B [rad/s, m/s^2].
+
+        Its time also shows that odometry with an old stamp is late.
+        """
+        self._imu_stamp = stamp
         if self.maneuvers.blind is not None:
             self.maneuvers.blind.imu(stamp, gyro, accel)
+        else:
+            self.maneuvers.unseen.append((stamp, gyro, accel))
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -203,10 +210,11 @@ class FlightController:
             sample: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
         """
         m = self.maneuvers
-        dt = self._advance(stamp)
+        # Odometry that repeats itself does not stop the time.
+        dt = self._advance(stamp if stamp > m.now else max(m.now, self._imu_stamp))
         verdict = self.gate.check(stamp, sample)
         self._believe(verdict, sample, dt)
-        self.odometry_age = stamp - self.gate.stamp if self.gate.stamp is not None else inf
+        self.odometry_age = m.now - self.gate.stamp if self.gate.stamp is not None else inf
         if m.flying and m.blind is None:
             if self.odometry_age > self.settings.odometry.timeout:
                 m.descend(self._refused or "no odometry")
@@ -236,6 +244,8 @@ class FlightController:
         m = self.maneuvers
         if verdict.usable:
             m.belief, self._refused = sample, ""
+            m.seen = m.now, sample
+            m.unseen.clear()
             return
         if verdict.reason and not self._refused:
             m.events.append(f"refused: {verdict.reason}")

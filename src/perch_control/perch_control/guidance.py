@@ -12,7 +12,7 @@ import numpy as np
 from perch_control.reference import Setpoint
 from perch_core.trajectory import FlatTrajectory
 
-_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
+BRAKE_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polyn
         deceleration: [m/s^2].
     """
     p, v, a, v_end = (np.array(x, float) for x in (p, v, a, v_end))
-    T = max(0.4, _PEAK * float(np.linalg.norm(v - v_end)) / deceleration, float(np.linalg.norm(a)) / deceleration * 0.4)
+    T = max(0.4, BRAKE_PEAK * float(np.linalg.norm(v - v_end)) / deceleration, float(np.linalg.norm(a)) / deceleration * 0.4)
     velocity = np.stack([v, v + a * T / 5, v + 2 * a * T / 5, v_end, v_end, v_end], axis=-1)
     steps = np.cumsum(velocity, axis=-1) * T / 6
     return Polynomial(p[:, None] + np.concatenate([np.zeros((3, 1)), steps], axis=-1), T, horizontal(h))

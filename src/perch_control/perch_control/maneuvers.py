@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
-from perch_core.vector3 import axes_of, axpy, norm, scale
+from perch_core.vector3 import axes_of, axpy, dot, norm, scale
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
-from perch_control.guidance import Hold, brake
+from perch_control.guidance import BRAKE_PEAK, Hold, brake
 from perch_control.modes import FLYING, State
 from perch_control.monitors import reference_tilt_deg
 from perch_control.recovery import Recovery
@@ -31,6 +32,8 @@ class Maneuvers:
         state, message: as published.
         now: time of the step [s].
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
+        seen: stamp [s] and state of the last odometry sample that was accepted.
+        unseen: IMU samples since then: time [s], rates [rad/s], specific force [m/s^2].
         rotors: rotor speeds as the lag model has them.
         source, start: running reference and the time at which it began [s].
         order, trajectory_id: trajectory that is being tracked; the id stays until another one or the motors' stop.
@@ -44,6 +47,8 @@ class Maneuvers:
         self.state, self.message = State.DISARMED, "disarmed"
         self.now = 0.0
         self.belief: tuple[float, ...] = ()
+        self.seen: tuple[float, tuple[float, ...]] = (0.0, ())
+        self.unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=250)
         self.rotors = RotorEstimate((0.0,) * 4, (0.0,) * 4)
         self.source: Any = Hold(Setpoint(_ZERO))
         self.start = 0.0
@@ -139,12 +144,17 @@ class Maneuvers:
         down = (0.0, 0.0, -self.settings.land_speed)
         self.run(brake(p, v, a, setpoint.h, down, self.settings.brake_deceleration))
 
-    def descend(self, message: str) -> None:
-        """Descend without position: level, with a little less thrust than the weight."""
+    def descend(self, message: str, moving: bool = True) -> None:
+        """Descend without position: level, with a little less thrust than the weight; `moving`: the velocity can be trusted."""
         if self.blind is not None or not self.flying:
             return
         self.enter(State.LANDING, f"descent without position: {message}")
-        self.blind = BlindDescent(self.vehicle, self.gains, self.settings, self.belief[6:10], self.belief[10:13], self.now)
+        # From the last sample that was accepted: the prediction since then knows less than the IMU.
+        stamp, sure = self.seen
+        self.blind = BlindDescent(self.vehicle, self.gains, self.settings, sure[6:10], sure[10:13], stamp, sure[3:6] if moving else _ZERO)
+        for sample in self.unseen:
+            self.blind.imu(*sample)
+        self.unseen.clear()
 
     def _point_of_departure(self, setpoint: Setpoint) -> tuple:
         """Position, velocity and acceleration from which a manoeuvre goes on: without a jump of the reference where the
@@ -154,11 +164,27 @@ class Maneuvers:
             return setpoint.p, setpoint.v, setpoint.a
         return self.belief[0:3], self.belief[3:6], _ZERO
 
+    @property
+    def committed(self) -> bool:
+        """A brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
+        order = self.order
+        if order is None or order.at_end is not AtEnd.CONTACT:
+            return False
+        now, normal = self.setpoint(), _normal_at_end(order)
+        gap = dot(axpy(-1.0, order.source.setpoint(order.source.duration).p, now.p), normal)
+        closing = max(-dot(now.v, normal), 0.0)
+        return BRAKE_PEAK * closing**2 / (2.0 * self.settings.brake_deceleration) > gap - max(self.vehicle.body_radii)
+
     def _surface_normal(self) -> tuple[float, ...] | None:
         """Outward normal of the surface that the trajectory is about to touch or has touched, None: in the open."""
         order = self.order
         if order is None or order.at_end is not AtEnd.CONTACT or self.elapsed < order.source.duration - _NEAR_CONTACT:
             return None
-        a = order.source.setpoint(order.source.duration).a
-        f = (a[0], a[1], a[2] + GRAVITY)
-        return scale(1.0 / max(norm(f), 1e-6), f)
+        return _normal_at_end(order)
+
+
+def _normal_at_end(order: Order) -> tuple[float, ...]:
+    """The direction of the thrust at the end of a trajectory: outward normal of the surface that it touches."""
+    a = order.source.setpoint(order.source.duration).a
+    f = (a[0], a[1], a[2] + GRAVITY)
+    return scale(1.0 / max(norm(f), 1e-6), f)

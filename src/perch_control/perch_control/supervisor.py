@@ -32,10 +32,10 @@ class Supervisor:
         """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
         m, s = self._maneuvers, self._maneuvers.settings
         if state == _DIVERGED:
-            m.descend(f"the estimator has diverged: {message}")
+            m.descend(f"the estimator has diverged: {message}", moving=False)
         elif state == _COASTING and vio_age > s.coasting_land_time:
             m.descend(f"no VIO for {vio_age:.1f} s")
-        elif state == _COASTING and vio_age > s.coasting_time and m.state is State.TRACKING:
+        elif state == _COASTING and vio_age > s.coasting_time and m.state is State.TRACKING and not m.committed:
             m.stop(f"hover: no VIO for {vio_age:.1f} s")
 
     def act(self, margin: float) -> None:

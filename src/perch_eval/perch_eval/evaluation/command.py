@@ -15,7 +15,8 @@ from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       --quick: 5 seeds a condition
   python3 scripts/evaluate.py --full --jobs 2       100 seeds; interrupted, the same command goes on
-  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_inspection, p_cable)
+  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_inspection, p_cable,
+                                                    c_faults, c_comparison)
 
 exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
 2 the caller's mistake, 130 interrupted"""
@@ -51,8 +52,20 @@ def _cable(effort: Effort) -> list[Section]:
     return cable_sections(effort)
 
 
+def _faults(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.control import fault_sections
+
+    return fault_sections(effort)
+
+
+def _comparison(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.control import comparison_sections
+
+    return comparison_sections(effort)
+
+
 PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline,
-                          "p_inspection": _inspection, "p_cable": _cable}
+                          "p_inspection": _inspection, "p_cable": _cable, "c_faults": _faults, "c_comparison": _comparison}
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,0 +1,89 @@
+"""The controllers on the same flights: geometric and NMPC, each with and without L1, nominal and disturbed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import config
+from perch_core.scenario import Scenario
+from perch_eval.control_flights.flight import LEAD, TAKE_OFF_SPEED, ControlFlight
+
+SCENARIO = "surface_90"
+CONTROLLERS = {"geometric": ("geometric", False), "geometric + L1": ("geometric", True),
+               "nmpc": ("nmpc", False), "nmpc + L1": ("nmpc", True)}
+"""Name -> `controller.type`, `controller.adaptive`."""
+
+CONDITIONS: dict[str, dict] = {
+    "nominal": {},
+    "wind 5 m/s": {"wind": {"steady": [3.5, 3.5, 0.0]}},
+    "gusts, sigma 1.5 m/s": {"wind": {"gust_sigma": 1.5}},
+    "mass +20 %": {"disturbance": {"mass_factor": 1.2}},
+    "wind 5 m/s, mass +20 %": {"wind": {"steady": [3.5, 3.5, 0.0]}, "disturbance": {"mass_factor": 1.2}},
+    "one rotor -15 %": {"disturbance": {"rotor_thrust_factor": [0.85, 1.0, 1.0, 1.0]}},
+    "inertia +30 %": {"disturbance": {"inertia_factor": 1.3}},
+    "motor lag doubled": {"disturbance": {"motor_lag_factor": 2.0}},
+    "ground and wall effect": {"disturbance": {"surface_effect": True}},
+}
+MANEUVERS = ("line", "perch")
+SETTLE, HOVER = 1.5, 0.5
+LINE, LINE_TIME = np.array([0.7, 1.0, 0.4]), 2.0  # [m], [s]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One flight.
+
+    Attributes:
+        rmse: true position against the reference per axis [m], shape (3,); nan where the manoeuvre was not begun.
+        outcome: held, perched, or what went wrong.
+    """
+
+    rmse: tuple[float, float, float]
+    outcome: str
+
+
+def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
+    """Take off, hover until the adaptation has settled, then a line and a hover, or the perch on the wall; estimated state."""
+    law, adaptive = CONTROLLERS[controller]
+    mapping = {**config.read_yaml(config.find("scenarios", SCENARIO)), **CONDITIONS[condition],
+               "parameters": {"controller": {"controller.type": law, "controller.adaptive": adaptive}}}
+    flight = ControlFlight(config.from_mapping(Scenario, mapping, SCENARIO), seed)
+    flight.arm()
+    flight.run(flight.time + 0.2)
+    height = flight.scenario.mission.takeoff_height
+    place = flight.odometry.estimate.p_WB + (0.0, 0.0, height)
+    flight.go(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
+    flight.run(flight.time + LEAD + height / TAKE_OFF_SPEED + SETTLE)
+    begin = flight.time
+    if maneuver == "line":
+        ordered = flight.go(LINE, LINE_TIME)
+        end = begin + LEAD + LINE_TIME
+        flight.run(end + HOVER)
+    else:
+        ordered = flight.perch(place)
+        end = flight.contact_due
+        flight.run(min(end, flight.time + 10.0) + 1.0)
+    if not ordered:
+        return Compared((np.nan,) * 3, f"not begun: {flight.events[-1][2]}")
+    table = np.array(flight.references)
+    # A vehicle that has touched the wall follows no reference.
+    touched = min([c.time for c in flight.contacts if c.time > begin], default=np.inf)
+    table = table[(table[:, 0] >= begin) & (table[:, 0] <= min(end if maneuver == "perch" else np.inf, touched))]
+    if maneuver == "perch":  # the controller's own reference differs from the plan by what its rehearsal adds
+        table = table[table[:, 0] >= flight.plan.start_time]
+        table[:, 1:4] = [flight.plan.sample(t - flight.plan.start_time).p for t in table[:, 0]]
+    rmse = np.sqrt(np.mean((table[:, 1:4] - table[:, 4:7]) ** 2, axis=0))
+    return Compared(tuple(rmse.tolist()), _outcome(flight, maneuver))
+
+
+def _outcome(flight: ControlFlight, maneuver: str) -> str:
+    if flight.simulation.plant.crashed:
+        return "crashed"
+    if maneuver == "perch":
+        if flight.simulation.plant.contact.attached:
+            return "perched"
+        refused = next((c.reason for c in flight.contacts if c.body == "pad" and c.reason), "")
+        return f"missed: {refused}" if refused else f"missed, {flight.controller.state.name.lower()}"
+    return "held" if flight.controller.state.name == "HOVERING" else flight.controller.state.name.lower()

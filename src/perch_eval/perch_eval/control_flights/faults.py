@@ -1,0 +1,252 @@
+"""Faults at random moments of a perching flight, and how each flight ends. (issue: every fault has a way out)
+
+A flight takes off, hovers, and perches on a wall; one fault strikes between the order to take off and the planned contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perch_control.modes import Command, State, StepResult
+from perch_core import config, so3
+from perch_core.errors import PerchError
+from perch_core.scenario import Scenario
+from perch_eval.control_flights.flight import LEAD, TAKE_OFF_SPEED, ControlFlight
+from perch_sim import seeding
+from perch_sim.contact_event import ContactState
+
+SCENARIO = "surface_90"
+SILENCE_TIME = 3.0   # `flight.silence_time` in these flights [s]: its 60 s are a long wait to simulate
+PAUSE = 0.5          # hover before the perch [s]
+SETTLE = 4.0         # a hover that lasts so long is an end [s]
+LIMIT = 25.0         # after the fault a flight is judged as it is [s]
+END_STATES = ("hovering", "landed", "perched")
+"""What counts as a way out."""
+
+
+class FaultyFlight(ControlFlight):
+    """A flight into whose odometry a fault can reach.
+
+    Attributes:
+        corrupt: what becomes of stamp [s] and sample; it returns None where no odometry comes at all.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        super().__init__(scenario, seed)
+        self.corrupt: Callable[[float, tuple[float, ...]], tuple[float, tuple[float, ...]] | None] | None = None
+        self._answered = 0.0
+
+    def answer(self, time: float) -> StepResult | None:
+        """As the node in real time: where odometry does not come for `blind_after`, the IMU's samples are answered."""
+        given = (time, self.odometry.sample)
+        if self.corrupt is not None:
+            given = self.corrupt(*given)
+        if given is not None:
+            self._answered = time
+            return self.controller.step(*given)
+        if time - self._answered < self.params.blind_after and not self.controller.blind:
+            return None
+        return self.controller.step_blind(time)
+
+
+Strike = Callable[[FaultyFlight, np.random.Generator], str]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of the issue's point 6.
+
+    Attributes:
+        name: for people and files.
+        about: what happens.
+        strike: makes it happen, and says what exactly.
+        scenario: changes to the scenario.
+    """
+
+    name: str
+    about: str
+    strike: Strike
+    scenario: dict = field(default_factory=dict)
+
+
+def _stale(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    if rng.random() < 0.5:
+        flight.corrupt = lambda time, sample: None
+        return "no odometry any more"
+    last = flight.time, flight.odometry.sample
+    flight.corrupt = lambda time, sample: last
+    return "the last sample again and again"
+
+
+def _jump(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    offset = rng.normal(size=3)
+    offset *= rng.uniform(0.3, 2.0) / np.linalg.norm(offset)
+    lasting = rng.uniform(0.01, 1.0) if rng.random() < 0.5 else np.inf
+    end = flight.time + lasting
+
+    def jumped(time: float, sample: tuple[float, ...]) -> tuple[float, tuple[float, ...]]:
+        return time, sample if time > end else (*(np.array(sample[:3]) + offset).tolist(), *sample[3:])
+
+    flight.corrupt = jumped
+    return f"position jumps by ({offset[0]:.2f}, {offset[1]:.2f}, {offset[2]:.2f}) m" + (f" for {lasting:.2f} s" if np.isfinite(lasting) else " for good")
+
+
+def _lose_vio(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    flight.vio_lost = True
+    return "no VIO pose any more"
+
+
+def _silence(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    flight.orders_lost = True
+    return "no trajectory any more"
+
+
+def _kick(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    axis = rng.normal(size=3) * (1.0, 1.0, 0.3)
+    w = axis / np.linalg.norm(axis) * rng.uniform(8.0, 20.0)
+    x, plant = flight.simulation.state, flight.simulation.plant
+    plant.place(x.p_WB, x.q_WB, x.v_WB, x.w_WB_B + w, plant.rotor_speed)
+    return f"a blow turns the vehicle with ({w[0]:.1f}, {w[1]:.1f}, {w[2]:.1f}) rad/s"
+
+
+def _weaken(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    vehicle, plant = flight.vehicle, flight.simulation.plant
+    hover = vehicle.mass * 9.81 / (4.0 * vehicle.thrust_max)
+    share = rng.uniform(0.95, 1.3) * hover
+    plant.body = plant.body._replace(thrust_coefficient=plant.body.thrust_coefficient * share)
+    return f"all rotors give at most {100 * share / hover:.0f} % of the weight"
+
+
+def _fence(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    limits, axis = flight.params.flight, rng.integers(3)
+    low, high = list(limits.fence_low), list(limits.fence_high)
+    p, outside = flight.odometry.estimate.p_WB, rng.uniform(-0.3, 1.5)
+    if axis == 2 or rng.random() < 0.5:
+        high[axis] = float(p[axis] - outside)
+    else:
+        low[axis] = float(p[axis] + outside)
+    law = flight.controller.law
+    flight.controller.use(law, flight.controller.maneuvers.gains, config.replace(flight.controller.settings, fence_low=tuple(low), fence_high=tuple(high)))
+    return f"the fence stands {abs(outside):.2f} m {'behind' if outside > 0 else 'ahead of'} the vehicle along {'xyz'[axis]}"
+
+
+def _nothing(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    return "the velcro does not hold"
+
+
+def _abort(flight: FaultyFlight, rng: np.random.Generator) -> str:
+    if rng.random() < 0.5:
+        flight.orders_lost = True
+        return f"abort: {flight.controller.abort()}"
+    flight.orders_lost = True
+    try:
+        flight.controller.command(Command.HOVER, "the goal was cancelled")
+    except PerchError as error:
+        return f"cancel: {error}"
+    return "cancel: hover"
+
+
+FAULTS = (
+    Fault("stale odometry", "odometry stops, or repeats its last sample", _stale),
+    Fault("jumping odometry", "the position jumps by 0.3 to 2 m, for up to 1 s or for good", _jump),
+    Fault("lost VIO", "no VIO pose reaches the estimator any more", _lose_vio),
+    Fault("planner silence", f"no trajectory comes any more; `flight.silence_time` {SILENCE_TIME:g} s instead of 60 s", _silence),
+    Fault("excess tilt, rate", "a blow adds 8 to 20 rad/s about a random axis", _kick),
+    Fault("low thrust margin", "all rotors weaken: the greatest thrust falls to 95 to 130 % of the weight", _weaken),
+    Fault("geofence", "the fence is moved to between 0.3 m ahead of and 1.5 m behind the vehicle", _fence),
+    Fault("missed contact", "the velcro does not hold", _nothing, {"adhesion": {"enabled": False}}),
+    Fault("abort", "`abort`, or the goal is cancelled (HOVER)", _abort),
+)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a flight ended.
+
+    Attributes:
+        fault, seed: which flight.
+        time: of the fault, since the order to take off [s]; phase: state of the controller then.
+        done: what the fault was.
+        before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] when it struck.
+        end: hovering, landed, perched, crashed or lost.
+        touched: surfaces hit by other parts than the plate without breaking anything.
+        events: of the controller from the fault on.
+    """
+
+    fault: str
+    seed: int
+    time: float
+    phase: str
+    done: str
+    before: tuple[float, float, float, float]
+    end: str
+    touched: tuple[str, ...]
+    events: tuple[str, ...]
+
+
+def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
+    """One flight with one fault.
+
+    Args:
+        fault: what happens.
+        seed: of the flight and of the fault's moment and size.
+        overrides: further changes to the scenario.
+    """
+    parameters = {"controller": {"flight.silence_time": SILENCE_TIME}}
+    mapping = {**config.read_yaml(config.find("scenarios", SCENARIO)), "parameters": parameters, **fault.scenario, **(overrides or {})}
+    flight = FaultyFlight(config.from_mapping(Scenario, mapping, SCENARIO), seed)
+    rng = seeding.stream(seed, f"fault {fault.name}")
+    flight.arm()
+    begin, height = flight.time + 0.2, flight.scenario.mission.takeoff_height
+    rise = max(1.0, height / TAKE_OFF_SPEED)
+    ready = begin + LEAD + rise + PAUSE
+    place = flight.odometry.estimate.p_WB + (0.0, 0.0, height)
+    contact = ready + 2.0 * LEAD + flight.perch_plan(place, 0.0, np.zeros(3)).duration
+    moment = rng.uniform(begin, contact)
+    script = [(begin, lambda: flight.go(np.array([0.0, 0.0, height]), rise)),
+              (ready, lambda: flight.perch(place))]
+    struck, done, phase, before, first = False, "", "", (0.0,) * 4, 0
+    resting = flight.time
+    while flight.time < moment + LIMIT and not flight.simulation.plant.crashed:
+        while script and flight.time >= script[0][0]:
+            script.pop(0)[1]()
+        if not struck and flight.time >= moment:
+            struck, phase, before, first = True, flight.controller.state.name, _situation(flight), len(flight.events)
+            done = fault.strike(flight, rng)
+        flight.step()
+        if flight.controller.state is not State.HOVERING:
+            resting = flight.time
+        if struck and flight.controller.state in (State.RECOVERING, State.LANDING, State.FAILED):
+            script.clear()  # the mission gives up
+        off = flight.controller.state in (State.DISARMED, State.FAILED)
+        if struck and not script and (flight.time - resting > SETTLE or off and flight.time > moment + 1.0):
+            break
+    if flight.controller.state in (State.DISARMED, State.FAILED):
+        flight.run(flight.time + 1.0)  # what has come off falls within this
+    touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.contacts if c.state is ContactState.COLLISION}))
+    return Ending(fault.name, seed, moment - begin, phase, done, before, _end(flight), touched,
+                  tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]))
+
+
+def _situation(flight: FaultyFlight) -> tuple[float, float, float, float]:
+    x, pad = flight.simulation.state, flight.simulation.pad
+    tilt = np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x.q_WB)[2, 2], -1.0, 1.0)))
+    return float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt)
+
+
+def _end(flight: FaultyFlight) -> str:
+    """The end by the truth; the controller's word counts for a hover alone."""
+    plant, x = flight.simulation.plant, flight.simulation.state
+    if plant.crashed:
+        return "crashed"
+    if plant.contact.attached:
+        return "perched"
+    tilt = _situation(flight)[3]
+    if x.p_WB[2] < flight.vehicle.perch_offset + 0.02 and tilt < 20.0 and np.linalg.norm(x.v_WB) < 0.1:
+        return "landed"
+    if flight.controller.state is State.HOVERING and np.linalg.norm(x.v_WB) < 0.5 and tilt < 20.0:
+        return "hovering"
+    return "lost"

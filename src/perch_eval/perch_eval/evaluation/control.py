@@ -1,0 +1,137 @@
+"""The controller under faults, and the controllers compared on the same flights: pages of their own beside the results."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from perch_eval.campaign.progress import Progress
+from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
+from perch_eval.control_flights.faults import END_STATES, FAULTS, Fault, fly_fault
+from perch_eval.evaluation.document import finite
+from perch_eval.evaluation.perching import source_digest
+from perch_eval.evaluation.sections import Effort, Section
+
+MOMENTS = 20                         # of each fault
+QUICK_SEEDS, FULL_SEEDS = 1, 3       # of the comparison
+WORST = 0.05                         # RMSE of each axis of a perch [m]
+CUT = 0.6                            # share of the RMSE that L1 takes away
+LOADED = "wind 5 m/s, mass +20 %"
+ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
+
+
+def fault_sections(effort: Effort) -> list[Section]:
+    """Every fault at random moments; writes `faults.md` and `faults.json`."""
+    jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
+    flown = _kept(effort, "faults", jobs, _faulted)
+    out = Section("c_faults", "Faults in flight",
+                  f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
+                  "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth. "
+                  "Every flight: faults.md.")
+    table = ["| fault | " + " | ".join(ENDINGS) + " | touched the wall |", "| --- " * (len(ENDINGS) + 2) + "|"]
+    bad = []
+    for fault in FAULTS:
+        own = [r for r in flown if r["fault"] == fault.name]
+        ends, touched = Counter(r["end"] for r in own), sum(bool(r["touched"]) and r["end"] in END_STATES for r in own)
+        table.append(f"| {fault.name}: {fault.about} | " + " | ".join(str(ends[e]) for e in ENDINGS) + f" | {touched} |")
+        safe = sum(ends[e] for e in END_STATES)
+        out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]), "", safe == len(own),
+                  "every flight ends hovering, landed or perched")
+        bad += [r for r in own if r["end"] not in END_STATES]
+    text = ["# Faults in flight", "", out.about, "",
+            "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
+            "it on the way, and nothing broke.", "", *table, "", "## Flights without a good end", ""]
+    for r in bad or ():
+        height, gap, speed, tilt = r["before"]
+        text.append(f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
+                    f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
+                    + " / ".join(r["events"]))
+    _write(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
+    out.data = {"flights": flown}
+    return [out]
+
+
+def comparison_sections(effort: Effort) -> list[Section]:
+    """All controllers on the same flights; writes `comparison.md` and `comparison.json`."""
+    seeds = range(1, 1 + (FULL_SEEDS if effort.full else QUICK_SEEDS))
+    jobs = [(c, k, m, seed) for seed in seeds for m in MANEUVERS for k in CONDITIONS for c in CONTROLLERS]
+    flown = _kept(effort, "comparison", jobs, _compared)
+    offset = ", ".join(f"{x:g}" for x in LINE)
+    out = Section("c_comparison", "Controllers compared on the same flights",
+                  f"Seeds {seeds.start} to {seeds.stop - 1}; true position against the reference (line: as commanded; perch: the plan), RMS per axis x, y, z; "
+                  f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
+                  "Wind 5 m/s blows at 45 deg to the wall. Every flight: comparison.md.")
+    text = ["# Controllers compared", "", out.about]
+    for maneuver in MANEUVERS:
+        text += ["", f"## {maneuver.capitalize()}", "", "RMSE x, y, z [cm]; outcome, per seed where they differ.", "",
+                 "| | " + " | ".join(CONTROLLERS) + " |", "| --- " * (len(CONTROLLERS) + 1) + "|"]
+        for condition in CONDITIONS:
+            cells = [_cell([r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == (c, condition, maneuver)]) for c in CONTROLLERS]
+            text.append(f"| {condition} | " + " | ".join(cells) + " |")
+
+    def mean(c: str, condition: str, maneuver: str) -> np.ndarray:
+        return np.sqrt(np.mean([np.square(r["rmse"]) for r in flown
+                                if (r["controller"], r["condition"], r["maneuver"]) == (c, condition, maneuver)], axis=0))
+
+    for c in CONTROLLERS:
+        worst = float(mean(c, "nominal", "perch").max())
+        out.claim(f"{c}: perch, nominal, worst axis", f"{100 * worst:.1f} cm", "5 to 10.8 cm", worst <= WORST, f"at most {100 * WORST:g} cm")
+    for law in ("geometric", "nmpc"):
+        plain, adaptive = (float(np.linalg.norm(mean(c, LOADED, "line"))) for c in (law, f"{law} + L1"))
+        out.claim(f"{law}: line, {LOADED}, with L1", f"{100 * plain:.1f} -> {100 * adaptive:.1f} cm, {100 * (1 - adaptive / plain):.0f} % less", "",
+                  adaptive <= (1 - CUT) * plain, f"at least {100 * CUT:g} % less")
+    for c in CONTROLLERS:
+        own = [r for r in flown if r["controller"] == c and r["maneuver"] == "perch"]
+        out.show(f"{c}: perches that hold, all conditions", f"{sum(r['outcome'] == 'perched' for r in own)}/{len(own)}")
+    _write(effort, "comparison", text, {"flights": flown})
+    out.data = {"flights": flown}
+    return [out]
+
+
+def _cell(own: Sequence[dict[str, Any]]) -> str:
+    rmse = 100 * np.sqrt(np.mean([np.square(r["rmse"]) for r in own], axis=0))
+    outcomes = [r["outcome"] for r in own]
+    return ", ".join(f"{x:.1f}" for x in rmse) + "; " + (outcomes[0] if len(set(outcomes)) == 1 else " / ".join(outcomes))
+
+
+def _faulted(job: tuple[str, int]) -> dict[str, Any]:
+    fault: Fault = next(f for f in FAULTS if f.name == job[0])
+    return asdict(fly_fault(fault, job[1]))
+
+
+def _compared(job: tuple[str, str, str, int]) -> dict[str, Any]:
+    controller, condition, maneuver, seed = job
+    return {"controller": controller, "condition": condition, "maneuver": maneuver, "seed": seed, **asdict(fly(*job))}
+
+
+def _kept(effort: Effort, name: str, jobs: list[tuple], carry_out: Callable[[tuple], dict[str, Any]]) -> list[dict[str, Any]]:
+    """The flights' figures; those of the same code that an earlier evaluation has flown are kept."""
+    effort.state.mkdir(parents=True, exist_ok=True)
+    file, digest = effort.state / f"{name}.json", source_digest()
+    known: dict[str, dict[str, Any]] = {}
+    if file.exists() and not effort.fresh:
+        content = json.loads(file.read_text())
+        known = content["flights"] if content["digest"] == digest else {}
+    open_jobs = [job for job in jobs if str(job) not in known]
+    progress = Progress(len(jobs), len(jobs) - len(open_jobs), what=f"{name} flights")
+    with ProcessPoolExecutor(effort.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for job, result in zip(open_jobs, pool.map(carry_out, open_jobs)):
+            known[str(job)] = finite(result)
+            temporary = file.with_suffix(".part")
+            temporary.write_text(json.dumps({"digest": digest, "flights": known}))
+            temporary.replace(file)
+            progress.add(result.get("end", "held") in (*END_STATES, "held"))
+    progress.close()
+    return [known[str(job)] for job in jobs]
+
+
+def _write(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
+    (effort.out / f"{name}.md").write_text("\n".join(lines) + "\n\nMade by `python3 scripts/evaluate.py --only c_" + name + " --out docs/results/control`.\n")
+    (effort.out / f"{name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")

@@ -1,0 +1,107 @@
+"""Ways out without odometry: time goes on, speed is braked, walls are not the ground; and the flights of the fault tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from closed_loop.loop import make_loop, perch
+from perch_control.admission import AtEnd
+from perch_control.descent import BlindDescent
+from perch_control.flight_settings import FlightSettings
+from perch_control.modes import State
+from perch_control.settings import GeometricGains
+from perch_core.trajectory import rest_to_rest
+from perch_core.vehicle import load_vehicle
+from perch_eval.control_flights.comparison import fly
+from perch_eval.control_flights.faults import END_STATES, FAULTS, FaultyFlight, fly_fault
+
+
+def repeat_last(loop):
+    """From now on the same sample with the same stamp, while the IMU goes on."""
+    stamp, sample = loop.time - 0.002, loop.odometry(loop.plant)
+    step = loop.controller.step
+    loop.controller.step = lambda _, __: step(stamp, sample)
+
+
+def fast_loop():
+    loop = make_loop()
+    loop.begin_in_hover()
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [4, 0, 0], 0, 0, 3.0), id=3)
+    loop.run(1.5)
+    assert loop.plant.v[0] > 2.0
+    return loop
+
+
+def test_odometry_that_repeats_itself_ends_in_a_descent_that_brakes():
+    loop = fast_loop()
+    begin, speed = loop.plant.p.copy(), loop.plant.v[0]
+    repeat_last(loop)
+    loop.run(1.2)
+    assert loop.controller.state is State.LANDING and loop.controller.blind
+    assert abs(loop.plant.v[0]) < 0.3, "the speed of the last sample is braked"
+    assert loop.plant.p[0] - begin[0] < 0.6 * 1.2 * speed, "much less than it would have coasted"
+    assert loop.run(5.0, until=lambda x: x.controller.state is State.DISARMED), loop.events
+    assert loop.plant.p[2] < 0.02 and loop.plant.impact_speed < 1.2
+
+
+def descent(v):
+    vehicle = load_vehicle("snapdragon")
+    return BlindDescent(vehicle, GeometricGains(), FlightSettings(), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.0, v)
+
+
+@pytest.mark.parametrize("blow, ends", [((60.0, 0.0, 9.0), False), ((0.0, 0.0, 60.0), True)])
+def test_the_ground_pushes_upwards_and_a_wall_does_not(blow, ends):
+    x = descent((0.0, 0.0, 0.0))
+    for k in range(1000):
+        force = blow if k in (400, 401) else (0.0, 0.0, 9.81) if ends and k > 401 else (0.0, 0.0, 9.12)
+        x.imu(0.002 * k, (0.0, 0.0, 0.0), force)
+    assert x.landed is ends
+
+
+def test_a_velocity_that_cannot_be_is_not_braked():
+    thrust, *moment = descent((30.0, 0.0, 0.0)).wanted()
+    np.testing.assert_allclose(moment, 0.0, atol=1e-12)
+    assert descent((2.0, 0.0, 0.0)).wanted()[2] < 0.0, "moving along +x, the vehicle leans back"
+
+
+def test_lost_vio_does_not_brake_into_the_wall():
+    plan = perch("surface_90_1.7m")
+
+    def flown(before):
+        loop = make_loop(floor=-10.0)
+        loop.begin_in_hover()
+        loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+        loop.run(0.04 + plan.trajectory.duration - before)
+        loop.controller.supervisor.estimator(2, 1.5, "")
+        return loop.controller.state
+
+    assert flown(0.4) is State.TRACKING, "no brake ends before the wall"
+    assert flown(1.4) is State.HOVERING, "there is room to brake"
+
+
+@pytest.mark.parametrize("name", ["abort", "jumping odometry"])
+def test_a_fault_flight_has_a_good_end_and_is_repeatable(name):
+    fault = next(f for f in FAULTS if f.name == name)
+    first = fly_fault(fault, 4)
+    assert first.done and first.end in END_STATES, first
+    assert fly_fault(fault, 4) == first
+
+
+def test_the_end_is_judged_by_the_truth():
+    """A controller that believes to hover is not hovering on the floor."""
+    from perch_core.scenario import load_scenario
+    from perch_eval.control_flights import faults
+
+    flight = FaultyFlight(load_scenario("surface_90"), 1)
+    assert faults._end(flight) == "landed"
+    x = flight.simulation.state
+    flight.simulation.plant.place(x.p_WB + (0.0, 0.0, 1.0), x.q_WB, x.v_WB, x.w_WB_B, np.zeros(4))
+    assert faults._end(flight) == "lost"
+
+
+def test_l1_cuts_the_error_under_wind_and_mass():
+    """Issue 6: by >= 60 %."""
+    plain, adaptive = (np.linalg.norm(fly(c, "wind 5 m/s, mass +20 %", "line", 1).rmse) for c in ("geometric", "geometric + L1"))
+    assert adaptive < 0.4 * plain
