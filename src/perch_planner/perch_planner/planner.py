@@ -70,7 +70,8 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         vehicle: mass, thrust range, extension and perch offset.
 
     Returns:
-        A plan that keeps every limit, each with its proof.
+        A plan that keeps every limit, each with its proof; that of the single rotors is sampled, and may be broken where
+        they are `preferred` (its certificate says so).
 
     Raises:
         PerchRefusal: there is none, or none was found; with the violated constraint and its margin.

@@ -12,20 +12,19 @@ That is no polynomial, so it is *sampled*, the extrema refined by parabolas thro
 
 from __future__ import annotations
 
-from math import sqrt
-
 import numpy as np
 
 from perch_core import bernstein
 from perch_core.flatness import commanded_frame, heading_derivatives
 from perch_core.jit import compiled
-from perch_core.vector3 import axpy, cross, times
+from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.bounds import derivative, derivatives_at, value
 
 _PLACES = np.linspace(0.0, 1.0, 49)
 _AT10, _AT11, _AT12, _AT13, _AT14 = (np.ascontiguousarray(bernstein.basis(n, _PLACES).T) for n in range(10, 15))
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
+_ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
 _NEAR = 0.1         # rotors this near to a limit are bounded; share of the range
 _KEEP = 2e-3        # bounds are set inside by this share of the range,
@@ -40,10 +39,10 @@ def rotor_model(vehicle: Vehicle) -> tuple[float, tuple[float, float, float], np
 @compiled
 def thrusts_of(f, j, s, heading, mass, J, mixing):
     """Rotor thrusts [N] of the specific force f, jerk and snap (3 floats each) and yaw with two derivatives; 4 floats."""
-    specific = sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2])
-    if specific < _FREE_FALL:
-        return -1e3, -1e3, -1e3, -1e3
+    specific = norm(f)
     h, dh, ddh = heading_derivatives(heading[0], heading[1], heading[2])
+    if specific < _FREE_FALL or norm(cross(h, f)) < _ALONG * specific:
+        return -1e3, -1e3, -1e3, -1e3
     _, _, _, w, dw = commanded_frame(f, j, s, h, dh, ddh)
     M = axpy(1.0, times(J, dw), cross(w, times(J, w)))
     T = mass * specific
@@ -127,8 +126,8 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        (where, gradients, bounds): segment and place, shape (n, 2); gradients by acceleration, jerk and snap, shape (n, 3, 3); lower
-        and upper bound of the sum of gradients times derivatives, shape (n, 2).
+        (where, gradients, bounds): segment and place, shape (n, 2); gradients by acceleration, jerk and snap, shape
+        (n, 3, 3); lower and upper bound of the sum of gradients times derivatives, shape (n, 2).
     """
     near, keep = _NEAR * (high - low), _KEEP * (high - low)
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
