@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from closed_loop.loop import make_loop, perch
-from perch_control.admission import AtEnd
+from closed_loop.plant import Disturbances
+from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
@@ -79,6 +80,20 @@ def test_lost_vio_does_not_brake_into_the_wall():
 
     assert flown(0.4) is State.TRACKING, "no brake ends before the wall"
     assert flown(1.4) is State.HOVERING, "there is room to brake"
+
+
+@pytest.mark.parametrize("share, flies", [(0.6, False), (1.0, True)])
+def test_weak_rotors_do_not_begin_a_perch(share, flies):
+    plan = perch("surface_90_1.7m")
+    loop = make_loop(disturbances=Disturbances(rotor_factor=(share,) * 4))
+    loop.begin_in_hover()
+    loop.run(1.5)
+    try:
+        loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    except TrajectoryRefused as refusal:
+        assert not flies and "thrust margin" in str(refusal)
+    else:
+        assert flies
 
 
 @pytest.mark.parametrize("name", ["abort", "jumping odometry"])

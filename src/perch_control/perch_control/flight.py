@@ -23,6 +23,7 @@ from perch_control.settings import GeometricGains
 from perch_control.supervisor import Supervisor
 
 _AIRBORNE = 0.1              # so far above where it was armed, the ground no longer carries the vehicle [m]
+_SPARE_SHARE = 0.01          # weight of a step in the mean margin: 0.2 s
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
@@ -52,6 +53,7 @@ class FlightController:
         self.gate = OdometryGate(settings.odometry)
         self.odometry_age = inf
         self.margin = 1.0
+        self._spare = 1.0            # mean margin in hover
         self.position_error = 0.0
         self.compensator: L1Augmentation | None = None
         self._ground_height = -inf  # where the vehicle was armed [m]
@@ -148,6 +150,8 @@ class FlightController:
         m = self.maneuvers
         if m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {m.state.name.lower()}, not armed and ready")
+        if m.state is State.HOVERING and order.at_end is not AtEnd.HOLD and self._spare < self.settings.margin_perch:
+            raise TrajectoryRefused(f"the thrust margin in hover is {self._spare:.2f}; a perch needs {self.settings.margin_perch:g}")
         check_joints(order.source.trajectory, self.settings.joint_gap)
         check_start(order, m.now, m.expected(max(order.start, m.now)), self.settings)
         self._pending = order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT)
@@ -280,6 +284,7 @@ class FlightController:
         m.rotors = m.rotors.following(out.rotor_speed)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
+        self._spare += _SPARE_SHARE * (self.margin - self._spare) if m.state is State.HOVERING else 0.0
         if self.supervisor.landed(setpoint):
             m.motors_off(State.DISARMED, "landed, motors off")
             return self._idle()

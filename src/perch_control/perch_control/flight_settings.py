@@ -16,6 +16,7 @@ class FlightSettings:
     """When the supervisor steps in, and how hover, landing and descent are flown."""
 
     brake_deceleration: float = quantity(4.0, unit="m/s^2", above=0.0, high=20.0)
+    brake_hard: float = quantity(8.0, unit="m/s^2", above=0.0, high=20.0, doc="at most, where the trajectory leads to a surface")
     leave_time: float = quantity(0.6, unit="s", low=0.0, high=5.0,
                                  doc="an abort flies on for at most so long, to where a planned recovery begins")
     land_speed: float = quantity(0.35, unit="m/s", above=0.0, high=2.0)
@@ -38,6 +39,7 @@ class FlightSettings:
     down_time: float = quantity(1.5, unit="s", above=0.0, doc="at rest and tilted for so long: motors off")
     margin_time: float = quantity(1.0, unit="s", above=0.0, doc="rotors at their limit for so long: land")
     margin_min: float = quantity(0.02, unit="-", low=0.0, high=0.5, doc="thrust margin that counts as none")
+    margin_perch: float = quantity(0.15, unit="-", low=0.0, high=0.5, doc="a perch is refused where the mean margin in hover is less")
     fence_low: Vector3 = quantity((-20.0, -20.0, -5.0), unit="m", doc="geofence in map")
     fence_high: Vector3 = quantity((20.0, 20.0, 20.0), unit="m", doc="geofence in map")
     fence_slack: float = quantity(1.0, unit="m", low=0.0, doc="so far outside the fence: land")

@@ -115,8 +115,9 @@ class Maneuvers:
             self.recover(message)
             return
         p, v, a = self._point_of_departure(setpoint)
+        deceleration = max(self.settings.brake_deceleration, min(self._needed_deceleration(), self.settings.brake_hard))
         self.enter(State.HOVERING, message)
-        self.run(brake(p, v, a, setpoint.h, deceleration=self.settings.brake_deceleration))
+        self.run(brake(p, v, a, setpoint.h, deceleration=deceleration))
 
     def stay(self, message: str) -> None:
         """Hover where the vehicle now believes to be: what was followed no longer fits."""
@@ -166,14 +167,18 @@ class Maneuvers:
 
     @property
     def committed(self) -> bool:
-        """A brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
+        """Even the hardest brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
+        return self._needed_deceleration() > self.settings.brake_hard
+
+    def _needed_deceleration(self) -> float:
+        """What it takes to stop before the surface that the trajectory leads to [m/s^2], 0 in the open."""
         order = self.order
         if order is None or order.at_end is not AtEnd.CONTACT:
-            return False
+            return 0.0
         now, normal = self.setpoint(), _normal_at_end(order)
-        gap = dot(axpy(-1.0, order.source.setpoint(order.source.duration).p, now.p), normal)
+        room = dot(axpy(-1.0, order.source.setpoint(order.source.duration).p, now.p), normal) - max(self.vehicle.body_radii)
         closing = max(-dot(now.v, normal), 0.0)
-        return BRAKE_PEAK * closing**2 / (2.0 * self.settings.brake_deceleration) > gap - max(self.vehicle.body_radii)
+        return BRAKE_PEAK * closing**2 / (2.0 * max(room, 1e-3))
 
     def _surface_normal(self) -> tuple[float, ...] | None:
         """Outward normal of the surface that the trajectory is about to touch or has touched, None: in the open."""

@@ -65,7 +65,7 @@ class Supervisor:
             m.recover(deviation)
         elif outside > s.fence_slack:
             m.land(f"landing: {outside:.1f} m outside the geofence")
-        elif outside > 0.0 and m.state is State.TRACKING:
+        elif outside > 0.0 and m.state is State.TRACKING and not m.committed:
             m.stop(f"hover: {outside:.1f} m outside the geofence")
         elif self._monitor.exhausted(margin, m.now):
             m.land("landing: the rotors are at their limit")

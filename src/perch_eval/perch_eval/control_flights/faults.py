@@ -1,4 +1,4 @@
-"""Faults at random moments of a perching flight, and how each flight ends. (issue: every fault has a way out)
+"""Faults at random moments of a perching flight, and how each flight ends.
 
 A flight takes off, hovers, and perches on a wall; one fault strikes between the order to take off and the planned contact.
 """
@@ -14,6 +14,7 @@ from perch_control.modes import Command, State, StepResult
 from perch_core import config, so3
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
+from perch_core.vehicle import GRAVITY
 from perch_eval.control_flights.flight import LEAD, TAKE_OFF_SPEED, ControlFlight
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
@@ -171,6 +172,7 @@ class Ending:
         time: of the fault, since the order to take off [s]; phase: state of the controller then.
         done: what the fault was.
         before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] when it struck.
+        best_impact: speed at the floor [m/s] if all thrust that is left pointed upwards from then on, without lag and turning.
         end: hovering, landed, perched, crashed or lost.
         touched: surfaces hit by other parts than the plate without breaking anything.
         events: of the controller from the fault on.
@@ -182,6 +184,7 @@ class Ending:
     phase: str
     done: str
     before: tuple[float, float, float, float]
+    best_impact: float
     end: str
     touched: tuple[str, ...]
     events: tuple[str, ...]
@@ -208,7 +211,7 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
     moment = rng.uniform(begin, contact)
     script = [(begin, lambda: flight.go(np.array([0.0, 0.0, height]), rise)),
               (ready, lambda: flight.perch(place))]
-    struck, done, phase, before, first = False, "", "", (0.0,) * 4, 0
+    struck, done, phase, before, best, first = False, "", "", (0.0,) * 4, 0.0, 0
     resting = flight.time
     while flight.time < moment + LIMIT and not flight.simulation.plant.crashed:
         while script and flight.time >= script[0][0]:
@@ -216,6 +219,7 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
         if not struck and flight.time >= moment:
             struck, phase, before, first = True, flight.controller.state.name, _situation(flight), len(flight.events)
             done = fault.strike(flight, rng)
+            best = _best_impact(flight)
         flight.step()
         if flight.controller.state is not State.HOVERING:
             resting = flight.time
@@ -227,7 +231,7 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
     if flight.controller.state in (State.DISARMED, State.FAILED):
         flight.run(flight.time + 1.0)  # what has come off falls within this
     touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.contacts if c.state is ContactState.COLLISION}))
-    return Ending(fault.name, seed, moment - begin, phase, done, before, _end(flight), touched,
+    return Ending(fault.name, seed, moment - begin, phase, done, before, best, _end(flight), touched,
                   tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]))
 
 
@@ -235,6 +239,15 @@ def _situation(flight: FaultyFlight) -> tuple[float, float, float, float]:
     x, pad = flight.simulation.state, flight.simulation.pad
     tilt = np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x.q_WB)[2, 2], -1.0, 1.0)))
     return float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt)
+
+
+def _best_impact(flight: FaultyFlight) -> float:
+    """A bound of physics: no controller arrives at the floor more slowly, if it has to stop at all."""
+    body, x = flight.simulation.plant.body, flight.simulation.state
+    up = body.thrust_coefficient.sum() * body.speed_max**2 / body.mass - GRAVITY
+    height = max(float(x.p_WB[2]) - body.plate_offset, 0.0)
+    fall = max(-float(x.v_WB[2]), 0.0)
+    return float(np.sqrt(max(fall**2 - 2.0 * up * height, 0.0)))
 
 
 def _end(flight: FaultyFlight) -> str:
