@@ -193,7 +193,7 @@ def test_the_mission_refuses_goals_that_are_none(asker):
     asker.wait(client.server_is_ready)
     powerline = {"mode": Perch.Goal.MODE_POWERLINE}
     for fields, path, value, words in (
-            ({}, "mode", 9, "mode 9 is neither MODE_SURFACE"), ({}, "takeoff_height", math.inf, "takeoff_height inf m is outside [0.3, 10]"),
+            ({}, "mode", 9, "mode 9 is none of MODE_SURFACE"), ({}, "takeoff_height", math.inf, "takeoff_height inf m is outside [0.3, 10]"),
             ({}, "takeoff_height", 0.1, "takeoff_height 0.1 m"), ({}, "search_timeout", -1.0, "search_timeout -1 s is outside (0, 300]"),
             ({}, "inclination_hint", 7.0, "inclination_hint 7 rad is outside [0, pi]"),
             ({}, "search_pose.pose.position.x", math.nan, "search_pose: position is not finite"),
