@@ -1,5 +1,7 @@
 """Node `vio` as a slow participant: one report per image whatever it is, odometry at the exposure's time, debug image."""
 
+import time
+
 import numpy as np
 import pytest
 import rclpy
@@ -47,9 +49,10 @@ class Vehicle:
             msg.angular_velocity.x, msg.angular_velocity.y, msg.angular_velocity.z = map(float, w)
             msg.linear_acceleration.x, msg.linear_acceleration.y, msg.linear_acceleration.z = map(float, f)
             self.imu_publisher.publish(msg)
-            if self.time % (40 * MS) == 0:  # faster than the queue's depth can be emptied
-                for _ in range(30):
-                    self.executor.spin_once(timeout_sec=0.0)
+            if self.time % (100 * MS) == 0:  # the node has no ticks here: before its queue is full, let it look by itself
+                end = time.monotonic() + 2.0 * vio_node.LOOK
+                while time.monotonic() < end:
+                    self.executor.spin_once(timeout_sec=0.005)
 
     def image(self, stamp, **changes):
         pixels = np.clip(self.rng.normal(110, 4, (480, 640)), 0, 255).astype(np.uint8)
