@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import rclpy
 from geometry_msgs.msg import Point
@@ -78,8 +81,20 @@ class Pilot:
         self._executor.add_node(self._node)
         self._client = ActionClient(self._node, Perch, "perch")
         self._time = 0.0
+        self._interrupted, self._handler = False, None
+        if threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGINT, self._interrupt)
         self._node.create_subscription(Step, "tick", self._receive_tick,
                                        QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+
+    def _interrupt(self, *_: Any) -> None:
+        self._interrupted = True
+
+    def _spin(self, timeout: float) -> None:
+        """Run callbacks; an interrupt counts afterwards, as rclpy's C++ cannot pass on an exception out of a callback."""
+        self._executor.spin_once(timeout_sec=timeout)
+        if self._interrupted:
+            raise KeyboardInterrupt
 
     @property
     def time(self) -> float:
@@ -88,7 +103,7 @@ class Pilot:
 
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
-        self._executor.spin_once(timeout_sec=0.02)
+        self._spin(0.02)
         return {f"{ns.rstrip('/')}/{name}" for name, ns in self._node.get_node_names_and_namespaces()}
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
@@ -127,7 +142,7 @@ class Pilot:
         cancelled = False
         last_time, last_progress = self._time, time.monotonic()
         while not result.done():
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin(0.05)
             check()
             if self._time > last_time:
                 last_time, last_progress = self._time, time.monotonic()
@@ -149,18 +164,20 @@ class Pilot:
         """Let simulation time go on for a while, so that the recording shows the rest."""
         end, last = self._time + duration, time.monotonic() + patience
         while self._time < end and time.monotonic() < last:
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin(0.05)
             check()
 
     def close(self) -> None:
         """Leave the graph."""
+        if self._handler is not None:
+            signal.signal(signal.SIGINT, self._handler)
         self._node.destroy_node()
         self._context.try_shutdown()
 
     def _spin_until(self, done: Callable[[], bool], check: Callable[[], None], timeout: float, problem: str) -> None:
         last = time.monotonic() + timeout
         while not done():
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin(0.05)
             check()
             if time.monotonic() > last:
                 raise PerchError(f"{problem} within {timeout:g} s")
