@@ -1,5 +1,7 @@
 """A perch on a cable by both engines: mapped, planned, re-planned on the way, gripped; the same flight to the last bits."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,8 @@ from perch_eval.in_process import Sensing, fly
 from perch_eval.in_process.trace import ESTIMATE, TRUTH
 
 TOLERANCE = 1e-7  # as in test_campaign_engines
+
+pytestmark = pytest.mark.skipif(os.environ.get("PERCH_SLOW") != "1", reason="two powerline flights, minutes: set PERCH_SLOW=1")
 
 
 @pytest.fixture(scope="module")
