@@ -40,12 +40,6 @@ def stamp_of(data: bytes) -> int:
     return sec * NANOSECONDS + nanosec
 
 
-def seconds_of(data: bytes) -> float:
-    """The same stamp in seconds."""
-    sec, nanosec = _STAMP.unpack_from(data, _HEADER)
-    return sec + 1e-9 * nanosec
-
-
 def _after_text(data: bytes, offset: int) -> int:
     """Where the text at `offset` ends."""
     offset += -offset % 4

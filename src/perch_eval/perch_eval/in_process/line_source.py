@@ -7,40 +7,27 @@ from perch_msgs.msg import PowerlineArray
 
 from perch_core.camera import CameraMount
 from perch_core.surface import PerchSurface
+from perch_eval.in_process.frame_source import FrameSource
 from perch_perception.line_mapping import LineMapper, detect_lines, place
-from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+from perch_perception.pose_buffer import StampError
 from perch_perception.powerline_mapper_node import PowerlineMapperConfig, map_message
 from perch_sim.camera_stream import Delivery
 from perch_sim.state_history import StateHistory
 
 
-class LineSource:
+class LineSource(FrameSource):
     """Owns the mapper."""
 
     def __init__(self, params: PowerlineMapperConfig, mount: CameraMount) -> None:
-        self._params, self._mount = params, mount
-        self._mapper, self._buffer = LineMapper(params.mapper), PoseBuffer(reach=0.0)
-        self._handled = self._used = -np.inf
-
-    def add_odometry(self, state: BodyState) -> None:
-        """Take one estimate in."""
-        self._buffer.add(state)
-
-    def exposed(self, delivery: Delivery) -> float:
-        """Middle of a frame's exposure on the board's clock [s]."""
-        stamp = delivery.frame.stamp
-        return round(stamp // 1_000_000_000 + 1e-9 * (stamp % 1_000_000_000) - self._mount.stamp_offset, 9)
-
-    def covers(self, delivery: Delivery) -> bool:
-        """Whether the odometry has passed a frame's exposure."""
-        return self.exposed(delivery) <= self._buffer.newest
+        super().__init__(mount)
+        self._params, self._mapper = params, LineMapper(params.mapper)
+        self._used = -np.inf
 
     def answer(self, delivery: Delivery, truth: StateHistory, pad: PerchSurface) -> PowerlineArray | None:
         """The map as published for one frame; None where the frame is not used."""
         exposed = self.exposed(delivery)
-        if exposed <= self._handled:
+        if not self.fresh(exposed):
             return None
-        self._handled = exposed
         if exposed - self._used < 1.0 / self._params.rate - 1e-3:
             return None
         self._used = exposed

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-SECOND = 1_000_000_000
+from perch_core.ros.conversions import NANOSECONDS as SECOND
+from perch_core.ros.conversions import seconds
 
-
-def seconds(stamp: int) -> float:
-    """A stamp [ns] in seconds, to the last bit as a node reads it from a header."""
-    return stamp // SECOND + 1e-9 * (stamp % SECOND)
+__all__ = ["SECOND", "published", "seconds", "stamp_of"]
 
 
 def stamp_of(time: float) -> int:

@@ -13,11 +13,12 @@ import numpy as np
 from perch_core.camera import CameraMount
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import TagBoard
-from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+from perch_perception.pose_buffer import BodyState, StampError
 from perch_perception.tags import BoardLocalizer, Localization, LocalizationRefusal, average_board, fuse, solve_board, start_fusion, to_map
 from perch_perception.target_localizer_node import TargetLocalizerConfig
 from perch_control.mission import Target
 from perch_core import so3
+from perch_eval.in_process.frame_source import FrameSource
 from perch_eval.in_process.stamps import published
 from perch_sim.camera_stream import Delivery
 from perch_sim.state_history import StateHistory, TrueState
@@ -104,33 +105,19 @@ class RenderedSight:
         return self._localizer.process(delivery.image.result(), exposed, body)
 
 
-class TargetSource:
+class TargetSource(FrameSource):
     """Mirrors `perch_perception.target_localizer_node`."""
 
     def __init__(self, sight: ModelledSight | RenderedSight, mount: CameraMount, params: TargetLocalizerConfig) -> None:
-        self._sight, self._mount, self._params = sight, mount, params
-        self._buffer, self._target = PoseBuffer(reach=0.0), None
-        self._handled = -np.inf
-
-    def add_odometry(self, state: BodyState) -> None:
-        """Take one estimate in."""
-        self._buffer.add(state)
-
-    def exposed(self, delivery: Delivery) -> float:
-        """Middle of a frame's exposure on the board's clock [s]."""
-        stamp = delivery.frame.stamp
-        return round(stamp // 1_000_000_000 + 1e-9 * (stamp % 1_000_000_000) - self._mount.stamp_offset, 9)
-
-    def covers(self, delivery: Delivery) -> bool:
-        """Whether the odometry has passed a frame's exposure."""
-        return self.exposed(delivery) <= self._buffer.newest
+        super().__init__(mount)
+        self._sight, self._params = sight, params
+        self._target = None
 
     def answer(self, delivery: Delivery, truth: StateHistory, pad: PerchSurface) -> Target | None:
         """The target as published for one frame; None where nothing is."""
         exposed = self.exposed(delivery)
-        if exposed <= self._handled:
+        if not self.fresh(exposed):
             return None
-        self._handled = exposed
         try:
             body = self._buffer.at(exposed)
         except StampError:
