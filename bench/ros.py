@@ -22,7 +22,7 @@ from perch_core.scenario import Scenario, load_scenario
 from perch_core.trajectory import rest_to_rest
 from perch_eval.demo import fly
 from perch_eval.domain import reserved_domain
-from perch_eval.nodes import programs
+from perch_eval.nodes import ALL_NODES, programs
 from perch_eval.stack import Stack
 from perch_msgs.msg import ControllerCommand, MotorCommand, Step, Trajectory
 from rclpy.experimental import EventsExecutor
@@ -144,7 +144,7 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
     return [*out, figure(f"real time, {law}: command after its IMU sample", "us", [delay])]
 
 
-def lockstep(scenario: Scenario, folder: Path, windows: int, composed: bool) -> Figure:
+def lockstep(scenario: Scenario, folder: Path, windows: int, composed: tuple[str, ...]) -> Figure:
     """Simulation time per wall-clock time of the 500 Hz chain, without cameras."""
     with running(scenario, folder, composed=composed, overrides={"vehicle": {"cameras": "none"}}) as probe:
         factors = [_factor(probe) for _ in range(windows)]
@@ -167,8 +167,8 @@ def figures(quick: bool) -> list[Figure]:
         flights = [fly("surface_90", seed, folder / f"flight_{seed}")["real_time_factor"]
                    for seed in range(1, 2 if quick else 4)]
         return [figure("whole stack, both cameras, lockstep", "x real time", flights, bar=0.7, comparison="median >="),
-                lockstep(scenario, folder / "processes", windows, composed=False),
-                lockstep(scenario, folder / "composed", windows, composed=True),
+                lockstep(scenario, folder / "processes", windows, composed=()),
+                lockstep(scenario, folder / "composed", windows, composed=ALL_NODES),
                 *real_time(scenario, folder / "real_time", windows),
                 *real_time(scenario, folder / "real_time_nmpc", windows, "nmpc")]
 

@@ -18,6 +18,7 @@ from perch_setup import ROOT, enter
 EXAMPLES = """examples:
   python3 scripts/start_stack.py                                       scenario surface_90
   python3 scripts/start_stack.py --scenario my.yaml --seed 3 --composed
+  python3 scripts/start_stack.py --composed vehicle estimator controller mission
   python3 scripts/start_stack.py --without mission recorder            start those yourself (run_node.py)
   python3 scripts/start_stack.py --only vehicle --realtime
   python3 scripts/start_stack.py --composed --view                     watch it in Foxglove, ws://localhost:8765
@@ -36,7 +37,7 @@ def command_line() -> argparse.ArgumentParser:
     )
     parser.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a file (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of every random number (default: 1)")
-    parser.add_argument("--composed", action="store_true", help="all nodes in one process: faster")
+    parser.add_argument("--composed", nargs="*", metavar="NODE", help="nodes that share a process, all without names: faster")
     parser.add_argument("--only", nargs="+", default=[], metavar="NODE", help="start these instead of the scenario's nodes")
     parser.add_argument("--without", nargs="+", default=[], metavar="NODE", help="do not start these nodes")
     parser.add_argument("--realtime", action="store_true", help="pace by the wall clock instead of lockstep")
@@ -94,7 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_core.scenario import load_scenario
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
-    from perch_eval.nodes import node_programs
+    from perch_eval.nodes import ALL_NODES, node_programs
     from perch_eval.stack import Stack
     from perch_eval.view.address import check_free
     from ros_graph.connection import visit
@@ -116,7 +117,8 @@ def run(arguments: argparse.Namespace) -> None:
         overrides=overrides,
     )
     folder = (arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute()
-    programs = node_programs(launches, folder, namespace=arguments.namespace, composed=arguments.composed)
+    composed = () if arguments.composed is None else arguments.composed or ALL_NODES
+    programs = node_programs(launches, folder, namespace=arguments.namespace, composed=composed)
     stack = Stack(programs, folder, on_line=printer([program.name for program in programs]))
     try:
         stack.start()

@@ -30,7 +30,7 @@ def flights(tmp_path_factory):
     folder = tmp_path_factory.mktemp("engines")
     file = folder / "both_engines.yaml"
     file.write_text(SCENARIO)
-    report = fly_on_the_stack(str(file), 5, folder / "stack", composed=True)
+    report = fly_on_the_stack(str(file), 5, folder / "stack")
     trace = fly(load_scenario(file), 5, Sensing(vio="rendered", target="rendered"))
     return report, Flight(folder / "stack" / "flight.mcap"), trace
 

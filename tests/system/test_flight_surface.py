@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 from perch_eval import demo
 from perch_eval.flight import HASHED, Flight
+from perch_eval.nodes import ALL_NODES
 
 SCENARIO, SEED = "surface_90", 1
 
@@ -24,7 +25,7 @@ def flight(tmp_path_factory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("composed")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", "0")  # the demo chooses its own and must not leave it behind
-        return demo.fly(SCENARIO, SEED, folder, composed=True), folder
+        return demo.fly(SCENARIO, SEED, folder, composed=ALL_NODES), folder
 
 
 def test_it_perches_as_the_paper_does(flight):
@@ -89,7 +90,7 @@ def test_one_process_per_node_and_a_busy_core_give_the_same_flight(flight, tmp_p
     report, folder = flight
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
-        again = demo.fly(SCENARIO, SEED, tmp_path)
+        again = demo.fly(SCENARIO, SEED, tmp_path, composed=())
     finally:
         busy.kill()
         busy.wait()

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(os.environ.get("PERCH_SLOW") != "1", reason="two
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
     folder = tmp_path_factory.mktemp("line")
-    report = fly_on_the_stack("line_20", 1, folder, composed=True)
+    report = fly_on_the_stack("line_20", 1, folder)
     return report, Flight(folder / "flight.mcap"), fly(load_scenario("line_20"), 1, Sensing(vio="rendered", target="rendered"))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import yaml
 from perch_core import config
@@ -10,7 +12,7 @@ from perch_core.scenario import Scenario, load_scenario
 from perch_eval import nodes as nodes_module
 from perch_eval.node_launch import (
     PACKAGES, NodeLaunch, choose_nodes, node_launches, parse_override, parse_overrides, read_parameters)
-from perch_eval.nodes import node_programs
+from perch_eval.nodes import ALL_NODES, node_programs
 
 
 @pytest.fixture
@@ -96,5 +98,16 @@ def test_one_program_per_node_or_one_for_all(tmp_path, monkeypatch):
     assert [(p.command[0], p.nodes) for p in single] == [
         ("/perch_sim/vehicle", ("/quad1/vehicle",)), ("/perch_control/controller", ("/quad1/controller",))]
     assert "__ns:=/quad1" in single[0].command
-    together = node_programs(launches, tmp_path, composed=True)
+    together = node_programs(launches, tmp_path, composed=ALL_NODES)
     assert [(p.command[0], p.nodes) for p in together] == [("/perch_eval/composed", ("/vehicle", "/controller"))]
+
+
+def test_some_nodes_share_a_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(nodes_module, "executable", lambda package, name: f"/{package}/{name}")
+    launches = node_launches(load_scenario("surface_90"), ["vehicle", "vio", "controller"])
+    found = node_programs(launches, tmp_path, composed=("controller", "vehicle", "recorder"))
+    assert [(p.command[0], p.nodes) for p in found] == [
+        ("/perch_eval/composed", ("/vehicle", "/controller")), ("/perch_perception/vio", ("/vio",))]
+    assert [entry["name"] for entry in json.loads((tmp_path / "composed.json").read_text())] == ["vehicle", "controller"]
+    with pytest.raises(PerchError, match="'pilot' is not one of"):
+        node_programs(launches, tmp_path, composed=("pilot",))

@@ -1,23 +1,27 @@
-"""From a scenario to the programs that a Stack can start: one per node, or all nodes in one process."""
+"""From a scenario to the programs that a Stack can start: one per node, and one for the nodes that share a process."""
 
 from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
-from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
+from perch_eval.node_launch import PACKAGES, NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 
 Overrides = Mapping[str, Mapping[str, Any]]
 
+ALL_NODES = tuple(PACKAGES)
+FAST_NODES = ("vehicle", "estimator", "controller", "mission", "recorder")
+"""Nodes with a little to do at many steps: between processes their messages cost more than their work."""
 
-def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", composed: bool = False,
+
+def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", composed: Collection[str] = (),
              lockstep: bool = True, record: Path | None = None, hold_for_goal: bool = False,
              overrides: Overrides | None = None, namespace: str = "", folder: Path | None = None) -> tuple[Program, ...]:
     """The programs of a whole scenario.
@@ -26,7 +30,7 @@ def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", co
         scenario: what is flown.
         seed: of every random number in the flight.
         scenario_source: file of the scenario, where it is none of `config/scenarios`.
-        composed: run all nodes in one process.
+        composed: nodes that share a process, as far as the scenario has them; the others have one each.
         lockstep: wait for every node at every step; otherwise pace by the wall clock.
         record: add a recorder that writes this MCAP file.
         hold_for_goal: hold simulation time at zero until the mission has a goal.
@@ -50,28 +54,33 @@ def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", co
 
 
 def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: str = "",
-                  composed: bool = False) -> tuple[Program, ...]:
+                  composed: Collection[str] = ()) -> tuple[Program, ...]:
     """The programs for some nodes. Their parameter files are written into `folder`.
 
     Args:
         launches: nodes with their parameters.
         folder: receives the parameter files.
         namespace: of every node, as in `/quad1`.
-        composed: run all nodes in one process.
+        composed: nodes that share a process, as far as they are among `launches`; the others have one each.
 
     Raises:
-        PerchError: the workspace is not built or not sourced.
+        PerchError: a node to compose does not exist, or the workspace is not built or not sourced.
     """
+    for name in composed:
+        if name not in PACKAGES:
+            raise PerchError(f"node {name!r} is not one of {', '.join(PACKAGES)}")
     arguments = {launch.name: ros_arguments(launch, folder, namespace) for launch in launches}
-    if composed:
+    together = [launch for launch in launches if launch.name in composed]
+    found = []
+    if together:
         plan = folder / "composed.json"
         plan.write_text(json.dumps(
-            [{"name": n.name, "module": n.module, "arguments": arguments[n.name]} for n in launches], indent=1))
-        everyone = tuple(qualified_name(launch.name, namespace) for launch in launches)
-        return (Program("composed", (executable("perch_eval", "composed"), str(plan)), everyone),)
-    return tuple(
-        Program(n.name, (executable(n.package, n.name), *arguments[n.name]), (qualified_name(n.name, namespace),))
-        for n in launches)
+            [{"name": n.name, "module": n.module, "arguments": arguments[n.name]} for n in together], indent=1))
+        found.append(Program("composed", (executable("perch_eval", "composed"), str(plan)),
+                             tuple(qualified_name(n.name, namespace) for n in together)))
+    found += [Program(n.name, (executable(n.package, n.name), *arguments[n.name]), (qualified_name(n.name, namespace),))
+              for n in launches if n not in together]
+    return tuple(found)
 
 
 def executable(package: str, name: str) -> str:

@@ -20,7 +20,7 @@ from perch_core.ros import qos
 from perch_core.scenario import load_scenario
 from perch_eval.composed_node import close_nodes, create_nodes
 from perch_eval.domain import reserved_domain
-from perch_eval.nodes import programs
+from perch_eval.nodes import ALL_NODES, programs
 from perch_msgs.msg import Step
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -34,7 +34,7 @@ def warm_up(scenario_name: str = "surface_90") -> bool:
     scenario = load_scenario(scenario_name)
     with tempfile.TemporaryDirectory() as folder, reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        programs(scenario, composed=True, record=Path(folder) / "flight.mcap", folder=Path(folder))
+        programs(scenario, composed=ALL_NODES, record=Path(folder) / "flight.mcap", folder=Path(folder))
         plan = json.loads((Path(folder) / "composed.json").read_text())
         rclpy.init(args=[])
         nodes = create_nodes(plan)

@@ -92,6 +92,7 @@ def fly_on_the_stack(task: Task) -> RunResult:
     """One run on the real nodes: composed, in lockstep, in a ROS domain of its own."""
     from perch_eval.demo import fly
     from perch_eval.flight import Flight
+    from perch_eval.nodes import ALL_NODES
 
     with contextlib.ExitStack() as stack:
         folder = Path(task.keep or stack.enter_context(tempfile.TemporaryDirectory(prefix="perch-run-")))
@@ -100,7 +101,7 @@ def fly_on_the_stack(task: Task) -> RunResult:
         file.write_text(yaml.safe_dump(task.scenario))
         log = stack.enter_context(open(folder / "flight.log", "w"))
         with contextlib.redirect_stdout(log):
-            report = fly(str(file), task.run.seed, folder, composed=True)
+            report = fly(str(file), task.run.seed, folder, composed=ALL_NODES)
         contacts = contact_events(Flight(folder / "flight.mcap"))
         adhesion = scenario_of(task.scenario, str(file)).adhesion
     return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, adhesion), report["outcome"],

@@ -170,6 +170,7 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
 def _engines() -> Section:
     """One flight on the real nodes against the same flight in process."""
     from perch_eval.demo import fly as fly_on_the_stack
+    from perch_eval.nodes import ALL_NODES
     from perch_eval.in_process import Sensing, fly
     from perch_eval.in_process.trace import TRUTH
 
@@ -182,7 +183,7 @@ def _engines() -> Section:
         file = Path(folder) / "surface_90.yaml"
         file.write_text(yaml.safe_dump(mapping))
         try:
-            report = fly_on_the_stack(str(file), 1, Path(folder) / "stack", composed=True)
+            report = fly_on_the_stack(str(file), 1, Path(folder) / "stack", composed=ALL_NODES)
             states = Flight(Path(folder) / "stack" / "flight.mcap").states("ground_truth/odometry")
         except Exception as error:  # without ROS, or with a node missing, the tables still stand
             out.missing("greatest difference of position", "", f"the stack did not fly: {error}")
