@@ -8,7 +8,7 @@ from perch_core import so3
 from perch_core.camera import PinholeCamera
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion
-from perch_perception.vio import ekf
+from perch_perception.vio import bearing, ekf, lens
 from perch_perception.vio.bearing import corrected, observe, residuals
 from perch_perception.vio.landmark_choice import Spread, cell
 from perch_perception.vio.motion_start import solve_motion
@@ -46,6 +46,19 @@ def test_a_wrong_focal_length_is_undone_by_the_focal_error(camera):
     np.testing.assert_allclose(corrected(measured, np.log(1.004)), truth, atol=5e-6)
 
 
+def test_the_compiled_lens_is_the_camera():
+    rng = np.random.default_rng(9)
+    camera = dataclasses.replace(MOUNT.camera, angle_limit=1.3)
+    pixels = np.vstack([[[camera.cx, camera.cy]], rng.uniform(0, [camera.width, camera.height], (300, 2))])
+    rays, expected = lens.observe(camera, pixels)[0], camera.unproject(pixels)
+    assert np.isnan(expected).any() and np.isfinite(expected).any()
+    np.testing.assert_allclose(rays, expected, atol=1e-12)
+    everywhere = np.vstack([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], rng.normal(size=(300, 3))])
+    (seen, valid), (expected, expected_valid) = lens.project(camera, everywhere), camera.project(everywhere)
+    assert (valid == expected_valid).all() and not valid.all()
+    np.testing.assert_allclose(seen, expected, atol=1e-9)
+
+
 def test_residual_jacobians_are_those_of_finite_differences():
     rng = np.random.default_rng(1)
     R, p, X = scene(rng)
@@ -58,12 +71,12 @@ def test_residual_jacobians_are_those_of_finite_differences():
 
     linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured, 0.0)
     cases = {
-        "by_theta": lambda d: r(R=R @ so3.exp(d)), "by_position": lambda d: r(p=p + d), "by_point": lambda d: r(X=X + d),
-        "by_camera_rotation": lambda d: r(R_BC=MOUNT.R_BC @ so3.exp(d)), "by_camera_position": lambda d: r(p_BC=MOUNT.p_BC + d)}
+        "THETA": lambda d: r(R=R @ so3.exp(d)), "POSITION": lambda d: r(p=p + d), "POINT": lambda d: r(X=X + d),
+        "CAMERA_ROTATION": lambda d: r(R_BC=MOUNT.R_BC @ so3.exp(d)), "CAMERA_POSITION": lambda d: r(p_BC=MOUNT.p_BC + d)}
     for name, moved in cases.items():
         # r = H x for an error x of the state: moving the estimate by d leaves the error -d
         numeric = np.stack([-(moved(STEP * e) - moved(-STEP * e)) / (2 * STEP) for e in np.eye(3)], axis=-1)
-        np.testing.assert_allclose(getattr(linear, name), numeric, atol=1e-7, err_msg=name)
+        np.testing.assert_allclose(linear.J[:, :, getattr(bearing, name)], numeric, atol=1e-7, err_msg=name)
 
 
 def test_the_focal_derivative_is_that_of_another_lens():
@@ -72,7 +85,7 @@ def test_the_focal_derivative_is_that_of_another_lens():
     stretched = dataclasses.replace(MOUNT.camera, fx=275.0 * 1.001, fy=275.0 * 1.001)
     measured = observe(MOUNT.camera, stretched.project(in_camera(R, p, X))[0])
     linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured, 0.0)
-    np.testing.assert_allclose(linear.r, linear.by_focal * np.log(1.001), atol=2e-6)
+    np.testing.assert_allclose(linear.r, linear.J[:, :, bearing.FOCAL] * np.log(1.001), atol=2e-6)
 
 
 # -- preintegration ------------------------------------------------------------------------------------------------------

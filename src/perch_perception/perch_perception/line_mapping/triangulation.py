@@ -2,7 +2,7 @@
 
 Each sighting gives a plane through the camera's centre that contains the wire: n . d = 0 and n . (p - c) = 0. Their
 intersection is the start; a robust least-squares fit to all rays, with the poses' own errors, refines it and says how
-well it is known. Where the camera moved along the wire or towards it, all planes are the same plane, and the depth
+well it is known. The odometry drifts as it flies: in its frame the wire wanders, and is estimated where it is now. Where the camera moved along the wire or towards it, all planes are the same plane, and the depth
 would be off by metres: such baselines are refused.
 """
 
@@ -18,8 +18,8 @@ from perch_core.errors import PerchError
 from perch_perception.line_mapping.curve import PARAMETERS, WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 
-ITERATIONS = 6
-WARM_ITERATIONS = 2    # where an earlier result is near; the next sighting brings the next two
+RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
+ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
 
 
@@ -32,7 +32,7 @@ class TriangulationConfig:
     pose_position: float = config.quantity(0.003, unit="m", above=0.0, high=1.0,
                                            doc="error of the camera's position from image to image, 1 sigma")
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
-                                        doc="growth of that error with the age of a sighting; the wire is where the newest see it")
+                                        doc="random walk of the odometry; the wire is where the newest sightings see it")
     pose_rotation: float = config.quantity(0.1, unit="deg", above=0.0, high=10.0, doc="the same for its attitude")
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
                                  doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
@@ -113,39 +113,58 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
     used = np.ones(len(observations), bool)
-    for _ in range(ITERATIONS if start is None else WARM_ITERATIONS):
-        residual, jacobian = _whitened(curve, observations, centres, rays, settings)
+    times = np.array([o.time for o in observations])
+    drifted = settings.pose_drift**2 * np.maximum(np.diff(times, prepend=times[0]), 0.0)  # variance added before each sighting
+    rigid, rounds = np.zeros(len(times)), RIGID_ITERATIONS if start is None else 0
+    for walk in [rigid] * rounds + [drifted] * ITERATIONS:
+        residual, _ = _whitened(curve, observations, centres, rays, settings, walk.sum() - np.cumsum(walk))
         size = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
         used = size < 3.0 * max(1.0, float(np.median(size)))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
-        information = np.einsum("n,nki,nkj->ij", weight, jacobian, jacobian)
-        information[4, 4] += 1.0 / settings.sag**2
-        gradient = np.einsum("n,nki,nk->i", weight, jacobian, residual)
-        gradient[4] += curve.curvature / settings.sag**2
+        information, gradient = _wandering(*_whitened(curve, observations, centres, rays, settings, rigid), weight, walk, settings,
+                                           curve.curvature)
         step = -np.linalg.solve(information, gradient)
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve = curve.moved(step)
-        if np.abs(step).max() < 1e-4:
-            break
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
         raise DegenerateBaseline(ratio, settings.min_ratio)
     covariance = np.linalg.inv(information) * max(1.0, float(np.mean(size[used] ** 2)))
     return WireEstimate(curve, covariance, ratio, used)
 
 
-def _whitened(curve, observations, centres, rays, settings):
+def _wandering(residual, jacobian, weight, walk, settings, curvature):
+    """Information (5, 5) and gradient (5,) of the wire where it is after the last sighting.
+
+    A filter in information form from the oldest sighting to the newest: before each, the wire's two offsets lose what the
+    odometry's random walk takes, W = walk G G', so that I <- (I^-1 + W)^-1. All sightings from before a drift share it:
+    together they know the wire's place no better than that, however many they are.
+    """
+    parts = np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian)
+    slopes = np.einsum("n,nki,nk->ni", weight, jacobian, residual)
+    information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    information[4, 4], gradient[4] = 1.0 / settings.sag**2, curvature / settings.sag**2
+    for part, slope, variance in zip(parts, slopes, walk):
+        if variance > 0.0:
+            a, b, c = information[0, 0] + 1.0 / variance, information[1, 1] + 1.0 / variance, information[0, 1]
+            lost = information[:, :2] @ (np.array([[b, -c], [-c, a]]) / (a * b - c * c))
+            gradient = gradient - lost @ gradient[:2]
+            information = information - lost @ information[:2]
+        information, gradient = information + part, gradient + slope
+    return information, gradient
+
+
+def _whitened(curve, observations, centres, rays, settings, walk):
     """Residuals (n, k) in sigmas and their Jacobian (n, k, 5), decorrelated within each image.
 
-    All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. The
-    odometry drifts: of two sightings that disagree the newer is right, as what is flown next starts from the newest pose.
+    All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. `walk` (n,)
+    is added to the variance of the positions [m^2].
     """
     n, k = len(observations), len(observations[0].rays_W)
     against = curve.offsets(centres, rays)
     by_rotation = np.cross(rays, against.normals)  # n . (dtheta x r)
     # a centre moved by dc sees the wire's point moved by -dc: across the plane by n . dc / distance
     by_position = against.normals / np.maximum(against.ahead, 0.1)[:, None]
-    age = observations[-1].time - np.array([o.time for o in observations])
-    position = np.repeat(np.sqrt(settings.pose_position**2 + settings.pose_drift**2 * np.maximum(age, 0.0)), k)
+    position = np.repeat(np.sqrt(settings.pose_position**2 + walk), k)
     by_pose = np.concatenate([by_rotation * np.radians(settings.pose_rotation), by_position * position[:, None]],
                              axis=1).reshape(n, k, 6)
     sigma = np.array([o.sigma for o in observations])

@@ -6,10 +6,14 @@ Bearings, not pixels: on a fisheye a pixel's error is nearly the same angle ever
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from perch_core.camera import Camera, EquidistantCamera
+from perch_core.jit import compiled
+
+from perch_perception.vio import lens
 
 
 @dataclass(frozen=True)
@@ -25,43 +29,40 @@ class Bearings:
     by_focal: np.ndarray
 
 
+# columns of a residual's derivatives
+CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, FOCAL = slice(0, 3), slice(3, 6), 6, 7
+THETA, POSITION, POINT = slice(8, 11), slice(11, 14), slice(14, 17)
+
+
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of n observations and their derivatives (rows of H: r = H x + n).
+    """Residuals of n observations and their derivatives (r = J x + n).
 
     Attributes:
         r: measured minus predicted, shape (n, 2).
-        by_theta, by_position: by the body pose's error, shape (n, 2, 3).
-        by_point: by the point's position in W, shape (n, 2, 3).
-        by_camera_rotation, by_camera_position: by the extrinsics' errors, shape (n, 2, 3).
-        by_focal: by the relative focal error, shape (n, 2).
+        J: derivatives by the errors of camera rotation (3) and position (3), time offset, relative focal error, the body's
+            theta (3) and position (3), and by the point's position in W (3), shape (n, 2, 17). The time offset's are zero:
+            it acts through the poses (`State.add_clone`).
         cosine: between measured and predicted bearing, shape (n,).
         distance: from the camera to the point [m], shape (n,).
     """
 
     r: np.ndarray
-    by_theta: np.ndarray
-    by_position: np.ndarray
-    by_point: np.ndarray
-    by_camera_rotation: np.ndarray
-    by_camera_position: np.ndarray
-    by_focal: np.ndarray
+    J: np.ndarray
     cosine: np.ndarray
     distance: np.ndarray
 
 
 def observe(camera: Camera, pixels: np.ndarray) -> Bearings:
     """Bearings of pixels, shape (n, 2)."""
+    if isinstance(camera, EquidistantCamera):
+        return Bearings(*lens.observe(camera, pixels))
     b = camera.unproject(pixels)
     rho = np.linalg.norm(b[:, :2], axis=1)
     safe = np.where(rho > 1e-9, rho, 1.0)
     e = np.where((rho > 1e-9)[:, None], b[:, :2] / safe[:, None], 0.0)
     outward = np.column_stack([b[:, 2:] * e, -rho])  # unit tangent away from the axis
-    if isinstance(camera, EquidistantCamera):
-        theta = np.arctan2(rho, b[:, 2])
-        angle = -camera.radius(theta) / camera.radius_slope(theta)
-    else:
-        angle = -rho * b[:, 2]  # theta = atan(r), r shrinks as f grows
+    angle = -rho * b[:, 2]  # theta = atan(r), r shrinks as f grows
     return Bearings(b, outward * angle[:, None])
 
 
@@ -71,20 +72,59 @@ def corrected(measured: Bearings, focal: float) -> np.ndarray:
     return b / np.linalg.norm(b, axis=1, keepdims=True)
 
 
-def skew(v: np.ndarray) -> np.ndarray:
-    """`so3.hat` for many vectors without its checks: (n, 3) -> (n, 3, 3)."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return out
-
-
-def tangent(b: np.ndarray) -> np.ndarray:
-    """Two unit vectors orthogonal to each bearing and to each other, (n, 3) -> (n, 2, 3)."""
-    a = np.where((np.abs(b[:, 0]) < 0.7)[:, None], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    e1 = np.cross(b, a)
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    return np.stack([e1, np.cross(b, e1)], axis=1)
+@compiled
+def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, distance):
+    """Fill r, J, cosine, distance of `Residuals`; loops because numpy's calls cost more than the numbers."""
+    X_B, X_C, u, b, e = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    by_C, by_B = np.zeros(3), np.zeros(3)
+    for n in range(X_W.shape[0]):
+        length = 0.0
+        for i in range(3):
+            b[i] = b_C[n, i] + focal * by_focal[n, i]
+            length += b[i] * b[i]
+            X_B[i] = 0.0
+            for j in range(3):
+                X_B[i] += R_WB[n, j, i] * (X_W[n, j] - p_WB[n, j])
+        length = math.sqrt(length)
+        d2 = 0.0
+        for i in range(3):
+            b[i] /= length
+            X_C[i] = 0.0
+            for j in range(3):
+                X_C[i] += R_BC[j, i] * (X_B[j] - p_BC[j])
+            d2 += X_C[i] * X_C[i]
+        d = math.sqrt(d2)
+        distance[n], cosine[n] = d, 0.0
+        for i in range(3):
+            u[i] = X_C[i] / d
+            cosine[n] += u[i] * b[i]
+        # e1 orthogonal to b, from the axis that is not near it; e2 = b x e1
+        first = abs(b[0]) < 0.7
+        a0, a1 = (1.0, 0.0) if first else (0.0, 1.0)
+        e[0], e[1], e[2] = -b[2] * a1, b[2] * a0, b[0] * a1 - b[1] * a0
+        length = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+        for i in range(3):
+            e[i] /= length
+        for row in range(2):
+            if row == 1:
+                e0, e1, e2 = b[1] * e[2] - b[2] * e[1], b[2] * e[0] - b[0] * e[2], b[0] * e[1] - b[1] * e[0]
+                e[0], e[1], e[2] = e0, e1, e2
+            eu = e[0] * u[0] + e[1] * u[1] + e[2] * u[2]
+            r[n, row] = -eu
+            for i in range(3):
+                by_C[i] = (e[i] - eu * u[i]) / d
+            for i in range(3):
+                by_B[i] = R_BC[i, 0] * by_C[0] + R_BC[i, 1] * by_C[1] + R_BC[i, 2] * by_C[2]
+            out = J[n, row]
+            out[6] = 0.0
+            out[7] = -(e[0] * by_focal[n, 0] + e[1] * by_focal[n, 1] + e[2] * by_focal[n, 2])
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                out[i] = by_C[j] * X_C[k] - by_C[k] * X_C[j]       # d X_C = X_C x dtheta_c
+                out[3 + i] = -by_B[i]
+                out[8 + i] = by_B[j] * X_B[k] - by_B[k] * X_B[j]
+                by_W = R_WB[n, i, 0] * by_B[0] + R_WB[n, i, 1] * by_B[1] + R_WB[n, i, 2] * by_B[2]
+                out[11 + i], out[14 + i] = -by_W, by_W
 
 
 def residuals(R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray,
@@ -100,17 +140,8 @@ def residuals(R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, R_BC: np.ndar
         measured: n bearings.
         focal: relative focal error.
     """
-    b = corrected(measured, focal)
-    X_B = np.einsum("nji,nj->ni", R_WB, X_W - p_WB)
-    X_C = (X_B - p_BC) @ R_BC
-    distance = np.sqrt((X_C * X_C).sum(axis=1))
-    u = X_C / distance[:, None]
-    B = tangent(b)
-    Bu = np.einsum("nij,nj->ni", B, u)
-    by_X_C = (B - Bu[:, :, None] * u[:, None, :]) / distance[:, None, None]
-    by_X_B = by_X_C @ R_BC.T
-    by_X_W = by_X_B @ np.swapaxes(R_WB, 1, 2)
-    return Residuals(
-        r=-Bu, by_theta=by_X_B @ skew(X_B), by_position=-by_X_W, by_point=by_X_W,
-        by_camera_rotation=by_X_C @ skew(X_C), by_camera_position=-by_X_B,
-        by_focal=-np.einsum("nij,nj->ni", B, measured.by_focal), cosine=(u * b).sum(axis=1), distance=distance)
+    n = len(X_W)
+    out = Residuals(np.empty((n, 2)), np.empty((n, 2, 17)), np.empty(n), np.empty(n))
+    _linearise(np.ascontiguousarray(R_WB), np.ascontiguousarray(p_WB), np.ascontiguousarray(X_W), np.ascontiguousarray(R_BC),
+               p_BC, measured.b_C, measured.by_focal, float(focal), out.r, out.J, out.cosine, out.distance)
+    return out

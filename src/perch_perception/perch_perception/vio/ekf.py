@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from perch_core.jit import compiled
+from scipy.linalg import lapack, qr
 from scipy.stats import chi2
 
 
@@ -21,10 +24,48 @@ class Gate:
 def squared_distance(H: np.ndarray, P: np.ndarray, r: np.ndarray, variance: float) -> float:
     """r^T (H P H^T + variance I)^-1 r for H (m, n), P (n, n), r (m,)."""
     S = H @ P @ H.T
-    S[np.diag_indices_from(S)] += variance
-    L = np.linalg.cholesky(S)
-    half = solve_triangular(L, r, lower=True, check_finite=False)
+    S.flat[:: len(S) + 1] += variance
+    half = _solve_lower(_cholesky(S), r)
     return float(half @ half)
+
+
+@compiled
+def _reflect(A, columns):
+    """Householder's QR of the first columns of A (m, n), applied to all of it in place."""
+    m, n = A.shape
+    v, w = np.zeros(m), np.zeros(n)
+    for c in range(columns):
+        norm2 = 0.0
+        for i in range(c, m):
+            v[i] = A[i, c]
+            norm2 += v[i] * v[i]
+        norm = math.sqrt(norm2)
+        if norm == 0.0:
+            continue
+        head = norm if v[c] >= 0.0 else -norm
+        v[c] += head
+        factor = 1.0 / (norm2 + abs(A[c, c]) * norm)  # 2 / |v|^2
+        w[:] = 0.0
+        for i in range(c, m):
+            for j in range(c, n):
+                w[j] += v[i] * A[i, j]
+        for i in range(c, m):
+            f = factor * v[i]
+            for j in range(c, n):
+                A[i, j] -= f * w[j]
+        for i in range(c + 1, m):
+            A[i, c] = 0.0
+
+
+def _cholesky(S: np.ndarray) -> np.ndarray:
+    L, info = lapack.dpotrf(S, lower=1, clean=0)
+    if info:
+        raise np.linalg.LinAlgError(f"innovation covariance is not positive definite (dpotrf: {info})")
+    return L
+
+
+def _solve_lower(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return lapack.dtrtrs(L, b, lower=1)[0]
 
 
 def eliminate(H_x: np.ndarray, H_f: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -37,9 +78,9 @@ def eliminate(H_x: np.ndarray, H_f: np.ndarray, r: np.ndarray) -> tuple[np.ndarr
         R_f (3, 3) upper triangular, H_1 (3, n), r_1 (3,) with r_1 = H_1 x + R_f f;
         H_0 (m - 3, n), r_0 (m - 3,) with r_0 = H_0 x.
     """
-    Q, R = np.linalg.qr(H_f, mode="complete")
-    QH, Qr = Q.T @ H_x, Q.T @ r
-    return R[:3], QH[:3], Qr[:3], QH[3:], Qr[3:]
+    A = np.column_stack([H_f, H_x, r])
+    _reflect(A, 3)
+    return A[:3, :3], A[:3, 3:-1], A[:3, -1], A[3:, 3:-1], A[3:, -1]
 
 
 def compress(H: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -63,10 +104,9 @@ def update(P: np.ndarray, columns: np.ndarray, H: np.ndarray, r: np.ndarray, var
     Returns:
         Error estimate (n,) and new covariance (n, n), symmetric.
     """
-    PH = P[:, columns] @ H.T
-    S = H @ PH[columns]
-    S[np.diag_indices_from(S)] += variance
-    factor = cho_factor(S, lower=True, check_finite=False)
-    K = cho_solve(factor, PH.T, check_finite=False).T
-    P = P - K @ PH.T
-    return K @ r, 0.5 * (P + P.T)
+    HP = H @ P[columns]
+    S = HP[:, columns] @ H.T
+    S.flat[:: len(S) + 1] += variance
+    L = _cholesky(S)
+    half = _solve_lower(L, HP)  # P H^T S^-1 H P = half^T half, symmetric to the last bit
+    return half.T @ _solve_lower(L, r), P - half.T @ half

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from perch_perception.vio import state as at
-from perch_perception.vio.bearing import Bearings, corrected, residuals
+from perch_perception.vio.bearing import POINT, Bearings, corrected, residuals
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.msckf import Msckf
 from perch_perception.vio.state import Landmark
@@ -54,12 +54,10 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
     n = len(chosen)
     seen = Bearings(bearings.b_C[chosen], bearings.by_focal[chosen])
     linear = residuals(np.broadcast_to(s.R_WB, (n, 3, 3)), np.broadcast_to(s.p_WB, (n, 3)), X, s.R_BC, s.p_BC, seen, s.focal)
-    rows = np.concatenate([linear.by_camera_rotation, linear.by_camera_position, np.zeros((n, 2, 1)), linear.by_focal[:, :, None],
-                           linear.by_theta, linear.by_position], axis=2)
     columns, variance = np.r_[_CALIBRATION, _POSE], np.diag([filter.sigma**2, filter.sigma**2, sigma**2])
     for k, i in enumerate(chosen):
-        inverse = np.linalg.inv(np.vstack([linear.by_point[k], [0.0, 0.0, 1.0]]))
-        J = -inverse[:, :2] @ rows[k]
+        inverse = np.linalg.inv(np.vstack([linear.J[k, :, POINT], [0.0, 0.0, 1.0]]))
+        J = -inverse[:, :2] @ linear.J[k, :, : POINT.start]
         cross = J @ s.P[columns]
         own = J @ s.P[np.ix_(columns, columns)] @ J.T + inverse @ variance @ inverse.T
         s.P = np.block([[s.P, cross.T], [cross, own]])

@@ -6,6 +6,7 @@ ended (their point eliminated), then take new landmarks into the state from trac
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from perch_core.vehicle import GRAVITY
 
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
-from perch_perception.vio.bearing import Bearings, corrected, residuals
+from perch_perception.vio.bearing import POINT, Bearings, corrected, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.preintegration import preintegrate
@@ -41,6 +42,11 @@ class FrameReport:
     def used(self) -> int:
         """Observed features that changed the state."""
         return self.landmarks_used + self.tracks_used + self.landmarks_new
+
+
+def _orthonormal(R: np.ndarray) -> np.ndarray:
+    """The rotation nearest to a matrix that rounding has taken off SO(3): one step of Newton's method."""
+    return 1.5 * R - 0.5 * R @ (R.T @ R)
 
 
 class Msckf:
@@ -80,14 +86,15 @@ class Msckf:
         G = np.zeros((9, 9))
         G[:3, :3], G[3:6, 3:6], G[6:, 6:] = np.eye(3), R, R
         P, n = s.P, at.INERTIAL_SIZE
-        P[:n, :n] = Phi @ P[:n, :n] @ Phi.T
-        P[:9, :9] += G @ pre.Q @ G.T
+        own = Phi @ P[:n, :n] @ Phi.T
+        own[:9, :9] += G @ pre.Q @ G.T
+        P[:n, :n] = 0.5 * (own + own.T)
         d = np.arange(3)
         P[9 + d, 9 + d] += self.config.imu.gyro_bias_walk**2 * T
         P[12 + d, 12 + d] += self.config.imu.accel_bias_walk**2 * T
         P[:n, n:] = Phi @ P[:n, n:]
         P[n:, :n] = P[:n, n:].T
-        s.p_WB, s.v_WB, s.R_WB, s.stamp = p, v, so3.quat_to_matrix(so3.quat_from_matrix(R_end)), stamp
+        s.p_WB, s.v_WB, s.R_WB, s.stamp = p, v, _orthonormal(R_end), stamp
         s.freeze()
         self.w_WB_B = pre.w_end
 
@@ -142,13 +149,14 @@ class Msckf:
         k = s.clone_at(len(s.clones) - 1)
         columns = np.concatenate([_CALIBRATION, np.arange(k, k + 6), np.arange(s.landmark_start, s.size)])
         H = np.zeros((m, 2, len(columns)))
-        H[:, :, :14] = self._pose_and_calibration(first)
+        H[:, :, :14] = first.J[:, :, : POINT.start]
         for i in range(m):
-            H[i, :, 14 + 3 * i : 17 + 3 * i] = first.by_point[i]
+            H[i, :, 14 + 3 * i : 17 + 3 * i] = first.J[i, :, POINT]
         trust = self._trust(now.distance / np.array([k.distance for k in s.landmarks.values()]))
         H, r = H * trust[:, None, None], now.r * trust[:, None]
         P = s.P[np.ix_(columns, columns)]
-        S = np.einsum("kia,kja->kij", H @ P, H) + self.sigma**2 * np.eye(2)
+        HP = (H.reshape(2 * m, -1) @ P).reshape(H.shape)
+        S = np.einsum("kia,kja->kij", HP, H) + self.sigma**2 * np.eye(2)
         distance = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
         good = (distance < self._gate.limit(2)) & (now.cosine > 0.5)
         bad = set()
@@ -169,7 +177,7 @@ class Msckf:
         oldest = s.clones[0].frame
         return self._with_parallax({
             i: t for i, t in self.tracks.by_id.items() if i not in s.landmarks and i not in self._used
-            and t.frames[0] <= oldest and len(t.frames) >= limits.clones - 1})
+            and t.frames[0] == oldest and len(t.frames) >= limits.clones - 1})
 
     def _spend(self, spanning: dict[int, Track]) -> dict[int, Track]:
         """Use spanning tracks that found no place as landmarks as if they had ended here; they begin anew."""
@@ -186,19 +194,18 @@ class Msckf:
         if limits.landmarks == 0:
             return
         spread = Spread({i: self.tracks.by_id[i].b_C[-1] for i in s.landmarks}, limits.landmarks)
-        for i in spanning:
+        columns, rows, rests = self._window_columns(), [], []
+        P = s.P[np.ix_(columns, columns)]
+        candidates = {i: t for i, t in spanning.items() if spread.admits(t.b_C[-1])}
+        for i, prepared in self._prepare_some(candidates, limits.landmarks_per_frame):
             if report.landmarks_new >= limits.landmarks_per_frame:
-                return
-            if not spread.admits(spanning[i].b_C[-1]):
+                break
+            if prepared is None or not spread.admits(spanning[i].b_C[-1]):
                 continue
-            prepared = self._prepare([spanning[i]])
-            if not prepared:
-                continue
-            X, H_x, H_f, r, columns = prepared[0]
+            X, H_x, H_f, r = prepared
             R_f, H_1, r_1, H_0, r_0 = ekf.eliminate(H_x, H_f, r)
             if np.abs(np.diag(R_f)).min() < 1e-3:
                 continue
-            P = s.P[np.ix_(columns, columns)]
             if ekf.squared_distance(H_0, P, r_0, self.sigma**2) > self._gate.limit(len(r_0)):
                 report.refused += 1
                 continue
@@ -211,8 +218,11 @@ class Msckf:
             own = inverse @ (H_1 @ P @ H_1.T + self.sigma**2 * np.eye(3)) @ inverse.T
             s.P = np.block([[s.P, cross.T], [cross, own]])
             s.landmarks[i] = Landmark(X + inverse @ r_1, X, float(np.linalg.norm(X - s.p_WB)))
-            self.apply(columns, H_0, r_0, self.sigma**2)
+            rows.append(H_0)
+            rests.append(r_0)
             report.landmarks_new += 1
+        if rows:
+            self.apply(columns, *ekf.compress(np.concatenate(rows), np.concatenate(rests)), self.sigma**2)
 
     # -- tracks that have ended --------------------------------------------------------------------------------------
 
@@ -221,10 +231,16 @@ class Msckf:
         s, limits = self.state, self.config.filter
         useful = [t for i, t in ended.items() if i not in self._used and i not in s.landmarks and len(t.frames) >= 4]
         useful = sorted(useful, key=lambda t: -len(t.frames))[: limits.tracks_per_frame]
-        rows, rests = [], []
-        for _, H_x, H_f, r, columns in self._prepare(useful):
+        if not useful:
+            return
+        columns, rows, rests = self._window_columns(), [], []
+        P = s.P[np.ix_(columns, columns)]
+        for prepared in self._prepare(useful):
+            if prepared is None:
+                continue
+            _, H_x, H_f, r = prepared
             _, _, _, H_0, r_0 = ekf.eliminate(H_x, H_f, r)
-            distance = ekf.squared_distance(H_0, s.P[np.ix_(columns, columns)], r_0, self.sigma**2)
+            distance = ekf.squared_distance(H_0, P, r_0, self.sigma**2)
             if distance > self._gate.limit(len(r_0)):
                 report.refused += 1
                 continue
@@ -236,20 +252,26 @@ class Msckf:
             H, r = ekf.compress(np.concatenate(rows), np.concatenate(rests))
             self.apply(columns, H, r, self.sigma**2)
 
-    def _prepare(self, tracks: list[Track]) -> list[tuple]:
-        """Triangulate tracks and linearise their observations over calibration and window.
+    def _prepare_some(self, tracks: dict[int, Track], size: int) -> Iterator[tuple[int, tuple | None]]:
+        """`_prepare` by number, a few at a time as they are asked for."""
+        ids = list(tracks)
+        for begin in range(0, len(ids), size):
+            chunk = ids[begin : begin + size]
+            yield from zip(chunk, self._prepare([tracks[i] for i in chunk]))
+
+    def _prepare(self, tracks: list[Track]) -> list[tuple | None]:
+        """Triangulate tracks and linearise their observations over calibration and window (`_window_columns`).
 
         Returns:
-            For each usable track: X_W (3,), H_x (2m, k), H_f (2m, 3), r (2m,), columns (k,).
+            For each track: X_W (3,), H_x (2m, k), H_f (2m, 3), r (2m,); None where it is not usable.
         """
         s, limits = self.state, self.config.filter
         place = {c.frame: j for j, c in enumerate(s.clones)}
         R, p = s.window()
         R_first, p_first = s.first_window()
-        columns = np.concatenate([_CALIBRATION, np.arange(at.CORE_SIZE, s.landmark_start)])
         centres, R_WC = p + R @ s.p_BC, R @ s.R_BC
-        found = []
-        for track in tracks:
+        found, which = [], []
+        for number, track in enumerate(tracks):
             seen = [k for k, f in enumerate(track.frames) if f in place]
             if len(seen) < 4:
                 continue
@@ -259,35 +281,40 @@ class Msckf:
             X = triangulate(centres[js], rays, np.radians(limits.least_parallax_deg), self.sigma)
             if X is not None:
                 found.append((X, js, bearings))
+                which.append(number)
+        out: list[tuple | None] = [None] * len(tracks)
         if not found:
-            return []
+            return out
         js = np.concatenate([f[1] for f in found])
-        X = np.repeat([f[0] for f in found], [len(f[1]) for f in found], axis=0)
+        X = np.repeat(np.array([f[0] for f in found]), [len(f[1]) for f in found], axis=0)
         bearings = Bearings(np.concatenate([f[2].b_C for f in found]), np.concatenate([f[2].by_focal for f in found]))
         now = self._residuals(R[js], p[js], X, bearings)
         first = self._residuals(R_first[js], p_first[js], X, bearings)
-        J = self._pose_and_calibration(first)
-        out, begin = [], 0
-        for X_W, js, _ in found:
+        begin = 0
+        for number, (X_W, js, _) in zip(which, found):
             m, rows = len(js), slice(begin, begin + len(js))
-            H = np.zeros((m, 2, len(columns)))
-            H[:, :, :8] = J[rows, :, :8]
-            for k, j in enumerate(js):
-                H[k, :, 8 + 6 * j : 14 + 6 * j] = J[begin + k, :, 8:]
             trust = float(self._trust(now.distance[rows].max() / now.distance[rows].min()))
-            out.append((X_W, trust * H.reshape(2 * m, -1), trust * first.by_point[rows].reshape(-1, 3),
-                        trust * now.r[rows].ravel(), columns))
+            J = trust * first.J[rows]
+            H = np.zeros((m, 2, 8 + at.CLONE_SIZE * len(s.clones)))
+            H[:, :, :8] = J[:, :, :8]
+            H[:, :, 8:].reshape(m, 2, -1, 6)[np.arange(m), :, js] = J[:, :, 8:14]
+            out[number] = X_W, H.reshape(2 * m, -1), J[:, :, POINT].reshape(-1, 3), trust * now.r[rows].ravel()
             begin += m
         return out
+
+    def _window_columns(self) -> np.ndarray:
+        """Indices of calibration and clones in the error."""
+        return np.arange(at.INERTIAL_SIZE, self.state.landmark_start)
 
     def _with_parallax(self, tracks: dict[int, Track]) -> dict[int, Track]:
         """Tracks whose first and last rays in W differ enough to be worth a triangulation, most parallax first."""
         if not tracks:
             return {}
         s = self.state
-        R = {c.frame: c.R_WB @ s.R_BC for c in s.clones}
-        ends = [(R[t.frames[0]] @ t.b_C[0]) @ (R[t.frames[-1]] @ t.b_C[-1]) if t.frames[0] in R else 1.0
-                for t in tracks.values()]
+        R, place = s.window()[0] @ s.R_BC, {c.frame: j for j, c in enumerate(s.clones)}
+        first, last = (np.einsum("nij,nj->ni", R[[place[t.frames[k]] for t in tracks.values()]],
+                                 np.array([t.b_C[k] for t in tracks.values()])) for k in (0, -1))
+        ends = (first * last).sum(axis=1)
         enough = np.cos(np.radians(self.config.filter.least_parallax_deg))
         order = np.argsort(ends, kind="stable")
         ids = list(tracks)
@@ -304,13 +331,3 @@ class Msckf:
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)
         return residuals(np.broadcast_to(R_WB, (n, 3, 3)), np.broadcast_to(p_WB, (n, 3)), X_W, s.R_BC, s.p_BC, bearings, s.focal)
-
-    @staticmethod
-    def _pose_and_calibration(linear) -> np.ndarray:
-        """Derivatives by (camera rotation, camera position, time offset, focal, theta, p), shape (n, 2, 14).
-
-        The time offset acts through the clones' poses (`State.add_clone`), not here.
-        """
-        n = len(linear.r)
-        return np.concatenate([linear.by_camera_rotation, linear.by_camera_position, np.zeros((n, 2, 1)),
-                               linear.by_focal[:, :, None], linear.by_theta, linear.by_position], axis=2)

@@ -11,13 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera import Camera, CameraMount
 
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
-from perch_perception.vio import ground, motion_start, rest, start
+from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
-from perch_perception.vio.bearing import observe
+from perch_perception.vio.bearing import POINT, observe, residuals
 from perch_perception.vio.config import VioConfig
+from perch_perception.vio.lens import project
 from perch_perception.vio.msckf import FrameReport, Msckf
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.result import FrameOutcome, VioPoseEstimate, VioResult
@@ -61,7 +62,7 @@ class VisualInertialOdometry:
         self._last_exposed: int | None = None
         self._informed = 0              # when vision or rest last updated the filter
         self._bad_frames = 0
-        _compile()
+        _compile(mount.camera)
 
     @property
     def time_offset(self) -> float:
@@ -251,12 +252,16 @@ class VisualInertialOdometry:
                          report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
 
 
-def _compile() -> None:
+def _compile(camera: Camera) -> None:
     """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
     row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
     preintegrate(row, np.zeros(3), np.zeros(3))
     rays = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -0.8]])
-    triangulate(np.array([[0.0, 0.0, 1.0], [0.75, 0.0, 1.0]]), rays, 0.1, 0.01)
+    centres = np.array([[0.0, 0.0, 1.0], [0.75, 0.0, 1.0]])
+    X = triangulate(centres, rays, 0.1, 0.01)
+    seen = observe(camera, project(camera, np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]))[0])
+    linear = residuals(np.broadcast_to(np.eye(3), (2, 3, 3)), centres, np.array([X, X]), np.eye(3), np.zeros(3), seen, 0.0)
+    ekf.eliminate(linear.J[:, :, :POINT.start].reshape(4, -1), linear.J[:, :, POINT].reshape(4, 3), linear.r.ravel())
 
 
 def pose_covariance(state: at.State) -> np.ndarray:

@@ -95,10 +95,13 @@ class State:
         n = len(self.clones)
         if n:
             steps = dx[CORE_SIZE : self.landmark_start].reshape(n, 6)
-            for clone, turn, step in zip(self.clones, so3.exp(steps[:, :3]), steps[:, 3:]):
-                clone.R_WB, clone.p_WB = clone.R_WB @ turn, clone.p_WB + step
-        for landmark, step in zip(self.landmarks.values(), dx[self.landmark_start :].reshape(-1, 3)):
-            landmark.X_W = landmark.X_W + step
+            R, p = self.window()
+            for clone, R_WB, p_WB in zip(self.clones, R @ so3.exp(steps[:, :3]), p + steps[:, 3:]):
+                clone.R_WB, clone.p_WB = R_WB, p_WB
+        if self.landmarks:
+            X = np.array([m.X_W for m in self.landmarks.values()]) + dx[self.landmark_start :].reshape(-1, 3)
+            for landmark, X_W in zip(self.landmarks.values(), X):
+                landmark.X_W = X_W
 
     def add_clone(self, frame: int, w_WB_B: np.ndarray) -> None:
         """Copy the present pose into the window.
@@ -115,13 +118,11 @@ class State:
         J[:3, THETA] = J[3:, POSITION] = np.eye(3)
         J[:3, TIME_OFFSET], J[3:, TIME_OFFSET] = w_WB_B, self.v_WB
         JP = J @ self.P
-        P = np.empty((n + 6, n + 6))
-        old = np.r_[0:at, at + 6 : n + 6]
-        new = np.arange(at, at + 6)
-        P[np.ix_(old, old)] = self.P
-        P[np.ix_(new, old)] = JP
-        P[np.ix_(old, new)] = JP.T
-        P[np.ix_(new, new)] = JP @ J.T
+        P, before, new, after = np.empty((n + 6, n + 6)), slice(0, at), slice(at, at + 6), slice(at + 6, n + 6)
+        for rows, old in ((before, slice(0, at)), (after, slice(at, n))):
+            P[rows, before], P[rows, after] = self.P[old, :at], self.P[old, at:]
+            P[new, rows], P[rows, new] = JP[:, old], JP[:, old].T
+        P[new, new] = JP @ J.T
         self.P = P
         self.clones.append(Clone(frame, self.R_WB.copy(), self.p_WB.copy(), self.R_WB.copy(), self.p_WB.copy()))
 

@@ -15,17 +15,21 @@ import cv2
 import numpy as np
 from perch_core.camera import Camera
 
+from perch_perception.vio.bearing import observe
 from perch_perception.vio.config import TrackerConfig
+from perch_perception.vio.lens import project
 
 _DRAWS = 24
-# strength (least eigenvalue over 5 x 5 px, as OpenCV scales it) of the corners that unit white noise makes in an image smoothed
-# with sigma = 1.5 px: measured on 640 x 480 noise images
-_NOISE_CORNER = 1.15e-6
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
+_HALVING = 1.0  # sigma of the smoothing in cv2.pyrDown [px]
+# strength (least eigenvalue over 3 x 3 px, as OpenCV scales it) of the corners that unit white noise makes in an image of half
+# the size, smoothed with sigma = 1.5 px before: measured on 640 x 480 images of 5 grey levels of noise
+_NOISE_CORNER = 2.3e-6
 
 
 def _noise(image: np.ndarray) -> float:
     """1 sigma of an image's white noise [grey levels], from second differences along some rows."""
-    rows = image[::8].astype(np.int16)
+    rows = image[::16].astype(np.int16)
     second = 2 * rows[:, 1:-1] - rows[:, :-2] - rows[:, 2:]
     return float(np.median(np.abs(second))) / (0.6745 * np.sqrt(6.0))
 
@@ -78,8 +82,6 @@ class Tracker:
             R_now_before: rotation of the camera since the frame before, takes rays of then into C of now, (3, 3).
         """
         disparity = np.inf
-        noise = _noise(image)
-        smooth = cv2.GaussianBlur(image, (0, 0), self.config.smoothing)
         if self._previous is not None and len(self._pixels):
             disparity = self._follow(image, R_now_before)
             self._return_to_reference(image)
@@ -87,46 +89,47 @@ class Tracker:
         self._previous = image
         new = 0
         if len(self._pixels) < self.config.features * self.config.refill:
-            new = self._refill(smooth, noise)
+            new = self._refill(image)
         self._choose_reference(image)
         self.latest = Features(self._ids, self._pixels.astype(float), new, disparity)
         return self.latest
 
     def _follow(self, image: np.ndarray, R_now_before: np.ndarray) -> float:
-        c, before = self.config, self._pixels
-        rays = self.camera.unproject(before.astype(float)) @ R_now_before.T
-        guess, valid = self.camera.project(rays)
-        guess = np.where(valid[:, None], guess, before).astype(np.float32)
-        size, stop = (c.window, c.window), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
-        after, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._previous, image, before.reshape(-1, 1, 2), guess.reshape(-1, 1, 2).copy(), winSize=size,
-            maxLevel=c.levels, criteria=stop, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            image, self._previous, after, before.reshape(-1, 1, 2).copy(), winSize=size, maxLevel=1, criteria=stop,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-        after = after.reshape(-1, 2)
+        c, rays = self.config, observe(self.camera, self._pixels).b_C @ R_now_before.T
+        guess, valid = project(self.camera, rays)
+        # what has left the view would be searched for longest
+        kept = valid & self.camera.contains(guess, -c.window)
+        before, ids, rays, guess = self._pixels[kept], self._ids[kept], rays[kept], guess[kept].astype(np.float32)
+        after, found = self._search(self._previous, image, before, guess, c.levels)
         place = np.clip(np.nan_to_num(np.rint(after), nan=-1.0, posinf=-1, neginf=-1), 0,
                         [image.shape[1] - 1, image.shape[0] - 1]).astype(int)
-        good = ((found.ravel() > 0) & (returned.ravel() > 0) & valid & self.camera.contains(after)
-                & (np.linalg.norm(back.reshape(-1, 2) - before, axis=1) < c.back_check)
-                & (self._view[place[:, 1], place[:, 0]] > 0))
+        good = found & self.camera.contains(after) & (self._view[place[:, 1], place[:, 0]] > 0)
+        back, returned = self._search(image, self._previous, after[good], before[good], 1)
+        good[good] = returned & (np.linalg.norm(back - before[good], axis=1) < c.back_check)
         good &= self._one_translation(rays, after, good)
         disparity = float(np.median(np.linalg.norm(after - guess, axis=1)[good])) if good.any() else np.inf
-        self._pixels, self._ids = after[good], self._ids[good]
+        self._pixels, self._ids = after[good], ids[good]
         return disparity
+
+    def _search(self, source: np.ndarray, image: np.ndarray, pixels: np.ndarray, guess: np.ndarray,
+                levels: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where the patches of a source image at pixels (n, 2) lie in an image, from a guess (n, 2); which were found (n,)."""
+        if not len(pixels):
+            return np.zeros((0, 2), np.float32), np.zeros(0, bool)
+        found_at, found, _ = cv2.calcOpticalFlowPyrLK(
+            source, image, pixels.reshape(-1, 1, 2), guess.reshape(-1, 1, 2).copy(), winSize=(self.config.window,) * 2,
+            maxLevel=levels, criteria=_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        return found_at.reshape(-1, 2), found.ravel() > 0
 
     def _return_to_reference(self, image: np.ndarray) -> None:
         """Place features where the patch of the reference frame fits best, if that is close to where they were followed to."""
         index = np.flatnonzero([i in self._origins for i in self._ids.tolist()])
         if self._reference is None or not len(index):
             return
-        origins = np.array([self._origins[i] for i in self._ids[index].tolist()], np.float32).reshape(-1, 1, 2)
-        guess, size = self._pixels[index].reshape(-1, 1, 2), (self.config.window, self.config.window)
-        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)
-        placed, found, _ = cv2.calcOpticalFlowPyrLK(self._reference, image, origins, guess.copy(), winSize=size, maxLevel=0,
-                                                    criteria=stop, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-        near = (found.ravel() > 0) & (np.linalg.norm(placed - guess, axis=2).ravel() < self.config.reference_reach)
-        self._pixels[index[near]] = placed.reshape(-1, 2)[near]
+        origins = np.array([self._origins[i] for i in self._ids[index].tolist()], np.float32)
+        placed, found = self._search(self._reference, image, origins, self._pixels[index], 0)
+        near = found & (np.linalg.norm(placed - self._pixels[index], axis=1) < self.config.reference_reach)
+        self._pixels[index[near]] = placed[near]
 
     def _thin(self) -> None:
         """Let go features that have come close to an older one.
@@ -159,7 +162,7 @@ class Tracker:
         index = np.flatnonzero(good)
         if len(index) < 8:
             return good
-        now = self.camera.unproject(after[index].astype(float))
+        now = observe(self.camera, after[index]).b_C
         normals = np.nan_to_num(np.cross(rays[index], now))  # of the epipolar planes: orthogonal to the translation
         rng = np.random.default_rng(len(index))  # the same draws for the same situation: flights repeat
         pairs = rng.integers(0, len(index), (_DRAWS, 2))
@@ -172,17 +175,23 @@ class Tracker:
         out[index[best]] = True
         return out
 
-    def _refill(self, image: np.ndarray, noise: float) -> int:
-        """Detect corners away from the features there are; those that noise alone would make are not taken."""
-        c, mask = self.config, self._view.copy()
+    def _refill(self, image: np.ndarray) -> int:
+        """Detect corners away from the features there are; those that noise alone would make are not taken.
+
+        At half the resolution: the smoothing leaves nothing that needs more, and it costs a quarter.
+        """
+        c, mask, noise = self.config, self._view[::2, ::2].copy(), _noise(image)
         for x, y in self._pixels:
-            cv2.circle(mask, (int(x), int(y)), int(c.spacing), 0, -1)
+            cv2.circle(mask, (round(x / 2), round(y / 2)), int(c.spacing / 2), 0, -1)
+        half = cv2.pyrDown(image)
+        if c.smoothing > _HALVING:
+            half = cv2.GaussianBlur(half, (0, 0), 0.5 * np.sqrt(c.smoothing**2 - _HALVING**2))
         corners, strength = cv2.goodFeaturesToTrackWithQuality(
-            image, c.features - len(self._pixels), c.quality, c.spacing, mask, blockSize=5)
+            half, c.features - len(self._pixels), c.quality, c.spacing / 2, mask, blockSize=3)
         if corners is None:
             return 0
         strong = strength.ravel() > c.noise_factor * _NOISE_CORNER * noise**2
-        corners = corners.reshape(-1, 2)[strong].astype(np.float32)
+        corners = 2.0 * corners.reshape(-1, 2)[strong].astype(np.float32)
         self._pixels = np.concatenate([self._pixels, corners])
         self._ids = np.concatenate([self._ids, np.arange(self._next, self._next + len(corners))])
         self._next += len(corners)
