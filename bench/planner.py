@@ -63,7 +63,7 @@ def _wrong_verdicts(count: int) -> float:
         force = rng.normal(0.0, rng.uniform(1.0, 8.0), (3, 13))
         force[2] += 9.81
         poly = bernstein.product(force, force).sum(axis=0)
-        attained, _, _ = bounds.maximum(poly, 1e-13 * np.abs(poly).max())
+        attained, _, _ = bounds.maximum(poly, 1e-13 * np.abs(poly).max(), -np.inf)
         bound = attained * (1.0 + rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-9.0, -2.0))
         verdict, _ = bounds.stays_below(poly, bound)
         wrong += (verdict == bounds.BELOW) != exact_sturm.stays_below(poly.tolist(), bound)

@@ -41,8 +41,8 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
                                   np.append(linear.places, places), np.append(linear.orders, np.full(len(times), 2)), 4)
     rows, low, high = reduced_qp.constraint_rows(program, linear.functional, linear.direction, linear.lower, linear.upper)
     count = len(linear.segments)
-    columns, constant = program.whitened[:, count:].T, program.constant[count:] + (0.0, 0.0, GRAVITY)
-    size = program.whitened.shape[0]
+    columns, constant = program.whitened[count:], program.constant[count:] + (0.0, 0.0, GRAVITY)
+    size = program.whitened.shape[1]
     limit = Limits.of(settings, vehicle).thrust[1] / vehicle.mass
 
     def cost(w, gradient):

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_core import bernstein
 from perch_core.flatness import flat_to_state
-from perch_planner import bounds, sturm
+from perch_core.vehicle import GRAVITY
+from perch_planner import bounds, plan_checks, sturm
 from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
 from perch_planner.plan_checks import specific_force
 
@@ -33,18 +34,51 @@ def thrust_like(seed: int) -> np.ndarray:
 @settings(max_examples=60)
 def test_maximum_is_enclosed_and_attained(seed):
     poly = thrust_like(seed)
-    attained, proved, place = bounds.maximum(poly, 1e-9 * np.abs(poly).max())
+    attained, proved, place = bounds.maximum(poly, 1e-9 * np.abs(poly).max(), -np.inf)
     dense = bernstein.evaluate(poly, np.linspace(0.0, 1.0, 2001))
     assert proved >= dense.max()
     assert attained == pytest.approx(float(bernstein.evaluate(poly, place)), rel=1e-9)
     assert proved - attained <= 2e-9 * np.abs(poly).max()
 
 
+@given(seeds, st.floats(0.5, 1.5))
+@settings(max_examples=60)
+def test_a_floor_saves_work_but_leaves_the_bound_proved(seed, share):
+    poly = thrust_like(seed)
+    dense = bernstein.evaluate(poly, np.linspace(0.0, 1.0, 2001)).max()
+    tolerance = 1e-6 * np.abs(poly).max()
+    attained, proved, _ = bounds.maximum(poly, tolerance, share * dense)
+    assert proved >= dense
+    assert proved <= max(attained, share * dense) + 2.0 * tolerance
+    assert attained <= dense * (1.0 + 1e-4)
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_thrust_extrema_of_a_plan_are_close_and_those_of_its_segments_are_proved(seed):
+    rng = np.random.default_rng(seed)
+    segments = np.cumsum(np.cumsum(rng.normal(0.0, 0.01, (4, 3, 15)), axis=2), axis=2)
+    durations = rng.uniform(0.4, 1.0, 4)
+    extrema, least, most = plan_checks.thrust_extrema(segments, durations, 2.0, 16.0)
+    places = np.linspace(0.0, 1.0, 1001)
+    norms = []
+    for segment, duration in zip(segments, durations):
+        force = bernstein.evaluate(bernstein.derivative(segment, 2), places) / duration**2
+        force[2] += GRAVITY
+        norms.append(np.linalg.norm(force, axis=0))
+    for row, norm in zip(extrema, norms):
+        assert row[1] <= norm.min() * (1.0 + 1e-9) and norm.max() <= row[4] * (1.0 + 1e-9)
+        if norm.max() > 16.0:  # beyond the limit each segment's peak is known closely
+            assert row[3] == pytest.approx(norm.max(), rel=2e-3)
+    assert most == extrema[:, 4].max() and least == extrema[:, 1].min()
+    assert most == pytest.approx(max(n.max() for n in norms), rel=2e-3)
+
+
 @given(seeds, st.sampled_from([1e-2, 1e-4, 1e-6, 1e-9]), st.sampled_from([-1.0, 1.0]))
 @settings(max_examples=60)
 def test_verdicts_agree_with_exact_sturm_down_to_tiny_margins(seed, margin, side):
     poly = thrust_like(seed)
-    attained, _, _ = bounds.maximum(poly, 1e-13 * np.abs(poly).max())
+    attained, _, _ = bounds.maximum(poly, 1e-13 * np.abs(poly).max(), -np.inf)
     bound = attained * (1.0 + side * margin)
     verdict, _ = bounds.stays_below(poly, bound)
     assert verdict != bounds.UNDECIDED
@@ -82,7 +116,7 @@ def test_both_chains_count_the_roots_that_were_put_in(roots):
 @settings(max_examples=30)
 def test_algorithm_1_agrees_with_subdivision_at_wide_margins(seed):
     poly = thrust_like(seed)
-    attained, _, _ = bounds.maximum(poly, 1e-9 * np.abs(poly).max())
+    attained, _, _ = bounds.maximum(poly, 1e-9 * np.abs(poly).max(), -np.inf)
     powers = bernstein.to_powers(poly / attained)
     assert sturm.global_bound_check(powers, 1.2, 0.0, 1.0)
     assert not sturm.global_bound_check(powers, 0.8, 0.0, 1.0)

@@ -10,7 +10,7 @@ from perch_core.vehicle import load_vehicle
 from perch_planner import full_qp, reference_element, solvers
 from perch_planner.contact_constraints import Contact, tube_bounds, tube_times
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint, contact_acceleration
-from perch_planner.segment_program import Cut, FullSegments, ReducedSegments
+from perch_planner.segment_program import Bounds, FullSegments, ReducedSegments
 from perch_planner.yaw_profile import yaw_coefficients
 
 VEHICLE = load_vehicle("snapdragon")
@@ -147,7 +147,8 @@ def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
         jerk, force = (bernstein.evaluate(bernstein.derivative(free[0], k), 0.4) / durations[0]**k for k in (3, 2))
         x = np.array([1.0, 0.0, 0.0])
         bound = jerk[0] - 2.0 * force[0] - 1.0
-        program.add([Cut(0, 0.4, ((3, x), (2, -2.0 * x)), -np.inf, bound)])
+        program.add(Bounds(np.array([0, 0]), np.array([0, 0]), np.array([0.4, 0.4]), np.array([3, 2]), np.array([x, -2.0 * x]),
+                           np.array([-np.inf]), np.array([bound])))
         cut, solution = program.solve()
         jerk, force = (bernstein.evaluate(bernstein.derivative(cut[0], k), 0.4) / durations[0]**k for k in (3, 2))
         assert solution.solved and jerk[0] - 2.0 * force[0] <= bound + 1e-5

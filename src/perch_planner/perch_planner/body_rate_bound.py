@@ -17,13 +17,26 @@ from math import cos, sin, sqrt
 import numpy as np
 
 from perch_core.jit import compiled
-from perch_planner.bounds import BELOW, UNDECIDED, VIOLATED, bernstein_row, cross, derivative, dot, product, split
+from perch_planner.bounds import (
+    BELOW,
+    UNDECIDED,
+    VIOLATED,
+    cross,
+    derivative,
+    dot,
+    largest,
+    magnitude,
+    product,
+    smallest,
+    split,
+    value,
+)
 
 _DEPTH = 20
 _NODES = 3000
 _TILT = 49          # coefficients of degree 48
-_LAYOUT = ((0, 49), (1, 49), (2, 25), (3, 13), (4, 13), (5, 13), (6, 24), (7, 24), (8, 24), (9, 15), (10, 14))
-_PARTS = 11         # rows of a node: |f|^4, |x|^2, |f|^2, f (3), x (3), psi, psi'
+_SIZES = np.array([49, 49, 25, 13, 13, 13, 24, 24, 24, 15, 14])  # of the rows |f|^4, |x|^2, |f|^2, f, x, psi, psi'
+_PARTS = len(_SIZES)
 
 
 @compiled
@@ -57,13 +70,20 @@ def rate_parts(force, jerk, yaw, duration):
     parts = np.zeros((_PARTS, _TILT))
     x = cross(force, jerk)
     squared = dot(force, force)
-    parts[0] = product(squared, squared)
-    parts[1] = _elevate(dot(x, x), _TILT)
-    parts[2, :25] = squared
-    parts[3:6, :13] = force
-    parts[6:9, :24] = x
-    parts[9, :15] = yaw
-    parts[10, :14] = derivative(yaw, 1) / duration
+    fourth, tilt, turn = product(squared, squared), _elevate(dot(x, x), _TILT), derivative(yaw, 1)
+    for k in range(_TILT):
+        parts[0, k], parts[1, k] = fourth[k], tilt[k]
+    for k in range(25):
+        parts[2, k] = squared[k]
+    for d in range(3):
+        for k in range(13):
+            parts[3 + d, k] = force[d, k]
+        for k in range(24):
+            parts[6 + d, k] = x[d, k]
+    for k in range(15):
+        parts[9, k] = yaw[k]
+    for k in range(14):
+        parts[10, k] = turn[k] / duration
     return parts
 
 
@@ -75,18 +95,21 @@ def rate_coarse_bound(force, jerk, yaw, duration):
         force, jerk, yaw, duration: as for `rate_parts`.
     """
     squared = dot(force, force)
-    least, most = squared.min(), squared.max()
+    least, most = smallest(squared), largest(squared)
     if least <= 0.0:
         return np.inf
-    low, high = yaw.min(), yaw.max()
+    low, high = smallest(yaw), largest(yaw)
     middle = 0.5 * (low + high)
-    lean = np.abs(cos(middle) * force[1] - sin(middle) * force[0]).max() + 0.5 * (high - low) * sqrt(most)
+    lean = 0.0
+    for k in range(force.shape[1]):
+        lean = max(lean, abs(cos(middle) * force[1, k] - sin(middle) * force[0, k]))
+    lean += 0.5 * (high - low) * sqrt(most)
     across = least - lean * lean
     if across <= 0.0:
         return np.inf
-    j = sqrt(max(dot(jerk, jerk).max(), 0.0))
-    turn = np.abs(derivative(yaw, 1)).max() / duration
-    spin = (turn * np.abs(force[2]).max() * sqrt(most) + lean * j) / across
+    j = sqrt(max(largest(dot(jerk, jerk)), 0.0))
+    turn = magnitude(derivative(yaw, 1)) / duration
+    spin = (turn * magnitude(force[2]) * sqrt(most) + lean * j) / across
     return sqrt(j * j / least + spin * spin)
 
 
@@ -126,19 +149,19 @@ def _along(parts, row, size, dx, dy, slack):
 @compiled
 def _spin_bound(parts):
     """Upper bound of |w_z| over the interval of the parts; infinite where the enclosure is too wide."""
-    low, high = parts[9, :15].min(), parts[9, :15].max()
+    low, high = smallest(parts[9, :15]), largest(parts[9, :15])
     middle, reach = 0.5 * (low + high), 0.5 * (high - low)
     dx, dy = -sin(middle), cos(middle)
-    least, most = parts[2, :25].min(), parts[2, :25].max()
+    least, most = smallest(parts[2, :25]), largest(parts[2, :25])
     if least <= 0.0:
         return np.inf
     shortest, longest = sqrt(least), sqrt(most)
     lean_low, lean_high = _along(parts, 3, 13, dx, dy, reach * longest)
-    turn_low, turn_high = _along(parts, 6, 24, dx, dy, reach * sqrt(max(parts[1].max(), 0.0)))
+    turn_low, turn_high = _along(parts, 6, 24, dx, dy, reach * sqrt(max(largest(parts[1]), 0.0)))
     across = least - max(lean_low * lean_low, lean_high * lean_high)
     if across <= 0.0:
         return np.inf
-    a, b = _interval_product(parts[10, :14].min(), parts[10, :14].max(), parts[5, :13].min(), parts[5, :13].max())
+    a, b = _interval_product(smallest(parts[10, :14]), largest(parts[10, :14]), smallest(parts[5, :13]), largest(parts[5, :13]))
     a, b = _interval_product(a, b, shortest, longest)
     c, d = _interval_product(lean_low, lean_high, turn_low, turn_high)
     c, d = _interval_product(c, d, 1.0 / longest, 1.0 / shortest)
@@ -146,17 +169,11 @@ def _spin_bound(parts):
 
 
 @compiled
-def _split_parts(parts, left, right):
-    """Halve the interval of all parts."""
-    split(parts[0].copy(), left[0], right[0])
-    split(parts[1].copy(), left[1], right[1])
-    split(parts[2, :25].copy(), left[2, :25], right[2, :25])
-    for k in range(3, 6):
-        split(parts[k, :13].copy(), left[k, :13], right[k, :13])
-    for k in range(6, 9):
-        split(parts[k, :24].copy(), left[k, :24], right[k, :24])
-    split(parts[9, :15].copy(), left[9, :15], right[9, :15])
-    split(parts[10, :14].copy(), left[10, :14], right[10, :14])
+def _split_parts(parts, left):
+    """Halve the interval of all parts: the left halves are written to `left`, `parts` become the right ones."""
+    for row in range(_PARTS):
+        size = _SIZES[row]
+        split(parts[row, :size], left[row, :size])
 
 
 @compiled
@@ -189,9 +206,9 @@ def rate_stays_below(parts, limit):
     stack = np.empty((_DEPTH + 2, _PARTS, _TILT))
     start = np.zeros(_DEPTH + 2)
     depth = np.zeros(_DEPTH + 2, np.int64)
-    left = np.empty((_PARTS, _TILT))
-    right = np.empty((_PARTS, _TILT))
-    stack[0] = parts
+    for row in range(_PARTS):
+        for k in range(_TILT):
+            stack[0, row, k] = parts[row, k]
     top, nodes = 1, 0
     doubtful = -1.0
     while top > 0:
@@ -205,12 +222,12 @@ def rate_stays_below(parts, limit):
             doubtful = start[top]
             continue
         level, begin = depth[top] + 1, start[top]
-        _split_parts(stack[top], left, right)
+        _split_parts(stack[top], stack[top + 1])
         middle = begin + 0.5**level
-        if _squared_rate(right) >= squared:
+        if _squared_rate(stack[top]) >= squared:
             return VIOLATED, middle
-        stack[top], start[top], depth[top] = right, middle, level
-        stack[top + 1], start[top + 1], depth[top + 1] = left, begin, level
+        start[top], depth[top] = middle, level
+        start[top + 1], depth[top + 1] = begin, level
         top += 2
     if doubtful >= 0.0:
         return UNDECIDED, doubtful
@@ -221,7 +238,6 @@ def rate_stays_below(parts, limit):
 def rate_at(parts, s):
     """|omega| at one place of a segment."""
     at = np.zeros((_PARTS, 1))
-    for row, size in _LAYOUT:
-        weights = bernstein_row(size - 1, s)
-        at[row, 0] = (weights * parts[row, :size]).sum()
+    for row in range(_PARTS):
+        at[row, 0] = value(parts[row, :_SIZES[row]], s)
     return sqrt(_squared_rate(at))

@@ -23,12 +23,40 @@ BELOW, VIOLATED, UNDECIDED = 1, 0, -1
 
 
 @compiled
-def split(work, left, right):
-    """De Casteljau at 1/2; `work` is used up, and its first entry is the value at the middle."""
+def largest(values):
+    """The largest entry of a vector."""
+    out = values[0]
+    for k in range(1, len(values)):
+        if values[k] > out:
+            out = values[k]
+    return out
+
+
+@compiled
+def smallest(values):
+    """The smallest entry of a vector."""
+    out = values[0]
+    for k in range(1, len(values)):
+        if values[k] < out:
+            out = values[k]
+    return out
+
+
+@compiled
+def magnitude(values):
+    """The largest absolute value of a vector's entries."""
+    out = 0.0
+    for k in range(len(values)):
+        out = max(out, abs(values[k]))
+    return out
+
+
+@compiled
+def split(work, left):
+    """De Casteljau at 1/2: the left half is written to `left`, and `work` becomes the right half."""
     last = len(work) - 1
     for k in range(last + 1):
         left[k] = work[0]
-        right[last - k] = work[last - k]
         for i in range(last - k):
             work[i] = 0.5 * (work[i] + work[i + 1])
 
@@ -46,37 +74,41 @@ def stays_below(coefficients, bound):
         UNDECIDED: within rounding of the bound near `place`.
     """
     n = len(coefficients)
-    size = np.abs(coefficients - bound).max()
+    if coefficients[0] >= bound:
+        return VIOLATED, 0.0
+    if coefficients[n - 1] >= bound:
+        return VIOLATED, 1.0
+    size, most = 0.0, -np.inf
+    for k in range(n):
+        size = max(size, abs(coefficients[k] - bound))
+        most = max(most, coefficients[k] - bound)
     margin = ROUNDING * size
+    if most < -margin:
+        return BELOW, 0.0
     stack = np.empty((_DEPTH + 2, n))
     start = np.zeros(_DEPTH + 2)
     depth = np.zeros(_DEPTH + 2, np.int64)
-    stack[0] = coefficients - bound
-    if stack[0, 0] >= 0.0:
-        return VIOLATED, 0.0
-    if stack[0, n - 1] >= 0.0:
-        return VIOLATED, 1.0
+    for k in range(n):
+        stack[0, k] = coefficients[k] - bound
     top, nodes = 1, 0
-    left = np.empty(n)
-    right = np.empty(n)
     doubtful = -1.0
     while top > 0:
         top -= 1
         nodes += 1
-        if stack[top].max() < -margin:
+        if largest(stack[top]) < -margin:
             continue
         if depth[top] >= _DEPTH or nodes >= _NODES:
             return UNDECIDED, start[top]
         level, begin = depth[top] + 1, start[top]
         middle = begin + 0.5**level
-        split(stack[top].copy(), left, right)
-        if right[0] >= 0.0:
-            if right[0] > margin:
+        split(stack[top], stack[top + 1])
+        if stack[top, 0] >= 0.0:
+            if stack[top, 0] > margin:
                 return VIOLATED, middle
             doubtful = middle
             continue
-        stack[top], depth[top], start[top] = right, level, middle
-        stack[top + 1], depth[top + 1], start[top + 1] = left, level, begin
+        depth[top], start[top] = level, middle
+        depth[top + 1], start[top + 1] = level, begin
         top += 2
     if doubtful >= 0.0:
         return UNDECIDED, doubtful
@@ -84,51 +116,52 @@ def stays_below(coefficients, bound):
 
 
 @compiled
-def maximum(coefficients, tolerance):
-    """Largest value of a polynomial on [0, 1], enclosed.
+def maximum(coefficients, tolerance, floor):
+    """Largest value of a polynomial on [0, 1], enclosed as far as it exceeds `floor`.
 
     Args:
         coefficients: Bernstein coefficients, shape (n + 1,).
         tolerance: wanted width of the enclosure, in the polynomial's unit.
+        floor: values below it are of no interest (-inf: all are).
 
     Returns:
         (attained, proved, place): a value that is attained at `place`, and a proved upper bound;
-        `proved - attained <= tolerance` unless rounding or the limit of 4000 nodes is met first.
+        `proved - max(attained, floor) <= tolerance` unless rounding or the limit of 4000 nodes is met first.
     """
     n = len(coefficients)
-    margin = ROUNDING * np.abs(coefficients).max()
-    stack = np.empty((_DEPTH + 2, n))
-    start = np.zeros(_DEPTH + 2)
-    depth = np.zeros(_DEPTH + 2, np.int64)
-    stack[0] = coefficients
     attained, place = coefficients[0], 0.0
     if coefficients[n - 1] > attained:
         attained, place = coefficients[n - 1], 1.0
+    margin = ROUNDING * magnitude(coefficients)
+    highest = largest(coefficients)
+    if highest <= max(attained, floor) + tolerance:
+        return attained, highest + margin, place
+    stack = np.empty((_DEPTH + 2, n))
+    start = np.zeros(_DEPTH + 2)
+    depth = np.zeros(_DEPTH + 2, np.int64)
+    for k in range(n):
+        stack[0, k] = coefficients[k]
     proved = attained
     top, nodes = 1, 0
-    left = np.empty(n)
-    right = np.empty(n)
     while top > 0:
         top -= 1
         nodes += 1
-        highest = stack[top].max()
-        if highest <= attained + tolerance or depth[top] >= _DEPTH or nodes >= _NODES:
-            if highest > proved:
-                proved = highest
+        highest = largest(stack[top])
+        if highest <= max(attained, floor) + tolerance or depth[top] >= _DEPTH or nodes >= _NODES:
+            proved = max(proved, highest)
             continue
         level, begin = depth[top] + 1, start[top]
         middle = begin + 0.5**level
-        split(stack[top].copy(), left, right)
-        if right[0] > attained:
-            attained, place = right[0], middle
-        # The half with the larger coefficients is looked at first: it raises `attained` sooner.
-        if left.max() > right.max():
-            stack[top], start[top] = right, middle
-            stack[top + 1], start[top + 1] = left, begin
-        else:
-            stack[top], start[top] = left, begin
-            stack[top + 1], start[top + 1] = right, middle
+        split(stack[top], stack[top + 1])
+        if stack[top, 0] > attained:
+            attained, place = stack[top, 0], middle
         depth[top] = depth[top + 1] = level
+        start[top], start[top + 1] = middle, begin
+        # The half with the larger coefficients is looked at first: it raises `attained` sooner.
+        if largest(stack[top]) > largest(stack[top + 1]):
+            for k in range(n):
+                stack[top, k], stack[top + 1, k] = stack[top + 1, k], stack[top, k]
+            start[top], start[top + 1] = begin, middle
         top += 2
     return attained, max(proved, attained) + margin, place
 
@@ -146,38 +179,79 @@ def bernstein_row(degree, s):
 
 
 @compiled
+def _add_product(a, b, sign, out):
+    """Add sign a b to `out`, which holds Bernstein coefficients times binomials."""
+    n, m = len(a), len(b)
+    for i in range(n):
+        scaled = sign * a[i] * _BINOMIALS[n - 1, i]
+        for k in range(m):
+            out[i + k] += scaled * (b[k] * _BINOMIALS[m - 1, k])
+
+
+@compiled
+def _divide_binomials(out):
+    n = len(out)
+    for i in range(n):
+        out[i] /= _BINOMIALS[n - 1, i]
+
+
+@compiled
 def product(a, b):
     """Bernstein coefficients of the product of two polynomials, shapes (n + 1,), (m + 1,) -> (n + m + 1,)."""
-    n, m = len(a), len(b)
-    scaled = b * _BINOMIALS[m - 1, :m]
-    out = np.zeros(n + m - 1)
-    for i in range(n):
-        out[i:i + m] += a[i] * _BINOMIALS[n - 1, i] * scaled
-    return out / _BINOMIALS[n + m - 2, :n + m - 1]
+    out = np.zeros(len(a) + len(b) - 1)
+    _add_product(a, b, 1.0, out)
+    _divide_binomials(out)
+    return out
 
 
 @compiled
 def derivative(coefficients, order):
     """Bernstein coefficients of the order-th derivative with respect to s, shape (n + 1,) -> (n + 1 - order,)."""
     out = coefficients.copy()
-    for _ in range(order):
-        out = (len(out) - 1) * (out[1:] - out[:-1])
+    n = len(out)
+    for k in range(order):
+        for i in range(n - 1 - k):
+            out[i] = (n - 1 - k) * (out[i + 1] - out[i])
+    return out[:n - order].copy()
+
+
+@compiled
+def time_derivative(coefficients, order, duration):
+    """Bernstein coefficients of the order-th time derivative of a segment, shape (3, n + 1) -> (3, n + 1 - order)."""
+    rows, n = coefficients.shape
+    work = np.empty(n)
+    out = np.empty((rows, n - order))
+    for d in range(rows):
+        for i in range(n):
+            work[i] = coefficients[d, i]
+        for k in range(order):
+            factor = (n - 1 - k) / duration
+            for i in range(n - 1 - k):
+                work[i] = factor * (work[i + 1] - work[i])
+        for i in range(n - order):
+            out[d, i] = work[i]
     return out
 
 
 @compiled
 def dot(a, b):
     """Bernstein coefficients of a . b for polynomial vectors, shapes (3, n + 1), (3, m + 1)."""
-    return product(a[0], b[0]) + product(a[1], b[1]) + product(a[2], b[2])
+    out = np.zeros(a.shape[1] + b.shape[1] - 1)
+    for d in range(3):
+        _add_product(a[d], b[d], 1.0, out)
+    _divide_binomials(out)
+    return out
 
 
 @compiled
 def cross(a, b):
     """Bernstein coefficients of a x b for polynomial vectors, shapes (3, n + 1), (3, m + 1) -> (3, n + m + 1)."""
-    out = np.empty((3, a.shape[1] + b.shape[1] - 1))
-    out[0] = product(a[1], b[2]) - product(a[2], b[1])
-    out[1] = product(a[2], b[0]) - product(a[0], b[2])
-    out[2] = product(a[0], b[1]) - product(a[1], b[0])
+    out = np.zeros((3, a.shape[1] + b.shape[1] - 1))
+    for d in range(3):
+        e, g = (d + 1) % 3, (d + 2) % 3
+        _add_product(a[e], b[g], 1.0, out[d])
+        _add_product(a[g], b[e], -1.0, out[d])
+        _divide_binomials(out[d])
     return out
 
 
@@ -195,9 +269,13 @@ def value(coefficients, s):
 def derivatives_at(coefficients, duration, s, count):
     """Time derivatives 0 to count - 1 of a segment at s, shapes (3, n + 1) -> (count, 3)."""
     out = np.empty((count, 3))
+    n = coefficients.shape[1]
+    work = np.empty(n)
     for d in range(3):
-        work = coefficients[d].copy()
+        for i in range(n):
+            work[i] = coefficients[d, i]
         for order in range(count):
-            out[order, d] = value(work, s)
-            work = (len(work) - 1) * (work[1:] - work[:-1]) / duration
+            out[order, d] = value(work[:n - order], s)
+            for i in range(n - 1 - order):
+                work[i] = (n - 1 - order) * (work[i + 1] - work[i]) / duration
     return out

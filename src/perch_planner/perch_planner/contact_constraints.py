@@ -61,8 +61,19 @@ def _rows(durations, times, tube_lower, tube_upper, window, window_lower, window
     for k in range(len(window)):
         r = 3 * count + k
         functional[r], lower[r], upper[r] = count, window_lower[k], window_upper[k]
-        direction[r] = window[k]
+        for d in range(3):
+            direction[r, d] = window[k, d]
     return segments, places, orders, functional, direction, lower, upper
+
+
+@compiled
+def _tube(end_acceleration, share, floor):
+    lower, upper = np.empty(3), np.empty(3)
+    for d in range(3):
+        near, far = (1.0 - share) * end_acceleration[d], (1.0 + share) * end_acceleration[d]
+        lower[d] = min(min(near, far), end_acceleration[d] - floor)
+        upper[d] = max(max(near, far), end_acceleration[d] + floor)
+    return lower, upper
 
 
 def tube_bounds(end_acceleration: np.ndarray, settings: PerchSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -71,11 +82,42 @@ def tube_bounds(end_acceleration: np.ndarray, settings: PerchSettings) -> tuple[
     The paper scales each component by (1 - q) and (1 + q): for a negative component that swaps the bounds, so they are
     sorted here; for a component near zero it leaves no room, so each axis has at least `tube_floor` on both sides.
     """
-    q = settings.tube_tolerance
-    near, far = (1.0 - q) * end_acceleration, (1.0 + q) * end_acceleration
-    lower = np.minimum(np.minimum(near, far), end_acceleration - settings.tube_floor)
-    upper = np.maximum(np.maximum(near, far), end_acceleration + settings.tube_floor)
-    return lower, upper
+    return _tube(end_acceleration, settings.tube_tolerance, settings.tube_floor)
+
+
+@compiled
+def _window(R_WS, velocity, least, most, tangential):
+    """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [M:eq14]"""
+    count = 1 + len(_OCTAGON)
+    directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
+    for k in range(count):
+        shift = 0.0
+        for d in range(3):
+            if k == 0:
+                directions[k, d] = -R_WS[d, 2]
+            else:
+                directions[k, d] = _OCTAGON[k - 1, 0] * R_WS[d, 0] + _OCTAGON[k - 1, 1] * R_WS[d, 1]
+            shift += directions[k, d] * velocity[d]
+        lower[k] = shift + (least if k == 0 else -tangential)
+        upper[k] = shift + (most if k == 0 else tangential)
+    return directions, lower, upper
+
+
+@compiled
+def _knots(durations, given, values, p_contact, velocity):
+    """What is given at the knots; those between the last waypoint and contact are free."""
+    f, last = len(durations), len(given) - 1
+    out, at = np.zeros((f + 1, 4), np.bool_), np.zeros((f + 1, 4, 3))
+    for i in range(last + 1):
+        to = i if i < last else f
+        for k in range(4):
+            out[to, k] = given[i, k]
+            for d in range(3):
+                at[to, k, d] = values[i, k, d]
+    duration = durations.sum()
+    for d in range(3):
+        at[f, 0, d] = p_contact[d] + velocity[d] * duration
+    return out, at
 
 
 def tube_times(duration: float, settings: PerchSettings) -> np.ndarray:
@@ -97,39 +139,36 @@ class Contact:
         self._values = np.zeros((knots, 4, 3))
         start = problem.start
         self._given[0], self._values[0] = True, (start.p, start.v, start.a, start.j)
+        self._complete = []  # waypoints at which everything is given
         for k, waypoint in enumerate(problem.waypoints, start=1):
-            for order, value in enumerate((waypoint.p, waypoint.v, waypoint.a, waypoint.j)):
+            at = (waypoint.p, waypoint.v, waypoint.a, waypoint.j)
+            for order, value in enumerate(at):
                 if value is not None:
                     self._given[k, order], self._values[k, order] = True, value
+            if all(value is not None for value in at):
+                self._complete.append(k)
         self._given[-1] = (True, False, True, False)
         self._values[-1, 2] = self.acceleration
 
         lower, upper = tube_bounds(self.acceleration, settings)
         self._tube_lower, self._tube_upper = lower + INSET, upper - INSET
         self._tube_times = tube_times(0.0, settings)
-        self._window = np.concatenate([-surface.normal[None], _OCTAGON @ surface.R_WS[:, :2].T])
         tangential = settings.tangential_speed_max * cos(pi / (2 * _FACETS)) - INSET
         least, most = settings.impact_speed_min + INSET, settings.impact_speed_max - INSET
         if least > most:
             least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
-        shift = self._window @ self.velocity
-        self._window_lower = np.array([least] + _FACETS * [-tangential]) + shift
-        self._window_upper = np.array([most] + _FACETS * [tangential]) + shift
+        self._window = _window(surface.R_WS, self.velocity, least, most, tangential)
 
     def knots(self, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]
 
         Where there are more durations than segments of the problem, nothing is given at the knots between the last
         waypoint and contact.
+
+        Returns:
+            given, bool, shape (f + 1, 4), and values, shape (f + 1, 4, 3).
         """
-        extra = len(durations) + 1 - len(self._given)
-        given = np.zeros((len(durations) + 1, 4), bool)
-        values = np.zeros((len(durations) + 1, 4, 3))
-        last = len(self._given) - 1
-        given[:last], given[last + extra] = self._given[:last], self._given[last]
-        values[:last], values[last + extra] = self._values[:last], self._values[last]
-        values[-1, 0] = self.p_contact + self.velocity * durations.sum()
-        return given, values
+        return _knots(durations, self._given, self._values, self.p_contact, self.velocity)
 
     def constraints(self, durations: np.ndarray) -> LinearConstraints:
         """Tube and impact window for these durations. [M:eq14, M:eq15]
@@ -138,14 +177,15 @@ class Contact:
         velocities are relative to the surface.
         """
         times = float(durations.sum()) + self._tube_times
-        return LinearConstraints(*_rows(durations, times, self._tube_lower, self._tube_upper, self._window,
-                                        self._window_lower, self._window_upper))
+        return LinearConstraints(*_rows(durations, times, self._tube_lower, self._tube_upper, *self._window))
 
     def bubbles(self, durations: np.ndarray, constraints: LinearConstraints, everywhere: bool) -> np.ndarray:
         """Segments with bubbles: those of the tube, and those after a knot whose derivatives are all given."""
         if everywhere:
             return np.ones(len(durations), bool)
-        out = np.arange(len(durations)) >= constraints.segments.min()
-        out[1:len(self._given) - 1] |= self._given[1:-1].all(axis=1)
+        out = np.zeros(len(durations), bool)
+        out[constraints.segments[0]:] = True
+        for k in self._complete:
+            out[k] = True
         return out
 

@@ -7,28 +7,69 @@ convex; their cuts are a choice of side. No plan is believed because of its cuts
 
 from __future__ import annotations
 
+from math import cos, sin
+
 import numpy as np
 
+from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import derivatives_at
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
-from perch_planner.problem import Limits, PerchProblem, contact_heading
+from perch_planner.problem import Limits, PerchProblem
 from perch_planner.rotor_thrusts import linear_bounds
-from perch_planner.segment_program import Cut
+from perch_planner.segment_program import Bounds
 
-_UP = np.array([0.0, 0.0, 1.0])
-_G = GRAVITY * _UP
-_INF = float("inf")
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
 _KEEP_AHEAD = 0.985  # of the limit, for cuts that are set ahead
 _PREVENTED = ((-1, 0.6), (-1, 0.8), (0, 0.0), (0, 0.15))  # segments from the last, places
-_LEAN = (0.980, 0.199)  # the thrust leans 11 degrees back where it is greatest
+_LEANS = ((1.0, 0.0), (0.980, 0.199))  # the thrust is upright or leans 11 degrees back where it is greatest
 _RAISE = 1.02       # cuts of the thrust from below
 _HEIGHT_ROOM = 2e-3  # [m]
 
 
+@compiled
+def _empty(terms, rows):
+    """Arrays of `Bounds`, without bounds yet: one term of weight zero each."""
+    return (np.zeros(terms, np.int64), np.zeros(terms, np.int64), np.zeros(terms), np.full(terms, 2), np.zeros((terms, 3)),
+            np.full(rows, -np.inf), np.full(rows, np.inf))
+
+
+@compiled
+def _specific_force(coefficients, duration, place):
+    """f = a + g e3 at one place of a segment as three floats, and its length [m/s^2]."""
+    f = derivatives_at(coefficients, duration, place, 3)[2]
+    f_z = f[2] + GRAVITY
+    return f[0], f[1], f_z, np.sqrt(f[0] * f[0] + f[1] * f[1] + f_z * f_z)
+
+
+@compiled
+def _thrust_cuts(coefficients, durations, extrema, low, high, side):
+    count = 0
+    for i in range(len(durations)):
+        count += (extrema[i, 4] > high) + (extrema[i, 1] < low)
+    owner, segments, places, orders, direction, lower, upper = _empty(count, count)
+    r = 0
+    for i in range(len(durations)):
+        if extrema[i, 4] > high:
+            x, y, z, norm = _specific_force(coefficients[i], durations[i], extrema[i, 5])
+            owner[r], segments[r], places[r] = r, i, extrema[i, 5]
+            direction[r, 0], direction[r, 1], direction[r, 2] = x / norm, y / norm, z / norm
+            upper[r] = _KEEP * high - direction[r, 2] * GRAVITY
+            r += 1
+        if extrema[i, 1] < low:
+            x, y, z, norm = _specific_force(coefficients[i], durations[i], extrema[i, 2])
+            owner[r], segments[r], places[r] = r, i, extrema[i, 2]
+            if norm > 0.5 * low:
+                direction[r, 0], direction[r, 1], direction[r, 2] = x / norm, y / norm, z / norm
+            else:
+                direction[r, 0], direction[r, 1], direction[r, 2] = side[0], side[1], side[2]
+            lower[r] = _RAISE * low - direction[r, 2] * GRAVITY
+            r += 1
+    return owner, segments, places, orders, direction, lower, upper
+
+
 def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.ndarray, low: float, high: float,
-                side: np.ndarray) -> list[Cut]:
+                side: np.ndarray) -> Bounds:
     """Cuts where the specific thrust leaves [low, high]. [M:eq16]
 
     Args:
@@ -38,47 +79,95 @@ def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.nda
         low, high: limits of the specific thrust [m/s^2].
         side: unit vector over which the thrust turns where it nearly vanishes, shape (3,).
     """
-    cuts = []
-    for i, (_, least, least_at, _, most, most_at) in enumerate(extrema.tolist()):
-        if most > high:
-            f = derivatives_at(coefficients[i], durations[i], most_at, 3)[2] + _G
-            n = f / np.sqrt(f @ f)
-            cuts.append(Cut(i, most_at, ((2, n),), -_INF, _KEEP * high - float(n @ _G)))
-        if least < low:
-            f = derivatives_at(coefficients[i], durations[i], least_at, 3)[2] + _G
-            norm = np.sqrt(f @ f)
-            n = f / norm if norm > 0.5 * low else side
-            cuts.append(Cut(i, least_at, ((2, n),), _RAISE * low - float(n @ _G), _INF))
-    return cuts
+    return Bounds(*_thrust_cuts(coefficients, durations, extrema, low, high, side))
 
 
-def preventive_cuts(durations: np.ndarray, high: float, side: np.ndarray) -> list[Cut]:
+@compiled
+def _preventive_cuts(count, high, side):
+    places = len(_PREVENTED) if count > 1 else 2
+    owner, segments, at, orders, direction, lower, upper = _empty(2 * places, 2 * places)
+    r = 0
+    for segment, place in _PREVENTED:
+        if count - 1 + segment < 0:
+            continue
+        for up, back in _LEANS:
+            owner[r], segments[r], at[r] = r, count - 1 + segment, place
+            for d in range(3):
+                direction[r, d] = back * side[d]
+            direction[r, 2] += up
+            upper[r] = _KEEP_AHEAD * high - direction[r, 2] * GRAVITY
+            r += 1
+    return owner, segments, at, orders, direction, lower, upper
+
+
+def preventive_cuts(count: int, high: float, side: np.ndarray) -> Bounds:
     """Upper thrust bounds where a perch nearly always meets them, before the first program is solved. [M:eq16]
 
     They hold for every plan that keeps the bound, whatever the direction, and save one round in most plans.
 
     Args:
-        durations: shape (f,) [s].
+        count: number of segments.
         high: limit of the specific thrust [m/s^2].
         side: of `turning_side`, shape (3,).
     """
-    last = len(durations) - 1
-    cuts = []
-    for segment, place in _PREVENTED:
-        for direction in (_UP, _LEAN[0] * _UP + _LEAN[1] * side):
-            if last + segment >= 0:
-                cuts.append(Cut(last + segment, place, ((2, direction),), -_INF, _KEEP_AHEAD * high - float(direction @ _G)))
-    return cuts
+    return Bounds(*_preventive_cuts(count, high, side))
 
 
-def turning_side(problem: PerchProblem) -> np.ndarray:
-    """Direction over which the thrust turns from up to s3: against the heading of the approach, shape (3,)."""
-    heading = contact_heading(problem.surface)
-    return np.array([-np.cos(heading), -np.sin(heading), 0.0])
+def turning_side(heading: float) -> np.ndarray:
+    """Direction over which the thrust turns from up to s3: against the heading of the approach [rad], shape (3,)."""
+    return np.array([-cos(heading), -sin(heading), 0.0])
+
+
+@compiled
+def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
+    owner, segments, places, orders, direction, lower, upper = _empty(5, 4)
+    t = r = 0
+    for row in (SPEED, HEIGHT, CLEARANCE, BODY_RATE):
+        if where[row, 0] < 0.0:
+            continue
+        i, s = int(where[row, 0]), where[row, 1]
+        x = derivatives_at(coefficients[i], durations[i], s, 4)
+        owner[t], segments[t], places[t] = r, i, s
+        if row == SPEED:
+            v = x[1]
+            orders[t], upper[r] = 1, _KEEP * speed
+            norm = np.sqrt((v * v).sum())
+            for d in range(3):
+                direction[t, d] = v[d] / norm
+        elif row == HEIGHT:
+            orders[t], direction[t, 2] = 0, 1.0
+            lower[r], upper[r] = low_height + _HEIGHT_ROOM, high_height - _HEIGHT_ROOM
+        else:
+            f, j = x[2], x[3]
+            f[2] += GRAVITY
+            squared = max((f * f).sum(), 1e-9)
+            if row == CLEARANCE:
+                # The rim's distance at the present tilt: right to first order where the tilt does not change.
+                tilt = np.sqrt(max(1.0 - (f * s3).sum() ** 2 / squared, 0.0))
+                time = durations[:i].sum() + s * durations[i]
+                orders[t] = 0
+                lower[r] = (s3 * p_S).sum() + time * (s3 * v_S).sum() + 1.1 * extension * tilt + _HEIGHT_ROOM
+                for d in range(3):
+                    direction[t, d] = s3[d]
+            else:
+                # |j across f| <= W |f|, linear in both at the present directions.
+                share, norm, along = 0.95 * rate, np.sqrt(squared), (f * j).sum() / squared
+                across = np.sqrt(((j - along * f) ** 2).sum())
+                if across <= 1e-6:
+                    continue
+                owner[t + 1], segments[t + 1], places[t + 1] = r, i, s
+                orders[t] = 3
+                upper[r] = share * f[2] / norm * GRAVITY
+                for d in range(3):
+                    direction[t, d] = (j[d] - along * f[d]) / across
+                    direction[t + 1, d] = -share * f[d] / norm
+                t += 1
+        t, r = t + 1, r + 1
+    return owner[:t], segments[:t], places[:t], orders[:t], direction[:t], lower[:r], upper[:r]
 
 
 def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarray, problem: PerchProblem,
-               limits: Limits) -> list[Cut]:
+               limits: Limits) -> Bounds:
     """Cuts where speed, height, clearance or body rate could not be proved.
 
     Args:
@@ -86,19 +175,13 @@ def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarra
         coefficients, durations: the plan.
         problem, limits: what was asked.
     """
-    cuts = []
-    for row, (i, s) in enumerate(where.tolist()):
-        if i < 0.0 or row not in _LIMIT_CUTS:
-            continue
-        segment = int(i)
-        derivatives = derivatives_at(coefficients[segment], durations[segment], s, 4)
-        t = float(durations[:segment].sum() + s * durations[segment])
-        cuts += [Cut(segment, s, *bound) for bound in _LIMIT_CUTS[row](derivatives, t, problem, limits)]
-    return cuts
+    surface = problem.surface
+    return Bounds(*_limit_cuts(where, coefficients, durations, surface.p_WS, problem.target_velocity, surface.normal.copy(),
+                               *limits.height, limits.speed, limits.body_rate, limits.extension))
 
 
 def rotor_bounds(thrusts: tuple[np.ndarray, np.ndarray], coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray,
-                 low: float, high: float, rotors: tuple) -> list[Cut]:
+                 low: float, high: float, rotors: tuple) -> Bounds:
     """Bounds where a rotor's thrust leaves [low, high] [N] or is near to it: linear at the present plan, and good near it.
 
     Args:
@@ -106,39 +189,7 @@ def rotor_bounds(thrusts: tuple[np.ndarray, np.ndarray], coefficients: np.ndarra
         coefficients, yaw, durations: the plan.
         rotors: of `rotor_thrusts.rotor_model`.
     """
-    where, gradients, bounds = linear_bounds(*thrusts, coefficients, yaw, durations, low, high, *rotors)
-    return [Cut(int(i), s, ((2, g[0]), (3, g[1]), (4, g[2])), lower, upper)
-            for (i, s), g, (lower, upper) in zip(where.tolist(), gradients, bounds.tolist())]
-
-
-def _speed_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
-    v = derivatives[1]
-    yield ((1, v / np.sqrt(v @ v)),), -_INF, _KEEP * limits.speed
-
-
-def _height_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
-    low, high = limits.height
-    yield ((0, _UP),), low + _HEIGHT_ROOM, high - _HEIGHT_ROOM
-
-
-def _clearance_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
-    """The rim's distance at the present tilt: right to first order where the tilt does not change."""
-    s3, f = problem.surface.normal, derivatives[2] + _G
-    tilt = np.sqrt(max(1.0 - float(f @ s3) ** 2 / max(float(f @ f), 1e-9), 0.0))
-    plane = float(s3 @ (problem.surface.p_WS + problem.target_velocity * t))
-    yield ((0, s3),), plane + 1.1 * limits.extension * tilt + _HEIGHT_ROOM, _INF
-
-
-def _rate_cut(derivatives, t: float, problem: PerchProblem, limits: Limits):
-    """|j across f| <= W |f|, linear in both at the present directions."""
-    f, j = derivatives[2] + _G, derivatives[3]
-    norm = max(np.sqrt(f @ f), 1e-9)
-    n = f / norm
-    across = j - n * (n @ j)
-    size = np.sqrt(across @ across)
-    if size > 1e-6:
-        share = 0.95 * limits.body_rate
-        yield ((3, across / size), (2, -share * n)), -_INF, share * float(n @ _G)
-
-
-_LIMIT_CUTS = {SPEED: _speed_cut, HEIGHT: _height_cut, CLEARANCE: _clearance_cut, BODY_RATE: _rate_cut}
+    segments, places, gradients, lower, upper = linear_bounds(*thrusts, coefficients, yaw, durations, low, high, *rotors)
+    count = len(lower)
+    return Bounds(np.repeat(np.arange(count), 3), np.repeat(segments, 3), np.repeat(places, 3), np.tile((2, 3, 4), count),
+                  gradients.reshape(-1, 3), lower, upper)

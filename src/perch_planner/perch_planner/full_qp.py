@@ -81,18 +81,20 @@ class FullProgram:
         row[segment * _SIZE:(segment + 1) * _SIZE] = _row(order, s, self._durations[segment])
         return row
 
-    def bound(self, segment: int, place: float, terms, lower: float, upper: float) -> None:
-        """Add `lower <= sum of direction . derivative <= upper`, scaled to unit length; terms as in `Cut`."""
-        self._bounds.append(self._scaled(segment, place, terms, lower, upper))
+    def bound(self, bounds) -> None:
+        """Add `lower <= sum of direction . derivative <= upper`, scaled to unit length; fields as in `Bounds`."""
+        self._bounds += self._scaled(*bounds)
 
     def replace(self, bounds) -> None:
-        """Set the bounds near the present plan, each the arguments of `bound`."""
-        self._local = [self._scaled(*bound) for bound in bounds]
+        """Set the bounds near the present plan; fields as in `Bounds`."""
+        self._local = self._scaled(*bounds)
 
-    def _scaled(self, segment: int, place: float, terms, lower: float, upper: float) -> tuple[np.ndarray, float, float]:
-        row = sum(np.kron(direction, self._place(int(segment), float(place), int(order))) for order, direction in terms)
-        norm = np.linalg.norm(row)
-        return row / norm, lower / norm, upper / norm
+    def _scaled(self, owner, segments, places, orders, direction, lower, upper) -> list[tuple[np.ndarray, float, float]]:
+        rows = np.zeros((len(lower), 3 * self._count))
+        for q, r in enumerate(owner):
+            rows[r] += np.kron(direction[q], self._place(segments[q], float(places[q]), int(orders[q])))
+        norms = np.linalg.norm(rows, axis=1)
+        return list(zip(rows / norms[:, None], lower / norms, upper / norms))
 
     def solve(self, solver: str) -> tuple[np.ndarray, Solution]:
         """Coefficients, shape (f, 3, 15), and the answer; solved only where every row holds to 1e-6."""

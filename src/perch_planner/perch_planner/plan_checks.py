@@ -10,7 +10,18 @@ from perch_core import bernstein
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
-from perch_planner.bounds import BELOW, VIOLATED, cross, derivative, dot, maximum, product, stays_below
+from perch_planner.bounds import (
+    BELOW,
+    VIOLATED,
+    cross,
+    dot,
+    magnitude,
+    maximum,
+    product,
+    smallest,
+    stays_below,
+    time_derivative,
+)
 
 THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE, ROTOR_THRUST = range(6)
 """Rows of the results; thrust is the specific thrust |a + g e3|. `check` gives the first five, which are proved."""
@@ -21,7 +32,7 @@ MINIMUM, MINIMUM_AT, MAXIMUM, MAXIMUM_AT, HOLDS = range(5)
 """Columns of the results: proved bounds, the times of the samples nearest to them, and whether the limits hold."""
 
 _PLACES = np.linspace(0.0, 1.0, 13)  # where clearance and rate are sampled
-_AT11, _AT12, _AT13, _AT14 = (np.ascontiguousarray(bernstein.basis(n, _PLACES).T) for n in (11, 12, 13, 14))
+_AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES) for n in (11, 12, 13, 14))
 
 _RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
 _RATE_ROUNDS = 8
@@ -32,20 +43,22 @@ _CLEARANCE_SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contac
 @compiled
 def specific_force(coefficients, duration):
     """f = a + g e3 of a segment, Bernstein coefficients of degree 12, shape (3, 15) -> (3, 13) [m/s^2]."""
-    force = np.empty((3, 13))
-    for d in range(3):
-        force[d] = derivative(coefficients[d], 2) / duration**2
-    force[2] += GRAVITY
+    force = time_derivative(coefficients, 2, duration)
+    for k in range(force.shape[1]):
+        force[2, k] += GRAVITY
     return force
 
 
 @compiled
-def _enclose(coefficients, limit):
-    """Attained maximum, proved maximum and place; finer where the limit lies between the two."""
-    scale = np.abs(coefficients).max()
-    attained, proved, place = maximum(coefficients, _RELATIVE * scale)
+def _enclose(coefficients, limit, attained_elsewhere):
+    """Attained maximum, proved maximum and place, as far as they exceed the limit or what another segment attains.
+
+    Finer where the limit lies between the two.
+    """
+    scale, floor = magnitude(coefficients), min(attained_elsewhere, limit)
+    attained, proved, place = maximum(coefficients, _RELATIVE * scale, floor)
     if attained <= limit < proved:
-        attained, proved, place = maximum(coefficients, _FINE * scale)
+        attained, proved, place = maximum(coefficients, _FINE * scale, floor)
     return attained, proved, place
 
 
@@ -53,23 +66,38 @@ def _enclose(coefficients, limit):
 def thrust_extrema(coefficients, durations, low, high):
     """Least and greatest specific thrust of each segment. [M:eq9, M:eq16]
 
+    A segment's extrema are enclosed closely where they break a limit or are those of the whole plan; other segments have
+    bounds that are proved, but looser.
+
     Args:
         coefficients: shape (f, 3, 15) [m].
         durations: shape (f,) [s].
         low, high: limits of the specific thrust [m/s^2].
 
     Returns:
-        Shape (f, 6): attained minimum, proved minimum, place, attained maximum, proved maximum, place [m/s^2].
+        (extrema, least, most): extrema, shape (f, 6): attained minimum, proved minimum, place, attained maximum, proved
+        maximum, place; proved minimum and maximum of the whole plan [m/s^2].
     """
-    out = np.empty((len(durations), 6))
-    for i in range(len(durations)):
+    f = len(durations)
+    out = np.empty((f, 6))
+    squared, negative = np.empty((f, 25)), np.empty((f, 25))
+    least, most = -np.inf, -np.inf  # attained, of -|f|^2 and |f|^2
+    for i in range(f):
         force = specific_force(coefficients[i], durations[i])
-        squared = dot(force, force)
-        attained, proved, place = _enclose(-squared, -low * low)
+        row = dot(force, force)
+        for k in range(25):
+            squared[i, k], negative[i, k] = row[k], -row[k]
+        least, most = max(least, max(-row[0], -row[24])), max(most, max(row[0], row[24]))
+    proved_least, proved_most = np.inf, -np.inf
+    for i in range(f):
+        attained, proved, place = _enclose(negative[i], -low * low, least)
+        least = max(least, attained)
         out[i, 0], out[i, 1], out[i, 2] = sqrt(max(-attained, 0.0)), sqrt(max(-proved, 0.0)), place
-        attained, proved, place = _enclose(squared, high * high)
+        attained, proved, place = _enclose(squared[i], high * high, most)
+        most = max(most, attained)
         out[i, 3], out[i, 4], out[i, 5] = sqrt(attained), sqrt(proved), place
-    return out
+        proved_least, proved_most = min(proved_least, out[i, 1]), max(proved_most, out[i, 4])
+    return out, proved_least, proved_most
 
 
 @compiled
@@ -94,34 +122,48 @@ def _rim_clears(distance, force, s3, extension, gap):
     verdict, place = stays_below(-reduced, _CLEARANCE_SLACK)
     if verdict != BELOW:
         return False, place
-    normal = np.empty((3, 1))
-    normal[:, 0] = s3
-    tilt = cross(force, normal)
+    tilt = cross(force, s3.reshape((3, 1)))
     far = product(product(reduced, reduced), dot(force, force))
-    near = product(extension**2 * dot(tilt, tilt), np.ones(len(far) - 24))
-    verdict, place = stays_below(near - far, _CLEARANCE_SLACK)
+    near = product(dot(tilt, tilt), np.ones(len(far) - 24))
+    for k in range(len(far)):
+        near[k] = extension * extension * near[k] - far[k]
+    verdict, place = stays_below(near, _CLEARANCE_SLACK)
     return verdict == BELOW, place
 
 
 @compiled
+def _values(coefficients, basis):
+    """Values of several polynomials at the places of a table, shapes (r, n + 1), (places, n + 1) -> (places, r)."""
+    out = np.zeros((basis.shape[0], coefficients.shape[0]))
+    for k in range(basis.shape[0]):
+        for d in range(coefficients.shape[0]):
+            for i in range(coefficients.shape[1]):
+                out[k, d] += basis[k, i] * coefficients[d, i]
+    return out
+
+
+@compiled
 def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
-    """Least clearance and greatest body rate over fixed places of a segment: (gap, place, rate, place)."""
+    """Least clearance and greatest body rate over fixed places of a segment: (gap, place, rate, place).
+
+    Arrays are Bernstein coefficients with one row for each polynomial.
+    """
     gap, gap_at, rate, rate_at_ = np.inf, 0.0, 0.0, 0.0
-    f, j = force @ _AT12, jerk @ _AT11
-    dist, heading, turn = distance @ _AT14, yaw @ _AT14, yaw_rate @ _AT13
-    count = _AT14.shape[1]
+    f, j = _values(force, _AT12), _values(jerk, _AT11)
+    dist, heading, turn = _values(distance, _AT14), _values(yaw, _AT14), _values(yaw_rate, _AT13)
+    count = len(_AT14)
     for k in range(count):
-        f_x, f_y, f_z, j_x, j_y, j_z = f[0, k], f[1, k], f[2, k], j[0, k], j[1, k], j[2, k]
+        f_x, f_y, f_z, j_x, j_y, j_z = f[k, 0], f[k, 1], f[k, 2], j[k, 0], j[k, 1], j[k, 2]
         f2 = max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12)
         along = f_x * s3[0] + f_y * s3[1] + f_z * s3[2]
-        here = dist[k] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
+        here = dist[k, 0] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
         if here < gap:
             gap, gap_at = here, k / (count - 1)
         x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
-        d_x, d_y = -sin(heading[k]), cos(heading[k])
+        d_x, d_y = -sin(heading[k, 0]), cos(heading[k, 0])
         lean = d_x * f_x + d_y * f_y
         across = max(f2 - lean * lean, 1e-12)
-        spin = (turn[k] * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
+        spin = (turn[k, 0] * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
         here = (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
         if here > rate:
             rate, rate_at_ = here, k / (count - 1)
@@ -129,11 +171,20 @@ def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
 
 
 @compiled
-def _widen(out, row, minimum, at_minimum, maximum_, at_maximum):
-    if minimum < out[row, 0]:
-        out[row, 0], out[row, 1] = minimum, at_minimum
-    if maximum_ > out[row, 2]:
-        out[row, 2], out[row, 3] = maximum_, at_maximum
+def _widen(out, attained, row, column, value, proved, time):
+    """Take up a segment's attained and proved extremum; column MINIMUM or MAXIMUM."""
+    sign = 1.0 if column == MAXIMUM else -1.0
+    if sign * proved > sign * out[row, column]:
+        out[row, column] = proved
+    if sign * value > sign * attained[row, column]:
+        attained[row, column], out[row, column + 1] = value, time
+
+
+@compiled
+def _doubt(where, row, segment, place):
+    """Note the first place at which a quantity fails."""
+    if where[row, 0] < 0.0:
+        where[row, 0], where[row, 1] = segment, place
 
 
 @compiled
@@ -155,56 +206,65 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
         rate: limit of |omega| [rad/s].
 
     Returns:
-        (results, where): results, shape (5, 5), rows and columns as named above; where, shape (5, 2): segment and
-        place of the first doubt of each quantity, segment -1 where there is none.
+        (results, where, holds): results, shape (5, 5), rows and columns as named above; where, shape (5, 2): segment and
+        place of the first doubt of each quantity, segment -1 where there is none; whether all limits hold.
     """
     f = len(durations)
-    out = np.zeros((5, 5))
-    out[:, 0], out[:, 2] = np.inf, -np.inf
-    out[:, 4] = 1.0
-    where = np.full((5, 2), -1.0)
+    out, where = np.empty((5, 5)), np.empty((5, 2))
+    for row in range(5):
+        out[row, 0], out[row, 1], out[row, 2], out[row, 3], out[row, 4] = np.inf, 0.0, -np.inf, 0.0, 1.0
+        where[row, 0], where[row, 1] = -1.0, -1.0
+    attained = out.copy()
     gap_wanted, rate_wanted = np.inf, 1e-3
     begin = 0.0
     coarse = np.empty(f)
+    down = np.empty((1, 15))
     for i in range(f):
         T, c = durations[i], coefficients[i]
-        _widen(out, 0, thrust[i, 1], begin + T * thrust[i, 2], thrust[i, 4], begin + T * thrust[i, 5])
-        velocity = np.empty((3, 14))
-        for d in range(3):
-            velocity[d] = derivative(c[d], 1) / T
-        attained, proved, place = _enclose(dot(velocity, velocity), speed * speed)
-        _widen(out, 1, 0.0, 0.0, sqrt(max(proved, 0.0)), begin + T * place)
-        if proved > speed * speed and where[1, 0] < 0.0:
-            where[1, 0], where[1, 1] = i, place
-        attained, proved, place = _enclose(-c[2], -low_height)
-        if -proved < low_height and where[2, 0] < 0.0:
-            where[2, 0], where[2, 1] = i, place
-        attained2, proved2, place2 = _enclose(c[2], high_height)
-        if proved2 > high_height and where[2, 0] < 0.0:
-            where[2, 0], where[2, 1] = i, place2
-        _widen(out, 2, -proved, begin + T * place, proved2, begin + T * place2)
-        force = specific_force(c, T)
-        distance = surface_distance(c, T, begin, p_S, v_S, s3)
-        jerk = np.empty((3, 12))
-        for d in range(3):
-            jerk[d] = derivative(c[d], 3) / T**3
-        gap, gap_at, sampled, rate_at_ = _sample(distance, force, jerk, yaw[i], derivative(yaw[i], 1) / T, s3, extension)
+        _widen(out, attained, THRUST, MINIMUM, thrust[i, 0], thrust[i, 1], begin + T * thrust[i, 2])
+        _widen(out, attained, THRUST, MAXIMUM, thrust[i, 3], thrust[i, 4], begin + T * thrust[i, 5])
+        if thrust[i, 1] < low_thrust:
+            _doubt(where, THRUST, i, thrust[i, 2])
+        if thrust[i, 4] > high_thrust:
+            _doubt(where, THRUST, i, thrust[i, 5])
+
+        velocity = time_derivative(c, 1, T)
+        reached = max(attained[SPEED, MAXIMUM], 0.0)
+        here, proved, place = _enclose(dot(velocity, velocity), speed * speed, reached * reached)
+        _widen(out, attained, SPEED, MAXIMUM, sqrt(max(here, 0.0)), sqrt(max(proved, 0.0)), begin + T * place)
+        if proved > speed * speed:
+            _doubt(where, SPEED, i, place)
+
+        for k in range(15):
+            down[0, k] = -c[2, k]
+        here, proved, place = _enclose(down[0], -low_height, -attained[HEIGHT, MINIMUM])
+        _widen(out, attained, HEIGHT, MINIMUM, -here, -proved, begin + T * place)
+        if -proved < low_height:
+            _doubt(where, HEIGHT, i, place)
+        here, proved, place = _enclose(c[2], high_height, attained[HEIGHT, MAXIMUM])
+        _widen(out, attained, HEIGHT, MAXIMUM, here, proved, begin + T * place)
+        if proved > high_height:
+            _doubt(where, HEIGHT, i, place)
+
+        force, jerk = specific_force(c, T), time_derivative(c, 3, T)
+        distance, heading = surface_distance(c, T, begin, p_S, v_S, s3), yaw[i:i + 1]
+        gap, gap_at, rate_here, rate_at_ = _sample(distance.reshape((1, 15)), force, jerk, heading,
+                                                   time_derivative(heading, 1, T), s3, extension)
         if gap < gap_wanted:
-            gap_wanted, out[3, 1] = gap, begin + T * gap_at
+            gap_wanted, out[CLEARANCE, MINIMUM_AT] = gap, begin + T * gap_at
         coarse[i] = rate_coarse_bound(force, jerk, yaw[i], T)
-        if sampled > rate_wanted:
-            rate_wanted, out[4, 3] = sampled, begin + T * rate_at_
-        if thrust[i, 1] < low_thrust and where[0, 0] < 0.0:
-            where[0, 0], where[0, 1] = i, thrust[i, 2]
-        if thrust[i, 4] > high_thrust and where[0, 0] < 0.0:
-            where[0, 0], where[0, 1] = i, thrust[i, 5]
+        if rate_here > rate_wanted:
+            rate_wanted, out[BODY_RATE, MAXIMUM_AT] = rate_here, begin + T * rate_at_
         begin += T
+    out[SPEED, MINIMUM] = 0.0
     _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, clearance, gap_wanted)
     _prove_rate(out, where, coefficients, yaw, durations, coarse, rate, rate_wanted)
+    holds = True
     for k in range(5):
         if where[k, 0] >= 0.0:
-            out[k, 4] = 0.0
-    return out, where
+            out[k, HOLDS] = 0.0
+            holds = False
+    return out, where, holds
 
 
 @compiled
@@ -217,7 +277,7 @@ def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extensio
         begin, failed, place = 0.0, -1, 0.0
         for i in range(len(durations)):
             distance = surface_distance(coefficients[i], durations[i], begin, p_S, v_S, s3)
-            clears = distance.min() > gap + extension
+            clears = smallest(distance) > gap + extension
             if not clears:
                 clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
             if not clears:
@@ -247,10 +307,8 @@ def _prove_rate(out, where, coefficients, yaw, durations, coarse, limit, sampled
             if coarse[i] < bound:
                 continue
             if not known[i]:
-                jerk = np.empty((3, 12))
-                for d in range(3):
-                    jerk[d] = derivative(coefficients[i, d], 3) / durations[i]**3
-                parts[i] = rate_parts(specific_force(coefficients[i], durations[i]), jerk, yaw[i], durations[i])
+                T = durations[i]
+                parts[i] = rate_parts(specific_force(coefficients[i], T), time_derivative(coefficients[i], 3, T), yaw[i], T)
                 known[i] = True
             verdict, place = rate_stays_below(parts[i], bound)
             if verdict != BELOW:
@@ -264,6 +322,9 @@ def _prove_rate(out, where, coefficients, yaw, durations, coarse, limit, sampled
             return
         if verdict == VIOLATED:
             attained = max(attained, rate_at(parts[failed], place))
-            out[4, 3] = durations[:failed].sum() + place * durations[failed]
+            begin = 0.0
+            for i in range(failed):
+                begin += durations[i]
+            out[4, 3] = begin + place * durations[failed]
         else:
             slack *= 1.1

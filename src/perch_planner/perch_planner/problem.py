@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import atan2, hypot
 
 import numpy as np
 
@@ -225,6 +226,6 @@ def contact_heading(surface: PerchSurface) -> float:
     On a pad that is turned so far that s2 points up or down, the heading of the approach, -s3, counts instead.
     """
     s2, s3 = surface.R_WS[:, 1], surface.normal
-    if np.hypot(s2[0], s2[1]) > 0.5:
-        return float(np.arctan2(-s2[0], s2[1]))
-    return float(np.arctan2(-s3[1], -s3[0]))
+    if hypot(s2[0], s2[1]) > 0.5:
+        return atan2(-s2[0], s2[1])
+    return atan2(-s3[1], -s3[0])

@@ -7,7 +7,8 @@ the Cholesky factor L of its cost, y = L^-T (w0 + w), the program reads
 
     minimise |w|^2   subject to   lower <= rows @ w <= upper,
 
-with one w of `size` entries per dimension, stacked. `docs/planner.md` derives it line by line.
+with one w of `size` entries per dimension, stacked. `docs/planner.md` derives it line by line. Kernels are plain loops:
+on matrices this small they are as fast as array expressions, and numba compiles them several times faster.
 """
 
 from __future__ import annotations
@@ -20,217 +21,280 @@ from perch_core.jit import compiled
 from perch_planner.bounds import bernstein_row
 from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, GRAMS, HERMITE, TABLES
 
+_POSITIONS = TABLES[0].T.copy()
+
 
 class ReducedProgram(NamedTuple):
-    """The whitened program and what turns its solution back into coefficients.
+    """Coordinates w in which every equality holds and the cost is |w|^2: unknowns = centre + spread' w.
 
     Attributes:
-        factor: L, lower triangular, shape (size, size).
-        offset: w0, the unconstrained optimum, shape (size, 3).
-        basis: all unknowns from the free ones, shape (n, size).
-        particular: the unknowns that are given, shape (n, 3).
-        whitened: functionals in whitened coordinates, shape (size, functionals).
+        spread: shape (size, n).
+        centre: all unknowns at the unconstrained optimum, shape (n, 3).
+        whitened: functionals of w, shape (functionals, size).
         constant: values of the functionals at the unconstrained optimum, shape (functionals, 3).
         time_unit: mean segment duration, in which unknowns are measured [s].
     """
 
-    factor: np.ndarray
-    offset: np.ndarray
-    basis: np.ndarray
-    particular: np.ndarray
+    spread: np.ndarray
+    centre: np.ndarray
     whitened: np.ndarray
     constant: np.ndarray
     time_unit: float
 
 
 @compiled
-def _local_scale(ratio):
-    """Factors that turn knot unknowns (in time units) into derivatives on the segment's own [0, 1]."""
-    scale = np.ones(FUNCTIONS)
-    for k in range(HERMITE):
-        scale[k] = ratio ** (k % 4)
-    return scale
-
-
-@compiled
-def _place(bubbles, segment, knots):
-    """Index of the first bubble of a segment among all unknowns, or -1."""
-    if not bubbles[segment]:
-        return -1
-    before = 0
-    for i in range(segment):
+def _first_bubbles(bubbles):
+    """Index of the first bubble of each segment among all unknowns, -1 where it has none; number of unknowns."""
+    out = np.empty(len(bubbles), np.int64)
+    n = 4 * (len(bubbles) + 1)
+    for i in range(len(bubbles)):
+        out[i] = -1
         if bubbles[i]:
-            before += 1
-    return 4 * knots + BUBBLES * before
+            out[i] = n
+            n += BUBBLES
+    return out, n
 
 
 @compiled
-def _functional(durations, bubbles, unit, size, segment, s, order, tables):
-    """Row that gives the order-th time derivative at place s of a segment from all unknowns, shape (size,)."""
-    row = np.zeros(size)
-    local = bernstein_row(DEGREE - order, s) @ tables[order, :DEGREE + 1 - order]
-    local = local * _local_scale(durations[segment] / unit) / durations[segment] ** order
-    row[4 * segment:4 * segment + HERMITE] = local[:HERMITE]
-    start = _place(bubbles, segment, len(durations) + 1)
-    if start >= 0:
-        row[start:start + BUBBLES] = local[HERMITE:]
-    return row
+def _index(segment, k, first):
+    """Index of function k of a segment among all unknowns; `first` is that of its first bubble."""
+    return 4 * segment + k if k < HERMITE else first + k - HERMITE
 
 
 @compiled
-def _assemble(durations, given, values, bubbles, segments, places, orders, gram, cost_order, tables):
-    f = len(durations)
-    unit = durations.mean()
-    n = 4 * (f + 1) + BUBBLES * bubbles.sum()
-    cost = np.zeros((n, n))
-    for i in range(f):
-        ratio = durations[i] / unit
-        scale = _local_scale(ratio)
-        block = gram * np.outer(scale, scale) * ratio ** (1 - 2 * cost_order)
-        k, b = 4 * i, _place(bubbles, i, f + 1)
-        cost[k:k + HERMITE, k:k + HERMITE] += block[:HERMITE, :HERMITE]
-        if b >= 0:
-            cost[b:b + BUBBLES, b:b + BUBBLES] += block[HERMITE:, HERMITE:]
-            cost[k:k + HERMITE, b:b + BUBBLES] += block[:HERMITE, HERMITE:]
-            cost[b:b + BUBBLES, k:k + HERMITE] += block[HERMITE:, :HERMITE]
+def _scales(ratio):
+    """Factors that turn unknowns (in time units) into coefficients of the functions of a segment, shape (15,)."""
+    out = np.ones(FUNCTIONS)
+    for k in range(HERMITE):
+        out[k] = ratio ** (k % 4)
+    return out
 
-    particular = np.zeros((n, 3))
-    for i in range(f + 1):
-        for k in range(4):
-            if given[i, k]:
-                particular[4 * i + k] = values[i, k] * unit**k
 
-    # The dependent unknown of a knot: its highest derivative that is free, or a bubble beside it.
-    role = np.ones(n, np.int64)
+@compiled
+def _functional(duration, unit, s, order):
+    """Factors of the segment's functions in the order-th time derivative at place s, shape (15,)."""
+    row, scale = bernstein_row(DEGREE - order, s), _scales(duration / unit)
+    out = np.zeros(FUNCTIONS)
+    for i in range(len(row)):
+        if row[i] != 0.0:
+            for k in range(FUNCTIONS):
+                out[k] += row[i] * TABLES[order, i, k]
+    for k in range(FUNCTIONS):
+        out[k] *= scale[k] / duration**order
+    return out
+
+
+@compiled
+def _place(local, segment, first, spread, centre, column, constant):
+    """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum."""
+    count = FUNCTIONS if first >= 0 else HERMITE
+    for d in range(3):
+        constant[d] = 0.0
+    for i in range(len(column)):
+        column[i] = 0.0
+    for k in range(count):
+        n = _index(segment, k, first)
+        for d in range(3):
+            constant[d] += local[k] * centre[n, d]
+        for i in range(len(column)):
+            column[i] += local[k] * spread[i, n]
+
+
+@compiled
+def _roles(given, first):
+    """For each unknown: 0 given, 1 free, 2 dependent; and the dependent unknown of each inner knot.
+
+    Dependent is the knot's highest derivative that is free, or else a bubble beside it.
+    """
+    f = len(given) - 1
+    role = np.ones(4 * (f + 1) + BUBBLES * (first >= 0).sum(), np.int64)
     for i in range(f + 1):
         for k in range(4):
             if given[i, k]:
                 role[4 * i + k] = 0
     dependent = np.zeros(f - 1, np.int64)
     for i in range(1, f):
-        pick = -1
-        for k in range(3, 0, -1):
+        pick = first[i]
+        for k in range(1, 4):
             if not given[i, k]:
                 pick = 4 * i + k
-                break
-        if pick < 0:
-            pick = _place(bubbles, i, f + 1)
         dependent[i - 1] = pick
         role[pick] = 2
-    free = np.nonzero(role == 1)[0]
-    m = len(free)
-    basis = np.zeros((n, m))
-    for q in range(m):
-        basis[free[q], q] = 1.0
-    if f > 1:
-        snap = np.zeros((f - 1, n))
-        for i in range(f - 1):
-            snap[i] = (_functional(durations, bubbles, unit, n, i, 1.0, 4, tables)
-                       - _functional(durations, bubbles, unit, n, i + 1, 0.0, 4, tables)) * unit**4
-        square = np.zeros((f - 1, f - 1))
-        right = np.zeros((f - 1, m + 3))
-        for k in range(f - 1):
-            square[:, k] = snap[:, dependent[k]]
-        for q in range(m):
-            right[:, q] = -snap[:, free[q]]
-        right[:, m:] = -(snap @ particular)
-        solved = np.linalg.solve(square, right)
-        for k in range(f - 1):
-            basis[dependent[k]] = solved[k, :m]
-            particular[dependent[k]] = solved[k, m:]
-
-    weighted = cost @ basis
-    factor = np.linalg.cholesky(basis.T @ weighted)
-    functionals = np.zeros((n, len(segments)))
-    for q in range(len(segments)):
-        functionals[:, q] = _functional(durations, bubbles, unit, n, segments[q], places[q], orders[q], tables)
-    work = np.zeros((m, 3 + len(segments)))
-    work[:, :3] = weighted.T @ particular
-    work[:, 3:] = basis.T @ functionals
-    for i in range(m):
-        for k in range(i):
-            if factor[i, k] != 0.0:
-                work[i] -= factor[i, k] * work[k]
-        work[i] /= factor[i, i]
-    offset = -work[:, :3].copy()
-    whitened = work[:, 3:].copy()
-    constant = functionals.T.copy() @ particular + whitened.T.copy() @ offset
-    return factor, offset, basis, particular, whitened, constant, unit
+    return role, dependent
 
 
 @compiled
-def _further(durations, bubbles, unit, factor, offset, basis, particular, owner, segments, places, orders, direction,
-             lower, upper, tables):
-    """Rows of further bounds; term q adds to row owner[q]."""
-    m = factor.shape[0]
-    rows = np.zeros((len(lower), 3 * m))
-    low, high = lower.copy(), upper.copy()
-    for q in range(len(owner)):
-        functional = _functional(durations, bubbles, unit, basis.shape[0], segments[q], places[q], orders[q], tables)
-        column = functional @ basis
-        for i in range(m):
-            column[i] = (column[i] - (factor[i, :i] * column[:i]).sum()) / factor[i, i]
-        constant = functional @ particular + column @ offset
-        r = owner[q]
+def _eliminate(durations, unit, first, role, dependent, particular):
+    """All unknowns from the free ones, shape (n, m), with a continuous fourth derivative; completes `particular`."""
+    f, n = len(durations), len(role)
+    column = np.full(n, -1)
+    m = 0
+    for q in range(n):
+        if role[q] == 1:
+            column[q] = m
+            m += 1
+    basis = np.zeros((n, m))
+    for q in range(n):
+        if role[q] == 1:
+            basis[q, column[q]] = 1.0
+    if f == 1:
+        return basis
+    for k in range(f - 1):
+        column[dependent[k]] = m + 3 + k
+    # Rows: the jump of the fourth derivative at each inner knot; columns: free unknowns, constants, dependent unknowns.
+    jump = np.zeros((f - 1, m + 2 + f))
+    for i in range(f - 1):
+        for side in range(2):
+            segment = i + side
+            local = _functional(durations[segment], unit, 1.0 - side, 4)
+            for k in range(FUNCTIONS if first[segment] >= 0 else HERMITE):
+                q = _index(segment, k, first[segment])
+                change = (1.0 - 2.0 * side) * unit**4 * local[k]
+                if role[q] > 0:
+                    jump[i, column[q]] += change
+                else:
+                    for d in range(3):
+                        jump[i, m + d] += change * particular[q, d]
+    solved = np.linalg.solve(jump[:, m + 3:].copy(), jump[:, :m + 3].copy())
+    for k in range(f - 1):
+        for q in range(m):
+            basis[dependent[k], q] = -solved[k, q]
         for d in range(3):
-            rows[r, d * m:(d + 1) * m] += direction[q, d] * column
+            particular[dependent[k], d] = -solved[k, m + d]
+    return basis
+
+
+@compiled
+def _cost(durations, unit, first, n, gram, cost_order):
+    """Cost of all unknowns, shape (n, n). [M:eq5]"""
+    out = np.zeros((n, n))
+    for i in range(len(durations)):
+        ratio = durations[i] / unit
+        scale, weight = _scales(ratio), ratio ** (1 - 2 * cost_order)
+        count = FUNCTIONS if first[i] >= 0 else HERMITE
+        for a in range(count):
+            for b in range(count):
+                out[_index(i, a, first[i]), _index(i, b, first[i])] += gram[a, b] * scale[a] * scale[b] * weight
+    return out
+
+
+@compiled
+def _assemble(durations, given, values, bubbles, segments, places, orders, gram, cost_order):
+    f = len(durations)
+    unit = durations.sum() / f
+    first, n = _first_bubbles(bubbles)
+    particular = np.zeros((n, 3))
+    for i in range(f + 1):
+        for k in range(4):
+            if given[i, k]:
+                for d in range(3):
+                    particular[4 * i + k, d] = values[i, k, d] * unit**k
+    role, dependent = _roles(given, first)
+    basis = _eliminate(durations, unit, first, role, dependent, particular)
+    m = basis.shape[1]
+    weighted = _cost(durations, unit, first, n, gram, cost_order) @ basis
+    factor = np.linalg.cholesky(basis.T @ weighted)
+
+    # L^-1 applied to [Z' | g] row by row: the inner loop runs over contiguous entries.
+    gradient = weighted.T @ particular
+    work = np.empty((m, n + 3))
+    for i in range(m):
+        for q in range(n):
+            work[i, q] = basis[q, i]
+        for d in range(3):
+            work[i, n + d] = gradient[i, d]
+    for i in range(m):
+        for k in range(i):
+            if factor[i, k] != 0.0:
+                for q in range(n + 3):
+                    work[i, q] -= factor[i, k] * work[k, q]
+        for q in range(n + 3):
+            work[i, q] /= factor[i, i]
+    spread = work[:, :n].copy()
+    centre = particular
+    for i in range(m):
+        for q in range(n):
+            for d in range(3):
+                centre[q, d] -= spread[i, q] * work[i, n + d]
+    whitened, constant = np.empty((len(segments), m)), np.empty((len(segments), 3))
+    for q in range(len(segments)):
+        i = segments[q]
+        _place(_functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, whitened[q], constant[q])
+    return spread, centre, whitened, constant, unit
+
+
+@compiled
+def _normalise(rows, lower, upper):
+    """Scale rows and their bounds to unit length."""
+    for r in range(len(rows)):
+        squared = 0.0
+        for k in range(rows.shape[1]):
+            squared += rows[r, k] ** 2
+        norm = np.sqrt(squared)
+        if norm < 1e-300:
+            norm = 1.0
+        for k in range(rows.shape[1]):
+            rows[r, k] /= norm
+        lower[r] /= norm
+        upper[r] /= norm
+
+
+@compiled
+def _further(durations, bubbles, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
+    """Rows of further bounds; term q adds to row owner[q]."""
+    m = len(spread)
+    first, _ = _first_bubbles(bubbles)
+    rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
+    column, constant = np.empty(m), np.empty(3)
+    for q in range(len(owner)):
+        i, r = segments[q], owner[q]
+        _place(_functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, column, constant)
+        for d in range(3):
+            for k in range(m):
+                rows[r, d * m + k] += direction[q, d] * column[k]
             low[r] -= direction[q, d] * constant[d]
             high[r] -= direction[q, d] * constant[d]
-    for r in range(len(lower)):
-        norm = max(np.sqrt((rows[r] ** 2).sum()), 1e-300)
-        rows[r] /= norm
-        low[r] /= norm
-        high[r] /= norm
+    _normalise(rows, low, high)
     return rows, low, high
 
 
 @compiled
 def _constrain(whitened, constant, functional, direction, lower, upper):
     """Rows of unit length: bounds on direction . (functional of x, y, z)."""
-    m = whitened.shape[0]
-    count = len(functional)
-    rows = np.zeros((count, 3 * m))
-    low = np.empty(count)
-    high = np.empty(count)
-    for r in range(count):
+    m = whitened.shape[1]
+    rows, low, high = np.zeros((len(functional), 3 * m)), lower.copy(), upper.copy()
+    for r in range(len(functional)):
         q = functional[r]
-        value = 0.0
         for d in range(3):
             if direction[r, d] != 0.0:
-                rows[r, d * m:(d + 1) * m] = direction[r, d] * whitened[:, q]
-                value += direction[r, d] * constant[q, d]
-        norm = np.sqrt((rows[r] ** 2).sum())
-        if norm < 1e-300:
-            norm = 1.0
-        rows[r] /= norm
-        low[r] = (lower[r] - value) / norm
-        high[r] = (upper[r] - value) / norm
+                for k in range(m):
+                    rows[r, d * m + k] = direction[r, d] * whitened[q, k]
+                low[r] -= direction[r, d] * constant[q, d]
+                high[r] -= direction[r, d] * constant[q, d]
+    _normalise(rows, low, high)
     return rows, low, high
 
 
 @compiled
-def _coefficients(factor, offset, basis, particular, unit, durations, bubbles, w, tables):
-    m = factor.shape[0]
-    y = offset.copy()
+def _coefficients(durations, bubbles, unit, spread, centre, w):
+    m, n = spread.shape
+    unknowns = np.empty((3, n))
     for d in range(3):
-        y[:, d] += w[d * m:(d + 1) * m]
-    for i in range(m - 1, -1, -1):
-        y[i] /= factor[i, i]
-        for k in range(i):
-            if factor[i, k] != 0.0:
-                y[k] -= factor[i, k] * y[i]
-    unknowns = particular + basis @ y
-    f = len(durations)
-    out = np.zeros((f, 3, DEGREE + 1))
-    for i in range(f):
-        local = np.zeros((FUNCTIONS, 3))
-        scale = _local_scale(durations[i] / unit)
-        for k in range(HERMITE):
-            local[k] = unknowns[4 * i + k] * scale[k]
-        start = _place(bubbles, i, f + 1)
-        if start >= 0:
-            local[HERMITE:] = unknowns[start:start + BUBBLES]
-        out[i] = (tables[0] @ local).T
+        for q in range(n):
+            unknowns[d, q] = centre[q, d]
+        for i in range(m):
+            if w[d * m + i] != 0.0:
+                for q in range(n):
+                    unknowns[d, q] += w[d * m + i] * spread[i, q]
+    first, _ = _first_bubbles(bubbles)
+    out = np.zeros((len(durations), 3, DEGREE + 1))
+    for i in range(len(durations)):
+        scale = _scales(durations[i] / unit)
+        for d in range(3):
+            for k in range(FUNCTIONS if first[i] >= 0 else HERMITE):
+                share = scale[k] * unknowns[d, _index(i, k, first[i])]
+                for c in range(DEGREE + 1):
+                    out[i, d, c] += share * _POSITIONS[k, c]
     return out
 
 
@@ -251,7 +315,7 @@ def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbl
         numpy.linalg.LinAlgError: the cost is not positive definite on what is left free.
     """
     return ReducedProgram(*_assemble(durations, given, values, bubbles, segments, places, orders, GRAMS[cost_order],
-                                     cost_order, TABLES))
+                                     cost_order))
 
 
 def further_rows(program: ReducedProgram, durations: np.ndarray, bubbles: np.ndarray, owner: np.ndarray,
@@ -268,8 +332,8 @@ def further_rows(program: ReducedProgram, durations: np.ndarray, bubbles: np.nda
     Returns:
         rows (r, 3 size), lower (r,), upper (r,), scaled to unit length.
     """
-    return _further(durations, bubbles, program.time_unit, program.factor, program.offset, program.basis,
-                    program.particular, owner, segments, places, orders, direction, lower, upper, TABLES)
+    return _further(durations, bubbles, program.time_unit, program.spread, program.centre, owner, segments, places, orders,
+                    direction, lower, upper)
 
 
 def constraint_rows(program: ReducedProgram, functional: np.ndarray, direction: np.ndarray, lower: np.ndarray,
@@ -290,5 +354,4 @@ def constraint_rows(program: ReducedProgram, functional: np.ndarray, direction: 
 
 def coefficients(program: ReducedProgram, durations: np.ndarray, bubbles: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]."""
-    return _coefficients(program.factor, program.offset, program.basis, program.particular, program.time_unit, durations,
-                         bubbles, w, TABLES)
+    return _coefficients(durations, bubbles, program.time_unit, program.spread, program.centre, w)

@@ -126,8 +126,8 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        (where, gradients, bounds): segment and place, shape (n, 2); gradients by acceleration, jerk and snap, shape
-        (n, 3, 3); lower and upper bound of the sum of gradients times derivatives, shape (n, 2).
+        (segments, places, gradients, lower, upper): where, shape (n,); gradients by acceleration, jerk and snap, shape
+        (n, 3, 3); bounds of the sum of gradients times derivatives, shape (n,).
     """
     near, keep = _NEAR * (high - low), _KEEP * (high - low)
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
@@ -142,7 +142,8 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
                 elif thrusts[i, k, q] > high - near:
                     chosen[i, k, q] = 2
                 count += chosen[i, k, q] > 0
-    where, gradients, bounds = np.empty((count, 2)), np.empty((count, 3, 3)), np.empty((count, 2))
+    segments, places, gradients = np.empty(count, np.int64), np.empty(count), np.empty((count, 3, 3))
+    lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
     n = 0
     for i in range(thrusts.shape[0]):
         for k in range(thrusts.shape[1]):
@@ -163,9 +164,11 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
             for q in range(4):
                 if chosen[i, k, q]:
                     known = (slopes[q] * x).sum() - thrusts[i, k, q]
-                    where[n, 0], where[n, 1] = i, place
+                    segments[n], places[n] = i, place
                     gradients[n] = slopes[q]
-                    bounds[n, 0] = above + known if chosen[i, k, q] == 1 else -np.inf
-                    bounds[n, 1] = below + known if chosen[i, k, q] == 2 else np.inf
+                    if chosen[i, k, q] == 1:
+                        lower[n] = above + known
+                    else:
+                        upper[n] = below + known
                     n += 1
-    return where, gradients, bounds
+    return segments, places, gradients, lower, upper

@@ -52,7 +52,7 @@ class Outcome:
     failure: str = ""
     margin: float = 0.0
     stretch: float = _PLAIN_STRETCH
-    segments: np.ndarray | None = None
+    extrema: np.ndarray | None = None
 
     @property
     def proved(self) -> bool:
@@ -69,6 +69,7 @@ class Search:
         self.contact = Contact(problem, settings, vehicle.perch_offset)
         self.first = allocate(problem, settings, self.contact.p_contact)
         self.end_yaw = contact_heading(problem.surface)
+        self.side, self.normal = turning_side(self.end_yaw), problem.surface.normal.copy()
         self.rotors = rotor_model(vehicle) if settings.rotors != "free" else None
         self.attempts: list[Attempt] = []
         self.failures: Counter[str] = Counter()
@@ -93,50 +94,49 @@ class Search:
                                COST_ORDER[settings.objective])
         best, count, turning = None, 0, False
         if settings.cuts and len(durations) > 1:
-            program.add(preventive_cuts(durations, self.high, turning_side(self.problem)))
+            program.add(preventive_cuts(len(durations), self.high, self.side))
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= settings.iterations_max:
                 break
             coefficients, solution = program.solve()
             if not solution.solved:
-                self._note(durations, None, count)
+                self._note(durations, np.nan, np.nan, count)
                 break
-            extrema = plan_checks.thrust_extrema(coefficients, durations, self.low, self.high)
-            self._note(durations, extrema, count)
-            outcome, cuts = self._thrust(coefficients, durations, extrema)
+            extrema, least, most = plan_checks.thrust_extrema(coefficients, durations, self.low, self.high)
+            self._note(durations, least, most, count)
+            outcome = self._thrust(coefficients, extrema, least, most)
             if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
                 return outcome
+            cuts = []
+            if outcome:
+                cuts.append(thrust_cuts(coefficients, durations, extrema, self.low, self.high, self.side))
             if not outcome or rounds and outcome.margin > -_NEAR * self.limits.thrust[1]:
-                results, where, thrusts = self._check(coefficients, yaw, durations, extrema)
-                if results[:, plan_checks.HOLDS].all():
+                results, where, holds, thrusts = self._check(coefficients, yaw, durations, extrema)
+                if holds:
                     return Outcome(coefficients, yaw, results)
-                cuts += limit_cuts(where, coefficients, durations, self.problem, self.limits)
+                cuts.append(limit_cuts(where, coefficients, durations, self.problem, self.limits))
                 turning = turning or thrusts is not None and not results[plan_checks.ROTOR_THRUST, plan_checks.HOLDS]
                 if turning and settings.cuts:
                     bounds = rotor_bounds(thrusts, coefficients, yaw, durations, *self.limits.rotor_thrust, self.rotors)
                     program.replace(bounds)
-                    count += len(bounds)
+                    count += len(bounds.lower)
                 outcome = outcome or self._limit(coefficients, yaw, results)
             best = outcome
+            cuts = [bounds for bounds in cuts if len(bounds.lower)]
             if not (cuts or turning) or not settings.cuts:
                 break
-            if cuts:
-                program.add(cuts)
-            count += len(cuts)
+            for bounds in cuts:
+                program.add(bounds)
+                count += len(bounds.lower)
         # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
         return replace(best, stretch=_PLAIN_STRETCH) if best and count else best or Outcome(None, None, None)
 
-    def _thrust(self, coefficients: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
-        """The failure of the thrust range, or None, and cuts against it."""
-        peak, least = float(extrema[:, 4].max()), float(extrema[:, 1].min())
-        if peak <= self.high and least >= self.low:
-            return None, []
-        margin = min(self.high - peak, least - self.low) * self.vehicle.mass
-        outside = (extrema[:, 4] > self.high) | (extrema[:, 1] < self.low)
-        outcome = Outcome(coefficients, None, None, "thrust", margin, stretch_factor(peak, self.high), outside)
-        if not self.settings.cuts:
-            return outcome, []
-        return outcome, thrust_cuts(coefficients, durations, extrema, self.low, self.high, turning_side(self.problem))
+    def _thrust(self, coefficients: np.ndarray, extrema: np.ndarray, least: float, most: float) -> Outcome | None:
+        """The failure of the thrust range, or None."""
+        if most <= self.high and least >= self.low:
+            return None
+        margin = min(self.high - most, least - self.low) * self.vehicle.mass
+        return Outcome(coefficients, None, None, "thrust", margin, stretch_factor(most, self.high), extrema)
 
     def _better_stretched(self, extrema: np.ndarray) -> bool:
         """Whether the peak lies where a longer time lowers it."""
@@ -150,17 +150,18 @@ class Search:
         return Outcome(coefficients, yaw, results, name, self._margin(results, name))
 
     def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
-        """Rows of `plan_checks.NAMES`, first doubts of the proved ones, samples of the rotors' thrusts (or None)."""
+        """Rows of `plan_checks.NAMES`, first doubts of the proved ones, whether all hold, rotor samples (or None)."""
         surface, limits = self.problem.surface, self.limits
-        results, where = plan_checks.check(
-            coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity,
-            np.ascontiguousarray(surface.normal), self.low, self.high, limits.speed, limits.height[0], limits.height[1],
-            limits.extension, limits.clearance, limits.body_rate)
+        results, where, holds = plan_checks.check(
+            coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity, self.normal, self.low,
+            self.high, limits.speed, limits.height[0], limits.height[1], limits.extension, limits.clearance,
+            limits.body_rate)
         if self.rotors is None:
-            return results, where, None
+            return results, where, holds, None
         low, high = limits.rotor_thrust
         thrusts, row = sampled(coefficients, yaw, durations, *self.rotors)
-        return np.vstack([results, [*row, low <= row[0] and row[2] <= high]]), where, (thrusts, row)
+        kept = low <= row[0] and row[2] <= high
+        return np.vstack([results, [*row, kept]]), where, holds and kept, (thrusts, row)
 
     def _margin(self, results: np.ndarray, name: str) -> float:
         row, limits = results[plan_checks.NAMES.index(name)], self.limits
@@ -173,10 +174,9 @@ class Search:
             return min(row[plan_checks.MINIMUM] - limits.height[0], limits.height[1] - row[plan_checks.MAXIMUM])
         return -float("inf")
 
-    def _note(self, durations: np.ndarray, extrema: np.ndarray | None, cuts: int) -> None:
+    def _note(self, durations: np.ndarray, least: float, most: float, cuts: int) -> None:
         mass = self.vehicle.mass
-        low, high = (np.nan, np.nan) if extrema is None else (mass * extrema[:, 1].min(), mass * extrema[:, 4].max())
-        self.attempts.append(Attempt(float(durations.sum()), float(low), float(high), cuts))
+        self.attempts.append(Attempt(float(durations.sum()), mass * least, mass * most, cuts))
 
     def run(self) -> tuple[np.ndarray, Outcome]:
         """Lengthen until every limit is proved, or the time or the number of programs is used up."""
@@ -203,8 +203,9 @@ class Search:
         """
         last = len(durations) - 1
         violated = np.zeros(last + 1, bool)
-        if outcome.segments is not None:
-            for i in np.flatnonzero(outcome.segments):
+        if outcome.extrema is not None:
+            outside = (outcome.extrema[:, 4] > self.high) | (outcome.extrema[:, 1] < self.low)
+            for i in np.flatnonzero(outside):
                 violated[min(i, last)] = True
         if self.settings.stretching == "segments" and violated.any():
             grown = np.where(violated, _SEGMENT_STRETCH * durations, durations)

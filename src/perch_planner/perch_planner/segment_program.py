@@ -14,29 +14,33 @@ from perch_planner.solvers import Solution
 COST_ORDER = {"snap": 4, "jerk": 3}
 
 
-class Cut(NamedTuple):
-    """A linear bound at one place of the plan: lower <= sum of direction . (order-th derivative) <= upper.
+class Bounds(NamedTuple):
+    """Linear bounds at single places of the plan: lower <= sum of direction . (order-th derivative) <= upper.
 
     Attributes:
-        segment, place: where, place in [0, 1] of the segment.
-        terms: pairs (order, direction): time derivative, 0 position to 3 jerk, and a vector in W, shape (3,).
-        lower, upper: bounds of the sum.
+        owner: bound to which each term adds, shape (t,).
+        segments, places, orders: where a term is taken, place in [0, 1] of the segment, and its time derivative, 0
+            position to 4 snap; each shape (t,).
+        direction: vector in W of each term, shape (t, 3).
+        lower, upper: bounds of the sums, shape (r,).
     """
 
-    segment: int
-    place: float
-    terms: tuple[tuple[int, np.ndarray], ...]
-    lower: float
-    upper: float
+    owner: np.ndarray
+    segments: np.ndarray
+    places: np.ndarray
+    orders: np.ndarray
+    direction: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
 
 
 class SegmentProgram(Protocol):
     """What the search needs of a formulation."""
 
-    def add(self, cuts: list[Cut]) -> None:
+    def add(self, bounds: Bounds) -> None:
         """Add linear bounds to the program."""
 
-    def replace(self, bounds: list[Cut]) -> None:
+    def replace(self, bounds: Bounds) -> None:
         """Set the bounds that hold near the present plan alone, instead of those set before."""
 
     def solve(self) -> tuple[np.ndarray, Solution]:
@@ -56,21 +60,16 @@ class ReducedSegments:
         self._local: tuple[np.ndarray, ...] | None = None
         self._rows = reduced_qp.constraint_rows(self._program, linear.functional, linear.direction, linear.lower, linear.upper)
 
-    def add(self, cuts: list[Cut]) -> None:
+    def add(self, bounds: Bounds) -> None:
         """Add linear bounds; only their own rows are computed."""
-        self._rows = tuple(np.concatenate(pair) for pair in zip(self._rows, self._further(cuts)))
+        self._rows = tuple(map(np.concatenate, zip(self._rows, self._further(bounds))))
 
-    def replace(self, bounds: list[Cut]) -> None:
+    def replace(self, bounds: Bounds) -> None:
         """Set the bounds near the present plan."""
-        self._local = self._further(bounds) if bounds else None
+        self._local = self._further(bounds)
 
-    def _further(self, cuts: list[Cut]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        terms = [(k, cut, *term) for k, cut in enumerate(cuts) for term in cut.terms]
-        return reduced_qp.further_rows(
-            self._program, self._durations, self._bubbles, np.array([k for k, *_ in terms]),
-            np.array([cut.segment for _, cut, *_ in terms]), np.array([cut.place for _, cut, *_ in terms]),
-            np.array([order for *_, order, _ in terms]), np.array([direction for *_, direction in terms]),
-            np.array([cut.lower for cut in cuts]), np.array([cut.upper for cut in cuts]))
+    def _further(self, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return reduced_qp.further_rows(self._program, self._durations, self._bubbles, *bounds)
 
     def solve(self) -> tuple[np.ndarray, Solution]:
         """Coefficients and the solver's answer."""
@@ -86,15 +85,15 @@ class FullSegments:
         self._program = full_qp.FullProgram(durations, *contact.knots(durations), COST_ORDER[settings.objective])
         self._solver = settings.solver
         linear = contact.constraints(durations)
-        for q, direction, lower, upper in zip(linear.functional, linear.direction, linear.lower, linear.upper):
-            self._program.bound(linear.segments[q], linear.places[q], ((linear.orders[q], direction),), lower, upper)
+        at = linear.functional
+        self._program.bound(Bounds(np.arange(len(at)), linear.segments[at], linear.places[at], linear.orders[at],
+                                   linear.direction, linear.lower, linear.upper))
 
-    def add(self, cuts: list[Cut]) -> None:
+    def add(self, bounds: Bounds) -> None:
         """Add linear bounds."""
-        for cut in cuts:
-            self._program.bound(*cut)
+        self._program.bound(bounds)
 
-    def replace(self, bounds: list[Cut]) -> None:
+    def replace(self, bounds: Bounds) -> None:
         """Set the bounds near the present plan."""
         self._program.replace(bounds)
 

@@ -20,15 +20,29 @@ SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
 
 @compiled
+def _distance(a, b):
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@compiled
+def _turn(points, legs, i):
+    """Length of the difference between the directions of legs i and i + 1."""
+    squared = 0.0
+    for d in range(3):
+        squared += ((points[i + 2, d] - points[i + 1, d]) / legs[i + 1] - (points[i + 1, d] - points[i, d]) / legs[i]) ** 2
+    return np.sqrt(squared)
+
+
+@compiled
 def _along_waypoints(points, extra, speed, acceleration, turn_acceleration):
-    """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns.
+    """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns, `extra` longer.
 
     The speed at a waypoint is bounded by v^2 = A l / turn, with the shorter leg l and the change of direction there.
     """
     n = len(points) - 1
     legs = np.empty(n)
     for i in range(n):
-        legs[i] = max(np.sqrt(((points[i + 1] - points[i]) ** 2).sum()), 1e-6)
+        legs[i] = max(_distance(points[i + 1], points[i]), 1e-6)
     length = legs.sum()
     ramp = min(speed**2 / acceleration, length) / 2.0
     peak = np.sqrt(2.0 * acceleration * ramp)
@@ -42,11 +56,15 @@ def _along_waypoints(points, extra, speed, acceleration, turn_acceleration):
         now = near if reached <= 0.5 * length else total - near
         fast = speed
         if i < n - 1:
-            turn = np.sqrt((((points[i + 2] - points[i + 1]) / legs[i + 1] - (points[i + 1] - points[i]) / legs[i]) ** 2).sum())
+            turn = _turn(points, legs, i)
             fast = min(np.sqrt(turn_acceleration * min(legs[i], legs[i + 1]) / max(turn, 1e-6)), speed)
         out[i] = max(now - before, 2.0 * legs[i] / (slow + fast))
         before, slow = now, fast
-    return out * (1.0 + extra / out.sum())
+    stretch = 1.0 + extra / out.sum()
+    for i in range(n):
+        out[i] = max(stretch * out[i], SEGMENT_MIN)
+    out[n - 1] = max(out[n - 1], APPROACH_TIME)
+    return out
 
 
 def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) -> np.ndarray:
@@ -67,8 +85,6 @@ def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) 
         closing = problem.target_velocity - problem.start.v
         extra = sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
         durations = _along_waypoints(points, extra, CRUISE_SPEED, CRUISE_ACCELERATION, TURN_ACCELERATION)
-        durations = np.maximum(durations, SEGMENT_MIN)
-        durations[-1] = max(durations[-1], APPROACH_TIME)
     return with_last_segment(durations, settings)
 
 

@@ -37,19 +37,19 @@ def _yaw(yaw, rate, acceleration, end, durations, degree):
     whole[2] = 2.0 * whole[1] - whole[0] + acceleration * duration**2 / (degree * (degree - 1))
     if degree == 7:
         whole[3] = 3.0 * whole[2] - 3.0 * whole[1] + whole[0]
+    for n in range(degree + 1, DEGREE + 1):
+        raised = np.empty(n + 1)
+        raised[0], raised[n] = whole[0], whole[n - 1]
+        for k in range(1, n):
+            raised[k] = (k * whole[k - 1] + (n - k) * whole[k]) / n
+        whole = raised
     out = np.empty((len(durations), DEGREE + 1))
     begin = 0.0
     for i in range(len(durations)):
         part = _restrict(whole, begin / duration, min((begin + durations[i]) / duration, 1.0))
         begin += durations[i]
-        while len(part) < DEGREE + 1:
-            n = len(part)
-            raised = np.empty(n + 1)
-            raised[0], raised[n] = part[0], part[n - 1]
-            for k in range(1, n):
-                raised[k] = (k * part[k - 1] + (n - k) * part[k]) / n
-            part = raised
-        out[i] = part
+        for k in range(DEGREE + 1):
+            out[i, k] = part[k]
     return out
 
 
