@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -45,6 +46,17 @@ def test_an_animation_has_a_frame_for_each_moment(recorded, tmp_path):
     assert main([str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(gif)]) == 0
     with Image.open(gif) as image:
         assert image.n_frames == 4
+
+
+def test_mp4_needs_no_other_program(recorded, tmp_path, monkeypatch):
+    path, _ = recorded
+    monkeypatch.setenv("PATH", "")
+    mp4 = tmp_path / "f.mp4"
+    assert main([str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(mp4)]) == 0
+    video = cv2.VideoCapture(str(mp4))
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (4, 10)
+    found, frame = video.read()
+    assert found and np.ptp(frame) > 100  # something is drawn
 
 
 def test_plots_are_written(recorded, tmp_path):

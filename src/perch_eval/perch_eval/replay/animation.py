@@ -1,16 +1,20 @@
-"""An animation of a flight, as GIF with Pillow or as MP4 with ffmpeg."""
+"""An animation of a flight, as GIF or as MP4."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
-from matplotlib.animation import FFMpegWriter, PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
 
 from perch_core.errors import PerchError
 from perch_eval.replay.scene import Scene
+
+DPI = 80
+CODECS = ("vp09", "mp4v")  # browsers play the first, older players the second
 
 
 def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path,
@@ -25,19 +29,46 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path,
         on_frame: told (frames done, frames in all).
 
     Raises:
-        PerchError: another ending, or MP4 without ffmpeg.
+        PerchError: another ending, or OpenCV has no encoder for MP4.
     """
-    if path.suffix == ".gif":
-        writer = PillowWriter(fps=fps)
-    elif path.suffix == ".mp4":
-        if not FFMpegWriter.isAvailable():
-            raise PerchError(f"{path}: MP4 needs ffmpeg, which is not installed: sudo apt install ffmpeg; or choose a .gif")
-        writer = FFMpegWriter(fps=fps)
-    else:
+    writers = {".gif": _write_gif, ".mp4": _write_mp4}
+    if path.suffix not in writers:
         raise PerchError(f"{path}: the ending is neither .gif nor .mp4")
-    FigureCanvasAgg(scene.figure)
-    with writer.saving(scene.figure, str(path), dpi=80):
-        for k, time in enumerate(times):
-            scene.draw(float(time))
-            writer.grab_frame()
-            on_frame(k + 1, len(times))
+    writers[path.suffix](path, fps, _frames(scene, times, on_frame))
+
+
+def _frames(scene: Scene, times: np.ndarray, on_frame: Callable[[int, int], None]) -> Iterator[np.ndarray]:
+    """Pictures, (height, width, 3) RGB."""
+    scene.figure.set_dpi(DPI)
+    canvas = FigureCanvasAgg(scene.figure)
+    for k, time in enumerate(times):
+        scene.draw(float(time))
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        on_frame(k + 1, len(times))
+
+
+def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    first.save(path, save_all=True, append_images=others, duration=round(1000.0 / fps), loop=0)
+
+
+def _write_mp4(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
+    writer = None
+    try:
+        for frame in frames:
+            height, width = (n - n % 2 for n in frame.shape[:2])  # encoders want even sizes
+            if writer is None:
+                writer = _encoder(path, fps, (width, height))
+            writer.write(cv2.cvtColor(frame[:height, :width], cv2.COLOR_RGB2BGR))
+    finally:
+        if writer is not None:
+            writer.release()
+
+
+def _encoder(path: Path, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    for codec in CODECS:
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), fps, size)
+        if writer.isOpened():
+            return writer
+    raise PerchError(f"{path}: OpenCV has no encoder for MP4 ({', '.join(CODECS)}) here; choose a .gif")

@@ -24,7 +24,7 @@ EXAMPLES = """examples:
   python3 scripts/replay.py out/flight.mcap --from 1 --to 9 --out all.mp4
   python3 scripts/replay.py out/flight.mcap --plots plots         and the plots as PNG
 
-exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it, MP4 without ffmpeg)"""
+exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"""
 
 
 def parser() -> argparse.ArgumentParser:
