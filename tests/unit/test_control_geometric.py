@@ -91,10 +91,24 @@ def test_attitude_error_turns_back_from_any_angle(angle, axis):
     q = Rotation.from_rotvec(np.radians(angle) * axis).as_quat()
     e, _ = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
     assert abs(np.dot(e, axis)) == pytest.approx(2 * np.sin(np.radians(angle) / 2), abs=1e-9)
-    if angle == 10:  # the paper's e_R agrees to second order
+    if angle == 10:  # the paper's e_R agrees to second order where the heading is right
         R = Rotation.from_quat(q).as_matrix()
         paper = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         np.testing.assert_allclose(e, paper, rtol=0.005, atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", [30, 90, 150, -120])
+@pytest.mark.parametrize("tilt", [20, 100, 170])
+def test_a_heading_that_is_off_does_not_turn_the_tilt_error_aside(turned, tilt):
+    """The moment against e_R turns b3 to the commanded one on the shortest way, whatever the heading."""
+    q = (Rotation.from_rotvec((np.radians(tilt), 0, 0)) * Rotation.from_rotvec((0, 0, np.radians(turned)))).as_quat()
+    (x, y, z), _ = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
+    R = Rotation.from_quat(q).as_matrix()
+    shortest = np.cross(R[:, 2], (0.0, 0.0, 1.0))
+    motion = R @ (-x, -y, 0.0)
+    np.testing.assert_allclose(motion / np.linalg.norm(motion), shortest / np.linalg.norm(shortest), atol=1e-9)
+    assert np.hypot(x, y) == pytest.approx(2 * np.sin(np.radians(tilt) / 2))
+    assert z == pytest.approx(2 * np.sin(np.radians(turned) / 2))
 
 
 @pytest.mark.parametrize("a, h, b3", [

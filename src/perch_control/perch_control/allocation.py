@@ -1,9 +1,10 @@
 """Rotor thrusts from a wanted wrench when rotors saturate: yaw is given up first, then thrust, tilt last.
 
 The rotor thrusts that give collective thrust T, tilt moment (Mx, My) and yaw moment Mz are affine in all of them,
-`f_i = a_i T + t_i(Mx, My) + d_i Mz`, and bounded, `lo_i <= f_i <= hi_i`. The three priorities are three nested linear
-programs in one unknown each. Eliminating the unknowns of lower priority (Fourier-Motzkin) leaves finitely many linear
-bounds, so each is solved exactly by comparing at most 72 ratios: no iteration, no sampling.
+`f_i = a_i T + t_i(Mx, My) + d_i Mz`, and bounded, `lo_i <= f_i <= hi_i`. The tilt moments that can be had form a polygon
+whose edges are parallel to the rotors' levers (a zonogon); the one to have is the nearest point of it. Thrust and yaw are
+nested linear programs in one unknown each: eliminating the unknowns of lower priority (Fourier-Motzkin) leaves finitely
+many linear bounds. So everything is solved exactly by comparing a few dozen numbers: no iteration, no sampling.
 """
 
 from __future__ import annotations
@@ -52,34 +53,58 @@ def _thrust_interval(lo, hi, offset, a, d):
 
 
 @compiled
-def _tilt_share(lo, hi, base, step, a, d):
-    """Largest share s <= 1 of the tilt step for which some T and Mz keep all rotors within their bounds.
-
-    `base` is the part of the rotor thrusts that the tilt moment of a feasible point takes, `step` what is missing.
-    """
-    zero = (0.0, 0.0, 0.0, 0.0)
-    s = 1.0
+def _beyond(n, low, high, levers):
+    """How far the tilt moments that can be had reach along a direction `n`. [N m]"""
+    total = 0.0
     for i in range(4):
-        for j in range(4):
-            c, r = _thrust_row(i, j, lo, hi, base, a, d)
-            _, q = _thrust_row(i, j, zero, zero, step, a, d)  # the bound is c T <= r + q s
-            if abs(c) <= _TINY:
-                if q < -_TINY:
-                    s = min(s, max(r, 0.0) / -q)
-                continue
-            if c < 0.0:
-                continue
-            for m in range(4):
-                for n in range(4):
-                    c2, r2 = _thrust_row(m, n, lo, hi, base, a, d)
-                    if c2 < -_TINY:
-                        _, q2 = _thrust_row(m, n, zero, zero, step, a, d)
-                        # (r2 + q2 s) / c2 <= T <= (r + q s) / c
-                        slope = q2 / c2 - q / c
-                        room = r / c - r2 / c2
-                        if slope > _TINY:
-                            s = min(s, max(room, 0.0) / slope)
-    return s
+        k = n[0] * levers[0][i] + n[1] * levers[1][i]
+        total += max(k * low[i], k * high[i])
+    return total
+
+
+@compiled
+def _tilt_share(wanted, floor, ceiling, levers):
+    """Largest share <= 1 of a tilt moment that rotors have which are free between two thrusts, equal for all."""
+    low, high = (floor, floor, floor, floor), (ceiling, ceiling, ceiling, ceiling)
+    share = 1.0
+    for i in range(4):
+        for sign in (1.0, -1.0):
+            n = (-sign * levers[1][i], sign * levers[0][i])
+            demand = n[0] * wanted[0] + n[1] * wanted[1]
+            if demand > _TINY:
+                share = min(share, _beyond(n, low, high, levers) / demand)
+    return share
+
+
+@compiled
+def _nearest_tilt(wanted, lo, hi, levers):
+    """The tilt moment nearest to a wanted one that some rotor thrusts within their bounds have [N m], 2 floats."""
+    inside, best, least = True, wanted, 1e300
+    for i in range(4):
+        length = (levers[0][i] ** 2 + levers[1][i] ** 2) ** 0.5
+        along = (levers[0][i] / length, levers[1][i] / length)
+        for sign in (1.0, -1.0):
+            n = (-sign * along[1], sign * along[0])
+            reach = _beyond(n, lo, hi, levers)
+            across = n[0] * wanted[0] + n[1] * wanted[1]
+            if across > reach + _TINY:
+                inside = False
+            # The edge with this normal: rotors across it are at a bound, those whose levers lie along it are free.
+            first, last = 0.0, 0.0
+            for j in range(4):
+                k = n[0] * levers[0][j] + n[1] * levers[1][j]
+                m = along[0] * levers[0][j] + along[1] * levers[1][j]
+                if abs(k) < 1e-9:
+                    first, last = first + min(m * lo[j], m * hi[j]), last + max(m * lo[j], m * hi[j])
+                else:
+                    first, last = first + m * (hi[j] if k > 0.0 else lo[j]), last + m * (hi[j] if k > 0.0 else lo[j])
+            place = along[0] * wanted[0] + along[1] * wanted[1]
+            kept = min(max(place, first), last)
+            distance = (across - reach) ** 2 + (place - kept) ** 2
+            if distance < least:
+                least = distance
+                best = (reach * n[0] + kept * along[0], reach * n[1] + kept * along[1])
+    return wanted if inside else best
 
 
 @compiled
@@ -97,14 +122,17 @@ def _sum(base, k, direction):
 
 
 @compiled
-def allocate(wrench, reachable_tilt, lo, hi, mixing):
+def allocate(wrench, lo, hi, floor, ceiling, levers, mixing):
     """Rotor thrusts for a wanted wrench, by priority: tilt, then thrust, then yaw.
+
+    A tilt moment beyond what the rotors have at all is shortened in its direction; of the rest, the nearest that they can
+    reach now is had.
 
     Args:
         wrench: collective thrust [N] and moments Mx, My, Mz in B [N m], 4 floats.
-        reachable_tilt: a tilt moment (Mx, My) that some thrusts within the bounds have [N m]; (0, 0) where all rotors
-            have the same bounds. What cannot be had of the tilt moment is given up on the straight way towards it.
-        lo, hi: bounds of each rotor's thrust [N], 4 floats each.
+        lo, hi: bounds of each rotor's thrust now [N], 4 floats each.
+        floor, ceiling: bounds of every rotor's thrust, given time [N].
+        levers: moments Mx, My per thrust of each rotor [m], 2 x 4 floats.
         mixing: inverse of the allocation matrix by columns, ((a_i), (x_i), (y_i), (d_i)), 4 x 4 floats.
 
     Returns:
@@ -119,9 +147,9 @@ def allocate(wrench, reachable_tilt, lo, hi, mixing):
         inside = inside and lo[i] <= f[i] and f[i] <= hi[i]
     if inside:
         return f
-    base = _sum(_sum(zero, reachable_tilt[0], x), reachable_tilt[1], y)
-    step = _sum(wanted, -1.0, base)
-    tilt = _sum(base, _tilt_share(lo, hi, base, step, a, d), step)
+    share = _tilt_share((wrench[1], wrench[2]), floor, ceiling, levers)
+    Mx, My = _nearest_tilt((share * wrench[1], share * wrench[2]), lo, hi, levers)
+    tilt = _sum(_sum(zero, Mx, x), My, y)
     low, high = _thrust_interval(lo, hi, tilt, a, d)
     level = _sum(tilt, _nearest(wrench[0], low, high), a)
     low, high = _interval(lo, hi, level, d)

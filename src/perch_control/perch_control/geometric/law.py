@@ -75,12 +75,18 @@ def force_about(a_ref, feedback, b3_ref, tilt_tangent, floor):
 def attitude_error(q, q_C):
     """Attitude error e_R in B [rad], and the rotation q_e = q_C^-1 q. [M:eq2]
 
-    `2 sign(w) vec(q_e) = 2 sin(angle / 2) axis` agrees with the paper's `vee(R_C^T R - R^T R_C) / 2 = sin(angle) axis` to
-    second order and, unlike it, keeps growing up to 180 degrees: an inverted vehicle is turned back.
+    `2 sin(angle / 2) axis` of two rotations: the shortest one between both b3, and what is left about b3. To first order
+    that is the paper's `vee(R_C^T R - R^T R_C) / 2`, but it keeps growing up to 180 degrees, so an inverted vehicle is
+    turned back; and a heading that is far off does not turn the tilt error aside: with one common axis a vehicle that
+    spins is tilted in a spiral.
     """
     e = quaternion_product((-q_C[0], -q_C[1], -q_C[2], q_C[3]), q)
-    k = 2.0 if e[3] >= 0.0 else -2.0
-    return (k * e[0], k * e[1], k * e[2]), e
+    upright = sqrt(e[2] * e[2] + e[3] * e[3])
+    if upright < 1e-6:  # b3 opposite to the commanded one: any axis across it is a shortest one
+        return (2.0 * e[0], 2.0 * e[1], 0.0), e
+    k = 2.0 / upright
+    turn = k * e[2] if e[3] >= 0.0 else -k * e[2]
+    return (k * (e[3] * e[0] + e[1] * e[2]), k * (e[3] * e[1] - e[0] * e[2]), turn), e
 
 
 @compiled

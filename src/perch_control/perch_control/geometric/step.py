@@ -83,11 +83,8 @@ def rotors_for(wrench, speed, vehicle, lead):
     share = 1.0 if tau <= 0.0 else 1.0 - exp(-lead / tau)
     low, high = reachable(speed, share, speed_min, speed_max)
     lo, hi = thrusts(low, coefficient), thrusts(high, coefficient)
-    now = thrusts(speed, coefficient)
-    kept = (min(max(now[0], lo[0]), hi[0]), min(max(now[1], lo[1]), hi[1]),
-            min(max(now[2], lo[2]), hi[2]), min(max(now[3], lo[3]), hi[3]))
-    _, Mx, My, _ = wrench_of(kept, vehicle[2])
-    f = allocate(wrench, (Mx, My), lo, hi, vehicle[3])
+    floor, ceiling = coefficient * speed_min * speed_min, coefficient * speed_max * speed_max
+    f = allocate(wrench, lo, hi, floor, ceiling, vehicle[2], vehicle[3])
     return leading_command(speed, f, coefficient, share, speed_min, speed_max), f
 
 
