@@ -12,7 +12,7 @@ import numpy as np
 
 from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
-from perch_core.vector3 import axpy, cross, norm, quaternion_of, scale, times
+from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, scale, times
 from perch_core.vehicle import GRAVITY
 
 PERIOD = 0.002
@@ -23,6 +23,9 @@ _KEPT = 4096
 def reference_row(x, floor, vehicle):
     """p, q, v, w and rotor thrusts of a setpoint, 17 floats. [M:eq9-13]
 
+    A setpoint that carries its b3 keeps it, whatever is added to its acceleration on the way from one reference to another:
+    where there is hardly any thrust, a small acceleration would be a large turn. The thrust is the force's part along it.
+
     Args:
         x: packed setpoint, 33 floats.
         floor: specific thrust below which the attitude is taken as level [m/s^2].
@@ -30,7 +33,12 @@ def reference_row(x, floor, vehicle):
     """
     f = (x[6], x[7], x[8] + GRAVITY)
     j, s = x[9:12], x[12:15]
-    if norm(f) < floor:
+    thrust = norm(f)
+    if dot(x[24:27], x[24:27]) > 0.5:
+        thrust = max(dot(f, x[24:27]), 0.0)
+        f, j, s = x[24:27], x[27:30], x[30:33]
+    elif thrust < floor:
+        thrust = floor
         f, j, s = (0.0, 0.0, floor), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     h, dh, ddh = x[15:18], x[18:21], x[21:24]
     n = cross(h, f)
@@ -42,7 +50,7 @@ def reference_row(x, floor, vehicle):
     q = quaternion_of(b1, b2, b3)
     J = vehicle[0][1:4]
     M = axpy(1.0, times(J, dw), cross(w, times(J, w)))
-    T = vehicle[0][0] * norm(f)
+    T = vehicle[0][0] * thrust
     a, mx, my, d = vehicle[3]
     low, high = vehicle[1][0] * vehicle[1][1] ** 2, vehicle[1][0] * vehicle[1][2] ** 2
     return (x[0], x[1], x[2], q[0], q[1], q[2], q[3], x[3], x[4], x[5], w[0], w[1], w[2],
