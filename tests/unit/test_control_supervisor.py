@@ -156,7 +156,7 @@ def test_replacing_a_trajectory_keeps_the_reference_continuous():
 def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
     old = Hold.at((0.2, 0.1, 1.0), (0, 1, 0)).setpoint(0)
     new = FlatReference(rest_to_rest(np.zeros(3), np.array([1, 0, 0]), 0, 0, 2.0))
-    mixed = blended(old, new, 0.0)
+    mixed = blended(old, new, 0.0, new.duration)
     np.testing.assert_allclose(mixed.setpoint(0.0).p, old.p, atol=1e-12)
     np.testing.assert_allclose(mixed.setpoint(1.0).p, new.setpoint(1.0).p, atol=1e-12)
 

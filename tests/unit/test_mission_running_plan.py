@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, PlanAnswer, State, Target
 from perch_control.mission.running_plan import RunningPlan
+from perch_control.ros.planner_clients import perch_message
 from perch_core import so3
+from perch_core.ros.trajectories import from_message
 from perch_core.trajectory import SampledTrajectory
 from perch_core.vehicle import GRAVITY
 
@@ -30,11 +34,12 @@ def target(time: float, x: float = 5.0, sigma: float = 0.02) -> Target:
 
 
 def running(length: float = LENGTH) -> RunningPlan:
-    return RunningPlan(PlanAnswer(True, "", object(), START, length, states(length + 0.8)), target(9.0), SETTINGS)
+    return RunningPlan(answer(START, length), target(9.0), SETTINGS)
 
 
 def answer(start: float, length: float, success: bool = True) -> PlanAnswer:
-    return PlanAnswer(success, "", object(), start, length, states(length) if success else None)
+    sampled = dataclasses.replace(states(length + 0.8), start_time=start) if success else None
+    return PlanAnswer(success, "", object(), start, length, sampled)
 
 
 def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near():
@@ -58,33 +63,64 @@ def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near
 
 def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
     plan = running()
-    query = plan.query(START + 0.1, target(10.0, x=5.06), GOAL)
-    assert not query.recovery and query.target.p_WS[0] == 5.06
-    np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.end).p + [0.06, 0.0, 0.0], atol=1e-9)
+    query = plan.query(START + 0.1, target(10.0, x=5.26), GOAL)
+    assert not query.recovery and query.target.p_WS[0] == 5.26
+    np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.end).p + [0.26, 0.0, 0.0], atol=1e-9)
     ready, better = plan.answered(answer(query.start_time, plan.end - query.start_time + 0.05), START + 0.3)
-    assert ready is None and better.target.p_WS[0] == 5.06
+    assert ready is None and better.target.p_WS[0] == 5.26
     assert better.end == pytest.approx(plan.end + 0.05)
 
 
 @pytest.mark.parametrize("length, success", [(4.0, True), (1.0, False)])
 def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
     plan = running()
-    query = plan.query(START + 0.1, target(10.0, x=5.06), GOAL)
+    query = plan.query(START + 0.1, target(10.0, x=5.26), GOAL)
     assert plan.answered(answer(query.start_time, length, success), START + 0.3) == (None, None)
     assert plan.query(START + 0.32, None, GOAL).recovery, "the next thing is asked"
 
 
 @pytest.mark.parametrize("time, x, goal", [
-    (START + 0.1, 5.002, GOAL), (START + LENGTH - 0.6, 5.06, GOAL),
-    (START + 0.1, 5.06, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
-def test_no_new_perch_for_millimetres_nor_at_the_end_nor_unasked(time, x, goal):
+    (START + 0.1, 5.1, GOAL), (START + LENGTH - 0.6, 5.26, GOAL),
+    (START + 0.1, 5.26, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
+def test_no_new_perch_for_centimetres_nor_at_the_end_nor_unasked(time, x, goal):
     query = running().query(time, target(10.0, x=x), goal)
     assert query is None or query.recovery
 
 
 def test_a_target_known_worse_than_the_planned_one_is_not_followed():
-    query = running().query(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL)
+    query = running().query(START + 0.1, target(10.0, x=5.26, sigma=0.03), GOAL)
     assert query.recovery
+    assert running().moved(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL) is None
+
+
+@pytest.mark.parametrize("time", [START + 0.1, START + LENGTH - 0.4])
+def test_the_plan_moves_with_the_wire(time):
+    plan = running()
+    way_out = plan.query(time, None, GOAL)
+    following = plan.moved(time, target(10.0, x=5.03), GOAL)
+    assert following.end == pytest.approx(plan.end) and following.target.p_WS[0] == 5.03
+    assert time - 0.02 < following.plan.start_time <= time, "the rest of it"
+    for t in (time, plan.end, plan.end + 0.4):  # the recovery as well
+        np.testing.assert_allclose(following.state(t).p, plan.state(t).p + [0.03, 0.0, 0.0], atol=1e-9)
+        np.testing.assert_allclose(following.state(t).rotor_thrust, plan.state(t).rotor_thrust)
+    if way_out is not None:
+        assert following.answered(answer(way_out.start_time, 1.0), way_out.start_time - 0.05)[0] is not None, "what was asked still counts"
+
+
+@pytest.mark.parametrize("time, x, goal", [
+    (START + 0.1, 5.002, GOAL), (START + 0.1, 5.26, GOAL), (START + LENGTH - 0.1, 5.03, GOAL), (START - 0.1, 5.03, GOAL),
+    (START + 0.1, 5.03, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
+def test_the_plan_stays_for_millimetres_for_another_wire_at_the_end_before_its_start_and_unasked(time, x, goal):
+    assert running().moved(time, target(10.0, x=x), goal) is None
+
+
+def test_a_plan_that_was_moved_is_published_from_its_states():
+    following = running().moved(START + 1.0, target(10.0, x=5.03), GOAL)
+    msg = perch_message(following.plan)
+    assert msg.at_end == msg.AT_END_RECOVER and msg.recovery_start == pytest.approx(following.end - following.plan.start_time)
+    np.testing.assert_allclose(from_message(msg).p, following.plan.sampled.p)
+    ready = answer(START, 1.0)
+    assert perch_message(ready) is ready.trajectory
 
 
 def test_an_answer_that_comes_too_late_is_not_used():

@@ -270,7 +270,9 @@ class FlightController:
         elif m.now >= order.start:
             self._pending = None
             # On the ground there is nothing to continue; in the air the new reference is reached without a jump.
-            m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, m.now - order.start))
+            begin = m.now - order.start
+            end = order.recovery_start if order.recovery_start > begin else source.duration  # the wire is met there
+            m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, begin, end))
 
     def _fly(self) -> StepResult:
         m = self.maneuvers

@@ -131,13 +131,13 @@ class Blend:
                         x.h, x.dh, x.ddh, x.b3, x.db3, x.ddb3)
 
 
-def blended(old: Setpoint, source, start: float, duration: float = 0.5):
+def blended(old: Setpoint, source, start: float, end: float, duration: float = 0.5):
     """`source` from its time `start` on, taken over from the old setpoint without a jump in position, velocity or
-    acceleration; the source itself where it continues the old one exactly."""
+    acceleration, within half of the time to `end`; the source itself where it continues the old one exactly."""
     new = source.setpoint(start)
     gap = [np.subtract(getattr(old, k), getattr(new, k)) for k in ("p", "v", "a")]
     if max(float(np.abs(g).max()) for g in gap) < 1e-6:
         return source
     zero = np.zeros(3)
-    duration = min(duration, max(0.5 * (source.duration - start), 0.1))
+    duration = min(duration, max(0.5 * (end - start), 0.1))
     return Blend(source, start, Polynomial(quintic(*gap, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))

@@ -24,7 +24,7 @@ from perch_control.mission import (
     ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters
 from perch_control.ros.goal_server import GoalServer
-from perch_control.ros.planner_clients import PlannerClients
+from perch_control.ros.planner_clients import PlannerClients, perch_message
 from perch_control.ros.powerline_map import mapped_target
 
 TICK = TICK_STEPS * 2_000_000  # the mission decides at 50 Hz [ns]
@@ -145,7 +145,7 @@ class MissionNode(PerchNode[MissionParameters]):
             msg.id, msg.at_end = outputs.trajectory_id, Trajectory.AT_END_HOLD
             self._trajectories.publish(msg)
         if outputs.perch is not None:
-            msg = outputs.perch.trajectory
+            msg = perch_message(outputs.perch)
             msg.id = outputs.trajectory_id
             msg.contact_time = float(self.params.mission.contact_time)
             self._trajectories.publish(msg)

@@ -197,6 +197,17 @@ class SampledTrajectory:
         return StateSample(between(self.p), q, between(self.v), between(self.w), between(self.a), between(self.dw),
                            between(self.rotor_thrust))
 
+    def rest_of(self, since: float, offset: np.ndarray) -> SampledTrajectory:
+        """What is left of it from a sample on, moved.
+
+        Args:
+            since: time [s]; the rest begins with the last sample that is not later.
+            offset: added to every position in W [m], shape (3,).
+        """
+        k = min(max(int(np.searchsorted(self.times, since, side="right")) - 1, 0), len(self.times) - 2)
+        return SampledTrajectory(self.times[k:] - self.times[k], self.p[k:] + offset, self.q[k:], self.v[k:], self.w[k:], self.a[k:],
+                                 self.dw[k:], self.rotor_thrust[k:], self.start_time + float(self.times[k]))
+
 
 def rest_to_rest(p0, p1, yaw0: float, yaw1: float, duration: float, start_time: float = 0.0) -> FlatTrajectory:
     """Straight minimum-snap-like move between two hovers: degree 9, derivatives 1-4 vanish at both ends.

@@ -282,7 +282,12 @@ class MissionMachine:
                 self._fly(better.plan, outputs)
                 self.message = f"re-planned, {better.plan.duration:.2f} s"
         usable, _ = self._usable(inputs.target)
-        outputs.query = self._running.query(inputs.time, inputs.target if usable else None, self._goal)
+        target = inputs.target if usable else None
+        moved = self._running.moved(inputs.time, target, self._goal)
+        if moved is not None and outputs.perch is None and outputs.way_out is None:
+            self._running, self.target, self._perch = moved, moved.target, moved.plan
+            outputs.perch, outputs.trajectory_id = moved.plan, self._perch_id
+        outputs.query = self._running.query(inputs.time, target, self._goal)
 
     def _fly(self, plan: PlanAnswer, outputs: Outputs) -> None:
         self._perch, self._perch_id = plan, self._new_id()

@@ -1,12 +1,14 @@
 """What the mission asks while a powerline plan is flown: a better perch, and ways out of it. [P:V-B]
 
 A plan rests on a map that was made from metres away, by an odometry that has drifted since. On the way the wire comes near,
-and the map gets better: the rest of the perch is planned again from the running plan's own state, so that nothing jumps.
+and the map gets better: the plan as it is moves with the wire, as long as the wire is seen. A wire that turns out to be
+somewhere else gets a new plan from the running one's own state, so that nothing jumps.
 Between these, recoveries are planned from states that lie ahead, one after the other: an abort at any time finds one ready.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -80,11 +82,40 @@ class RunningPlan:
             return None, None  # a detour: the wire is better met as planned, or missed and left
         return None, RunningPlan(plan, query.target, self._settings, self._replanned_at)
 
+    def moved(self, time: float, target: Target | None, goal: Goal) -> RunningPlan | None:
+        """The same plan, moved with the wire; None: it stays where it is.
+
+        What counts at the wire is the place relative to it. The odometry has drifted since the map was made, but wire and
+        vehicle are seen in the same frame: where the wire is now, the perch is now. For centimetres a new plan would be worse:
+        the optimum of the rest is not the rest of the optimum, as N intervals share what time is left.
+
+        Args:
+            time: of the tick [s].
+            target: as mapped now, when it is certain enough to plan on.
+            goal: what was asked of the mission.
+        """
+        s = self._settings
+        if not goal.replan or target is None or not self._seen_better(target):
+            return None
+        if not self.plan.start_time + _DECISION < time < self.end - s.shift_until:
+            return None
+        offset = target.p_WS - self.target.p_WS
+        if not s.shift_distance < float(np.linalg.norm(offset)) < s.shift_max:
+            return None
+        rest = self.plan.sampled.rest_of(time - self.plan.start_time, offset)
+        plan = dataclasses.replace(self.plan, trajectory=None, sampled=rest, start_time=rest.start_time, duration=self.end - rest.start_time)
+        following = RunningPlan(plan, target, s, self._replanned_at)
+        following.covered, following._asked = self.covered, self._asked  # ways out stay: centimetres do not matter there
+        return following
+
+    def _seen_better(self, target: Target) -> bool:
+        return target.time > self.target.time and target.position_sigma <= self.target.position_sigma
+
     def _better(self, target: Target, time: float, start: float) -> bool:
         s = self._settings
-        return (target.time > self.target.time and target.position_sigma <= self.target.position_sigma and self.end - start > s.powerline_replan_until
+        return (self._seen_better(target) and self.end - start > s.powerline_replan_until
                 and start > self.plan.start_time + _DECISION and time - self._replanned_at >= s.powerline_replan_period
-                and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.replan_distance)
+                and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.shift_max)
 
     def _perch_pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
         """The planned end, moved with the wire: position [m] and attitude xyzw. Its side of the wire stays the same."""

@@ -148,7 +148,7 @@ class PlanAnswer:
     Attributes:
         success: there is a plan.
         message: the planner's words.
-        trajectory: the message to pass on (opaque to the mission).
+        trajectory: the message to pass on (opaque to the mission); None: it is to be made from `sampled`.
         start_time: when it starts [s].
         duration: from its start to the contact [s].
         sampled: the states of a powerline plan.

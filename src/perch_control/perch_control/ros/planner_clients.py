@@ -11,7 +11,7 @@ from rclpy.task import Future
 
 from perch_core import so3
 from perch_core.ros.conversions import to_point, to_pose, to_seconds, to_stamp, to_vector
-from perch_core.ros.trajectories import from_message
+from perch_core.ros.trajectories import from_message, sampled_message
 from perch_control.mission import Mode, PlanAnswer, PlanQuery
 
 _NAN = float("nan")
@@ -55,6 +55,15 @@ def plan_answer(response: PlanPerch.Response | PlanPowerline.Response) -> PlanAn
     else:
         trajectory.at_end, duration = Trajectory.AT_END_CONTACT, sum(s.duration for s in trajectory.segments)
     return PlanAnswer(response.success, response.message, trajectory, to_seconds(trajectory.header.stamp), duration, sampled)
+
+
+def perch_message(plan: PlanAnswer) -> Trajectory:
+    """The trajectory of a plan as it is published: the planner's own, or one made from the states of a plan that was moved."""
+    if plan.trajectory is not None:
+        return plan.trajectory
+    msg = sampled_message(plan.sampled)
+    msg.at_end, msg.recovery_start = Trajectory.AT_END_RECOVER, float(plan.duration)
+    return msg
 
 
 def _surface(query: PlanQuery) -> PlanPerch.Request:

@@ -10,6 +10,7 @@ from perch_msgs.msg import PowerlineArray
 from perch_control.admission import AtEnd
 from perch_control.mission import (
     Command, ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Outcome, PlanAnswer, State, Target)
+from perch_control.ros.planner_clients import perch_message
 from perch_control.ros.powerline_map import mapped_target
 from perch_core.ros.trajectories import from_message
 from perch_core.scenario import Scenario
@@ -105,7 +106,7 @@ class Commanding:
         contact_time = float(self._settings.contact_time)
         if self._goal.mode is Mode.SURFACE:
             return FlownTrajectory(id, plan.trajectory, AtEnd.CONTACT, contact_time)
-        msg = plan.trajectory
+        msg = perch_message(plan)
         return FlownTrajectory(id, from_message(msg), AtEnd(msg.at_end), contact_time, msg.recovery_start)
 
     def _note(self, time: float) -> None:
