@@ -29,7 +29,7 @@ class TriangulationConfig:
 
     min_ratio: float = config.quantity(0.03, above=0.0, high=0.5,
                                        doc="least sigma2/sigma1 of the planes' normals; below it the depth is not determined")
-    pose_position: float = config.quantity(0.003, unit="m", above=0.0, high=1.0,
+    pose_position: float = config.quantity(0.006, unit="m", above=0.0, high=1.0,
                                            doc="error of the camera's position from image to image, 1 sigma")
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="random walk of the odometry; the wire is where the newest sightings see it")
