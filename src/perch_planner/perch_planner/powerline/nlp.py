@@ -49,7 +49,8 @@ class Numbers:
         height_min: z_min with its margin [m]. [P:eq14e]
         thrust: bounds of a rotor's thrust [N]. [P:eq14f]
         body_rate: bound of |w_WB_B| [rad/s].
-        clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line, see `stage_functions`. [P:eq14j]
+        clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line at each node but the first, see
+            `stage_functions`, shape (N,). [P:eq14j]
         states, inputs: initial guess, shapes (N + 1, 18) and (N, 4), inputs in [-1, 1].
         defects: what is added to the integrator's result at the end of every interval, shape (N, 18); see `defects_of`.
     """
@@ -64,7 +65,7 @@ class Numbers:
     height_min: float
     thrust: tuple[float, float]
     body_rate: float
-    clearance: float
+    clearance: np.ndarray
     states: np.ndarray
     inputs: np.ndarray
     defects: np.ndarray
@@ -191,7 +192,7 @@ class Problem:
                                      numbers.defects.ravel()])
         low, high = self._bounds(numbers)
         least = np.zeros(len(self._equality))
-        least[self._clearances] = numbers.clearance
+        least[self._clearances] = np.repeat(numbers.clearance, self.structure.lines)
         begin, cpu = time.perf_counter(), time.process_time()
         answer = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
                               lbg=least, ubg=np.where(self._equality, 0.0, _FREE))

@@ -43,6 +43,7 @@ class _Task:
         pinned: factors on the end weights in the later phases, shape (6,).
         duration: bounds of T [s].
         margins: to begin with.
+        leaving: clearance that the margins grow to within a quarter of the time; 0: they stay as they are.
         radius_reduction: taken off the wires' radius [m].
         guess: attempt and N -> states and inputs.
         accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
@@ -59,6 +60,7 @@ class _Task:
     pinned: np.ndarray
     duration: tuple[float, float]
     margins: Margins
+    leaving: float
     radius_reduction: float
     guess: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
     accuracy: tuple[float, float, float]
@@ -110,7 +112,7 @@ class PowerlinePlanner:
                                      T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn)
 
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
-                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, first_guess,
+                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, 0.0, first_guess,
                      (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
 
     def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
@@ -126,7 +128,7 @@ class PowerlinePlanner:
         nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
         pinned = np.array([1.0, 1.0, *[s.end_factor] * 4])  # upright and at rest, but not at one place
         return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
-                     False, s.recovery, pinned, s.recovery_duration, margins, reduction, first_guess,
+                     False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, reduction, first_guess,
                      (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
@@ -168,7 +170,7 @@ class PowerlinePlanner:
                 end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
                 height_min=s.height_min + margins.height,
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
-                body_rate=vehicle.body_rate_max - margins.body_rate, clearance=margins.clearance, states=states, inputs=inputs,
+                body_rate=vehicle.body_rate_max - margins.body_rate, clearance=_clearances(margins.clearance, task.leaving, intervals), states=states, inputs=inputs,
                 defects=np.zeros((intervals, STATES + 1)))
             structure = Structure(intervals, len(lines), task.perception, solver_name)
             found = self.solver.solve(structure, numbers, numbers.end_weights * task.pinned, phase)
@@ -196,6 +198,12 @@ class PowerlinePlanner:
         raise PlanningRefusal("infeasible", task.name, -1.0,
                               f"no {task.name} was found: the solver did not converge from several guesses ({found.status}); "
                               "start farther away, higher, or choose another pitch")
+
+
+def _clearances(first: float, later: float, intervals: int) -> np.ndarray:
+    """Clearance margins of all nodes but the first, shape (N,): from what the start leaves to what is wanted in the open."""
+    share = np.minimum(4.0 * np.arange(1, intervals + 1) / intervals, 1.0)
+    return first + share * max(later - first, 0.0)
 
 
 def _tightened(margins: Margins, broken: list[Bound]) -> Margins:
