@@ -2,19 +2,23 @@
 
 import numpy as np
 import pytest
-from perch_msgs.msg import Contact
+from perch_msgs.msg import Contact, Powerline, PowerlineArray
 
 from perch_core import so3
+from perch_core.ros.conversions import to_point, to_stamp
 from perch_core.ros.trajectories import sampled_message
+from perch_core.scenario import Cable, Mission, Scenario, World
 from perch_core.trajectory import SampledTrajectory
-from perch_eval.evaluation.powerline_flights import perching_errors
+from perch_eval.evaluation.powerline_flights import mapping_errors, perching_errors
 from perch_eval.flight import Flight, States
 
 OFFSET, TILT = np.array([0.01, -0.02, 0.02]), np.radians(4.0)  # of the flown from the planned: 3 cm, 4 deg
 
 
 class Flown(Flight):
-    """A recorded flight made here: the plan, shifted and tilted, and flown to `end`."""
+    """A recorded flight made here: the plan, shifted and tilted, and flown to `end`; the odometry is off by `drift`."""
+
+    drift = np.zeros(3)
 
     def __init__(self, end: float, contact: float | None = None) -> None:
         times = np.linspace(0.0, 3.0, 31)
@@ -33,15 +37,52 @@ class Flown(Flight):
                              np.zeros((400, 3)), np.zeros((400, 3)))
 
     def states(self, topic):
-        return self._truth if topic == "ground_truth/odometry" else None
+        x = self._truth
+        return x if topic == "ground_truth/odometry" else States(x.t, x.p + self.drift, x.q, x.v, x.w)
+
+
+def scenario(y: float = 0.0, z: float = 0.0) -> Scenario:
+    """One wire, along x, that passes `y`, `z` beside where the plan has it, and another one far away."""
+    b3 = np.array([np.sin(0.8), 0.0, np.cos(0.8)])
+    x, _, height = np.array([2.0, 0.0, 2.2]) - 0.15 * b3  # the gripper at the end of the plan
+    return Scenario(name="line", mode="powerline", vehicle="rpg", mission=Mission(perch_point=(x, 0.0, height)), world=World(cables=(
+        Cable(start=(-3.0, 3.0, 3.0), end=(8.0, 3.0, 3.0)), Cable(start=(-3.0, y, height + z), end=(8.0, y, height + z)))))
 
 
 @pytest.mark.parametrize("contact", [None, 11.6, 12.5])
 def test_errors_are_those_that_were_put_in(contact):
-    found = perching_errors(Flown(12.8, contact))
-    assert found["perching_position_m"] == pytest.approx(0.03, abs=1e-6)
+    found = perching_errors(Flown(12.8, contact), scenario(), 0.15)
+    assert found["perching_in_map_m"] == pytest.approx(0.03, abs=1e-6)
+    assert found["perching_position_m"] == pytest.approx(np.hypot(0.02, 0.02), abs=1e-6), "across the wire"
     assert found["perching_tilt_deg"] == pytest.approx(4.0, abs=0.3)  # the attitude is that of the nearest sample
 
 
+def test_a_wire_elsewhere_is_an_error_and_a_drift_with_the_wire_is_none():
+    found = perching_errors(Flown(12.8), scenario(y=0.03), 0.15)
+    assert found["perching_position_m"] == pytest.approx(np.hypot(0.05, 0.02), abs=1e-6)
+    found = perching_errors(Flown(12.8), scenario(y=-0.02, z=0.02), 0.15)
+    assert found["perching_position_m"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_map_is_judged_in_map_and_as_the_vehicle_sees_it():
+    flight, where = Flown(12.8), scenario()
+    _, y, z = where.mission.perch_point
+    lines = PowerlineArray(lines=[Powerline(start=to_point(np.array([-1.0, k, z + k])), end=to_point(np.array([5.0, k, z + k])))
+                                  for k in (0.03, 1.0)])
+    lines.header.stamp = to_stamp(10.5)
+    flight._raw["powerlines"] = [(8.9, lines)]
+    found = mapping_errors(flight, where)
+    assert found["mapping_in_map_m"] == pytest.approx(np.hypot(0.03, 0.03), abs=1e-6)
+    drift = np.array([0.0, 0.04, 0.02])
+    flight.drift = drift
+    assert mapping_errors(flight, where)["mapping_m"] == pytest.approx(np.hypot(0.01, 0.01), abs=1e-6)
+
+
 def test_a_flight_that_ends_before_the_perch_has_no_errors():
-    assert perching_errors(Flown(11.5)) == {"perching_position_m": None, "perching_tilt_deg": None}
+    assert set(perching_errors(Flown(11.5), scenario(), 0.15).values()) == {None}
+
+
+def test_a_crash_on_the_way_is_no_error_at_the_perch():
+    flight = Flown(12.8)
+    flight._raw["contact"] = [(1.0, Contact(state=4)), (2.0, Contact(state=0)), (11.6, Contact(state=3))]
+    assert set(perching_errors(flight, scenario(), 0.15).values()) == {None}

@@ -15,8 +15,8 @@ from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       --quick: 5 seeds a condition
   python3 scripts/evaluate.py --full --jobs 2       100 seeds; interrupted, the same command goes on
-  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_inspection, p_cable,
-                                                    c_faults, c_comparison)
+  python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_flights, p_inspection,
+                                                    p_cable, c_faults, c_comparison)
 
 exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
 2 the caller's mistake, 130 interrupted"""
@@ -38,6 +38,12 @@ def _powerline(effort: Effort) -> list[Section]:
     from perch_eval.evaluation.powerline import powerline_sections
 
     return powerline_sections(effort)
+
+
+def _lines(effort: Effort) -> list[Section]:
+    from perch_eval.evaluation.powerline import flown_sections
+
+    return flown_sections(effort)
 
 
 def _inspection(effort: Effort) -> list[Section]:
@@ -64,7 +70,7 @@ def _comparison(effort: Effort) -> list[Section]:
     return comparison_sections(effort)
 
 
-PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline,
+PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline, "p_flights": _lines,
                           "p_inspection": _inspection, "p_cable": _cable, "c_faults": _faults, "c_comparison": _comparison}
 
 

@@ -2,40 +2,75 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perch_core import config, so3
+from perch_core.ros.conversions import to_array, to_seconds
 from perch_core.ros.trajectories import from_message
+from perch_core.scenario import Scenario
 from perch_core.trajectory import SampledTrajectory
-from perch_eval.campaign.causes import SUCCESS
-from perch_eval.campaign.engines import Task, fly_in_process
+from perch_core.vehicle import load_vehicle
+from perch_eval.campaign.causes import SUCCESS, cause_of
+from perch_eval.campaign.engines import Task, flatten
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import Results, RunResult
-from perch_eval.campaign.specification import Run
+from perch_eval.campaign.specification import Run, scenario_of
 from perch_eval.campaign.workers import in_pool
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
-from perch_eval.metrics import touch_of
+from perch_eval.metrics import flight_metrics, touch_of
+from perch_sim.cable_contact import CableLine
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = {"vio": "rendered", "target": "rendered"}
 SEEDS = range(1, 11)
+AROUND = 1.5  # the map is judged within this of the target point [m]
 
 
 def fly_line(task: Task) -> RunResult:
     """One perch on a line, the same as by the real nodes, with the errors at the perching point among its metrics."""
-    result = fly_in_process(task)
-    return dataclasses.replace(result, metrics=result.metrics | perching_errors(Flight(Path(task.keep) / "flight.mcap")))
+    from perch_eval.in_process import Sensing, fly
+    from perch_eval.in_process.recording import TracedFlight
+
+    scenario = scenario_of(task.scenario, f"run {task.run.number}")
+    trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5)
+    flight, vehicle = TracedFlight(trace), load_vehicle(scenario.vehicle)
+    metrics = flatten(flight_metrics(flight, vehicle, trace.end_time), trace.end_time)
+    metrics |= perching_errors(flight, scenario, vehicle.perch_offset) | mapping_errors(flight, scenario)
+    metrics["other_lines_touched"] = float(_others_touched(flight, scenario))
+    return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion), trace.outcome,
+                     trace.message, metrics=metrics)
 
 
-def perching_errors(flight: Flight) -> dict[str, float | None]:
-    """Distance [m] and angle between the b3 axes [deg] of truth and plan when the perch ends, or when the gripper closes."""
-    none: dict[str, float | None] = {"perching_position_m": None, "perching_tilt_deg": None}
+def _target(scenario: Scenario) -> int:
+    """Index of the cable that the goal means."""
+    point = np.array(scenario.mission.perch_point)
+    return int(np.argmin([CableLine(cable).nearest(point).distance for cable in scenario.world.cables]))
+
+
+def _others_touched(flight: Flight, scenario: Scenario) -> int:
+    """How often something else than the target was hit or gripped: another cable, or what is no cable, in flight."""
+    target, states = f"cable {_target(scenario)}", (1, 2, 3)
+    return sum(m.state in states and m.body.startswith("cable") and m.body != target for _, m in flight.messages("contact"))
+
+
+def perching_errors(flight: Flight, scenario: Scenario, perch_offset: float) -> dict[str, float | None]:
+    """Errors when the perch ends, or when the gripper closes before.
+
+    Args:
+        flight: what was flown.
+        scenario: where the wires truly are.
+        perch_offset: gripper below the centre of mass, to the wire's axis [m].
+
+    Returns:
+        `perching_position_m`: across the wire, of the body's true place against the true wire from its planned place against the
+        planned one; `perching_in_map_m`: of the true place in map from the planned one, odometry's drift included;
+        `perching_tilt_deg`: angle between the b3 axes. None where the flight did not get there.
+    """
+    none: dict[str, float | None] = {"perching_position_m": None, "perching_in_map_m": None, "perching_tilt_deg": None}
     plans = [m for _, m in flight.messages("trajectory") if m.at_end in (1, 3) and m.points]
     truth = flight.states("ground_truth/odometry")
     if not plans or truth is None:
@@ -43,14 +78,56 @@ def perching_errors(flight: Flight) -> dict[str, float | None]:
     plan = from_message(plans[-1])
     if not isinstance(plan, SampledTrajectory):
         return none
-    end = plan.start_time + (plans[-1].recovery_start if plans[-1].recovery_start > 0 else plan.duration)
+    perch_time = plans[-1].recovery_start if plans[-1].recovery_start > 0 else plan.duration
+    end = plan.start_time + perch_time
     touch = touch_of(flight)
+    if touch is not None and touch[1].state == 3 and touch[0] < end:
+        return none  # crashed on the way
     moment = touch[0] if touch is not None and plan.start_time < touch[0] < end else end
     if truth.t[-1] < moment:
         return none
-    wanted, true = plan.sample(moment - plan.start_time), truth.at(np.array([moment]))
-    tilt = so3.angle_between(so3.quat_to_matrix(wanted.q)[:, 2], so3.quat_to_matrix(true.q[0])[:, 2])
-    return {"perching_position_m": float(np.linalg.norm(true.p[0] - wanted.p)), "perching_tilt_deg": math.degrees(tilt)}
+    wanted, last, true = plan.sample(moment - plan.start_time), plan.sample(perch_time), truth.at(np.array([moment]))
+    b3 = so3.quat_to_matrix(wanted.q)[:, 2]
+    planned_wire = last.p - perch_offset * so3.quat_to_matrix(last.q)[:, 2]
+    wire = CableLine(scenario.world.cables[_target(scenario)]).nearest(true.p[0])
+    apart = (true.p[0] - wire.point_W) - (wanted.p - planned_wire)
+    apart -= (apart @ wire.direction) * wire.direction
+    tilt = so3.angle_between(b3, so3.quat_to_matrix(true.q[0])[:, 2])
+    return {"perching_position_m": float(np.linalg.norm(apart)), "perching_in_map_m": float(np.linalg.norm(true.p[0] - wanted.p)),
+            "perching_tilt_deg": math.degrees(tilt)}
+
+
+def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None]:
+    """Mean distance of the mapped target wire from the true one within `AROUND` of the target point, when the first plan is flown.
+
+    Returns:
+        `mapping_in_map_m`: of both in map, odometry's drift included; `mapping_m`: as the vehicle sees them, the mapped one from
+        its estimated pose and the true one from its true pose.
+    """
+    none: dict[str, float | None] = {"mapping_m": None, "mapping_in_map_m": None}
+    plans = [t for t, m in flight.messages("trajectory") if m.at_end in (1, 3) and m.points]
+    truth, estimate = flight.states("ground_truth/odometry"), flight.states("odometry")
+    maps = [m for t, m in flight.messages("powerlines") if plans and t <= plans[0] and m.lines]
+    if not maps or truth is None or estimate is None:
+        return none
+    point, cable = np.array(scenario.mission.perch_point), CableLine(scenario.world.cables[_target(scenario)])
+    ends = min(((to_array(m.start), to_array(m.end)) for m in maps[-1].lines), key=lambda ab: _distance(point, *ab))
+    samples = np.linspace(*ends, 400)
+    samples = samples[np.linalg.norm(samples - point, axis=1) < AROUND]
+    if not len(samples):
+        return none
+    moment = np.array([to_seconds(maps[-1].header.stamp)])
+    believed, true = estimate.at(moment), truth.at(moment)
+    turn = so3.quat_to_matrix(true.q[0]) @ so3.quat_to_matrix(believed.q[0]).T
+    seen = true.p[0] + (samples - believed.p[0]) @ turn.T
+    return {"mapping_m": float(np.mean([cable.nearest(p).distance for p in seen])),
+            "mapping_in_map_m": float(np.mean([cable.nearest(p).distance for p in samples]))}
+
+
+def _distance(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """From a point to a segment [m]."""
+    along = b - a
+    return float(np.linalg.norm(a + np.clip((p - a) @ along / (along @ along), 0.0, 1.0) * along - p))
 
 
 def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, list[RunResult]]:
@@ -61,8 +138,7 @@ def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, li
         tasks = []
         for number, (seed, case) in enumerate((seed, case) for seed in SEEDS for case in cases):
             mapping: dict[str, Any] = config.read_yaml(config.find("scenarios", case))
-            tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, RENDERED,
-                              str((effort.state / "lines" / f"{case}_{seed}").absolute())))
+            tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, RENDERED))
         known = {r.number for r in results.all()}
         progress = Progress(len(tasks), len(known), what="line flights")
         for result in in_pool([t for t in tasks if t.run.number not in known], 1):
