@@ -14,7 +14,7 @@ from perch_core import bernstein
 from perch_core.flatness import flat_to_state
 from perch_core.vehicle import GRAVITY
 from perch_planner import bounds, plan_checks, sturm
-from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
+from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_maximum, rate_parts
 from perch_planner.plan_checks import specific_force
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "oracles"))
@@ -159,12 +159,16 @@ def test_body_rate_is_that_of_flatness_and_its_bound_is_one(seed):
     for s, rate in zip(places[::8], rates[::8]):
         assert rate_at(parts, s) == pytest.approx(rate, rel=1e-6, abs=1e-8)
     worst = max(rates)
-    assert rate_stays_below(parts, 0.95 * worst)[0] == bounds.VIOLATED
-    verdict, place = rate_stays_below(parts, 1.05 * worst)
-    if verdict == bounds.VIOLATED:  # the true maximum lies between the samples
-        assert rate_by_flatness(coefficients, yaw, duration, place) >= 1.05 * worst * (1 - 1e-9)
+    attained, proved, place = rate_maximum(parts, 0.0, np.inf)
+    assert attained == pytest.approx(rate_by_flatness(coefficients, yaw, duration, place), rel=1e-6)
+    assert worst <= proved * (1.0 + 1e-9) and proved <= 1.04 * attained
+    assert rate_maximum(parts, 0.0, 0.95 * worst)[0] >= 0.95 * worst  # broken limits are found out
+    _, proved, _ = rate_maximum(parts, 0.0, 1.001 * attained)  # and those between the enclosure's ends are decided
+    if proved == np.inf:
+        attained, _, place = rate_maximum(parts, 0.0, 1.001 * attained)
+        assert rate_by_flatness(coefficients, yaw, duration, place) >= attained * (1.0 - 1e-6)
     else:
-        assert verdict == bounds.BELOW
+        assert worst <= proved <= 1.001 * attained
 
 
 @given(seeds)

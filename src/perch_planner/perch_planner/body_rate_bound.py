@@ -18,9 +18,6 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_planner.bounds import (
-    BELOW,
-    UNDECIDED,
-    VIOLATED,
     cross,
     derivative,
     dot,
@@ -34,6 +31,8 @@ from perch_planner.bounds import (
 
 _DEPTH = 20
 _NODES = 3000
+RATE_SLACK = 1.04   # of a proved bound above the largest rate that is attained
+_ROUNDING = 1e-9    # bounds are widened by this share
 _TILT = 49          # coefficients of degree 48
 _SIZES = np.array([49, 49, 25, 13, 13, 13, 24, 24, 24, 15, 14])  # of the rows |f|^4, |x|^2, |f|^2, f, x, psi, psi'
 _PARTS = len(_SIZES)
@@ -177,61 +176,63 @@ def _split_parts(parts, left):
 
 
 @compiled
-def _positive(room, parts):
-    """Whether room |f|^4 - |x|^2 has only positive coefficients."""
+def _rate_bound(parts):
+    """Upper bound of |omega| over the interval of the parts; infinite where the enclosure is too wide."""
+    tilt = 0.0
     for k in range(_TILT):
-        if room * parts[0, k] <= parts[1, k]:
-            return False
-    return True
+        if parts[0, k] <= 0.0:
+            return np.inf
+        tilt = max(tilt, parts[1, k] / parts[0, k])
+    spin = _spin_bound(parts)
+    return sqrt(tilt + spin * spin) * (1.0 + _ROUNDING)
 
 
 @compiled
-def rate_stays_below(parts, limit):
-    """Whether |omega| stays below a limit on a segment.
+def rate_maximum(parts, attained, limit):
+    """Largest |omega| on a segment, enclosed as far as it exceeds what is attained elsewhere. [M:alg1]
 
     Args:
         parts: of `rate_parts`.
-        limit: [rad/s].
+        attained: a rate that the plan attains anyhow [rad/s].
+        limit: where the decision has to be exact [rad/s].
 
     Returns:
-        (verdict, place) as `bounds.stays_below`.
+        (attained, proved, place): the largest rate that is known to be attained, at `place` of this segment or, with place
+        -1, elsewhere; and a proved upper bound, 4 % above it at most, and not above a limit that is kept. The search ends
+        when the limit is broken: then `proved` is infinite, as it is where nothing can be proved near `place`.
     """
-    squared = limit * limit
-    if _squared_rate(parts) >= squared:
-        return VIOLATED, 0.0
-    spin = _spin_bound(parts)
-    room = squared - spin * spin
-    if room > 0.0 and _positive(room, parts):
-        return BELOW, 0.0
     stack = np.empty((_DEPTH + 2, _PARTS, _TILT))
     start = np.zeros(_DEPTH + 2)
     depth = np.zeros(_DEPTH + 2, np.int64)
     for row in range(_PARTS):
         for k in range(_TILT):
             stack[0, row, k] = parts[row, k]
+    proved, place = 0.0, -1.0
+    here = sqrt(_squared_rate(stack[0]))
+    if here > attained:
+        attained, place = here, 0.0
     top, nodes = 1, 0
-    doubtful = -1.0
     while top > 0:
         top -= 1
         nodes += 1
-        spin = _spin_bound(stack[top])
-        room = squared - spin * spin
-        if room > 0.0 and _positive(room, stack[top]):
+        if attained >= limit:
+            return attained, np.inf, place
+        bound = _rate_bound(stack[top])
+        if bound <= min(RATE_SLACK * attained, limit):
+            proved = max(proved, bound)
             continue
         if depth[top] >= _DEPTH or nodes >= _NODES:
-            doubtful = start[top]
-            continue
+            return attained, np.inf, start[top]
         level, begin = depth[top] + 1, start[top]
         _split_parts(stack[top], stack[top + 1])
         middle = begin + 0.5**level
-        if _squared_rate(stack[top]) >= squared:
-            return VIOLATED, middle
+        here = sqrt(_squared_rate(stack[top]))
+        if here > attained:
+            attained, place = here, middle
         start[top], depth[top] = middle, level
         start[top + 1], depth[top + 1] = begin, level
         top += 2
-    if doubtful >= 0.0:
-        return UNDECIDED, doubtful
-    return BELOW, 0.0
+    return attained, proved, place
 
 
 @compiled

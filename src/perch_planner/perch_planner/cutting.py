@@ -12,6 +12,7 @@ from math import cos, sin
 import numpy as np
 
 from perch_core.jit import compiled
+from perch_core.vector3 import dot
 from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import derivatives_at
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
@@ -25,6 +26,7 @@ _PREVENTED = ((-1, 0.6), (-1, 0.8), (0, 0.0), (0, 0.15))  # segments from the la
 _LEANS = ((1.0, 0.0), (0.980, 0.199))  # the thrust is upright or leans 11 degrees back where it is greatest
 _RAISE = 1.02       # cuts of the thrust from below
 _HEIGHT_ROOM = 2e-3  # [m]
+_BESIDE = 1.0 / 24.0  # of a segment
 
 
 @compiled
@@ -120,39 +122,42 @@ def turning_side(heading: float) -> np.ndarray:
 
 @compiled
 def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
-    owner, segments, places, orders, direction, lower, upper = _empty(5, 4)
+    owner, segments, places, orders, direction, lower, upper = _empty(9, 6)
     t = r = 0
     for row in (SPEED, HEIGHT, CLEARANCE, BODY_RATE):
         if where[row, 0] < 0.0:
             continue
-        i, s = int(where[row, 0]), where[row, 1]
-        x = derivatives_at(coefficients[i], durations[i], s, 4)
-        owner[t], segments[t], places[t] = r, i, s
-        if row == SPEED:
-            v = x[1]
-            orders[t], upper[r] = 1, _KEEP * speed
-            norm = np.sqrt((v * v).sum())
-            for d in range(3):
-                direction[t, d] = v[d] / norm
-        elif row == HEIGHT:
-            orders[t], direction[t, 2] = 0, 1.0
-            lower[r], upper[r] = low_height + _HEIGHT_ROOM, high_height - _HEIGHT_ROOM
-        else:
+        i = int(where[row, 0])
+        for beside in range(-1, 2):
+            # The body rate has a flat top: it is bounded on both sides of the place, too.
+            s = where[row, 1] + beside * _BESIDE
+            if beside != 0 and (row != BODY_RATE or s < 0.0 or s > 1.0):
+                continue
+            x = derivatives_at(coefficients[i], durations[i], s, 4)
+            owner[t], segments[t], places[t] = r, i, s
             f, j = x[2], x[3]
             f[2] += GRAVITY
-            squared = max((f * f).sum(), 1e-9)
-            if row == CLEARANCE:
+            squared = max(dot(f, f), 1e-9)
+            if row == SPEED:
+                norm = np.sqrt(dot(x[1], x[1]))
+                orders[t], upper[r] = 1, _KEEP * speed
+                for d in range(3):
+                    direction[t, d] = x[1, d] / norm
+            elif row == HEIGHT:
+                orders[t], direction[t, 2] = 0, 1.0
+                lower[r], upper[r] = low_height + _HEIGHT_ROOM, high_height - _HEIGHT_ROOM
+            elif row == CLEARANCE:
                 # The rim's distance at the present tilt: right to first order where the tilt does not change.
-                tilt = np.sqrt(max(1.0 - (f * s3).sum() ** 2 / squared, 0.0))
+                tilt = np.sqrt(max(1.0 - dot(f, s3) ** 2 / squared, 0.0))
                 time = durations[:i].sum() + s * durations[i]
                 orders[t] = 0
-                lower[r] = (s3 * p_S).sum() + time * (s3 * v_S).sum() + 1.1 * extension * tilt + _HEIGHT_ROOM
+                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + 1.1 * extension * tilt + _HEIGHT_ROOM
                 for d in range(3):
                     direction[t, d] = s3[d]
             else:
                 # |j across f| <= W |f|, linear in both at the present directions.
-                share, norm, along = 0.95 * rate, np.sqrt(squared), (f * j).sum() / squared
-                across = np.sqrt(((j - along * f) ** 2).sum())
+                share, norm, along = 0.95 * rate, np.sqrt(squared), dot(f, j) / squared
+                across = np.sqrt(max(dot(j, j) - along * dot(f, j), 0.0))
                 if across <= 1e-6:
                     continue
                 owner[t + 1], segments[t + 1], places[t + 1] = r, i, s
@@ -162,7 +167,7 @@ def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_h
                     direction[t, d] = (j[d] - along * f[d]) / across
                     direction[t + 1, d] = -share * f[d] / norm
                 t += 1
-        t, r = t + 1, r + 1
+            t, r = t + 1, r + 1
     return owner[:t], segments[:t], places[:t], orders[:t], direction[:t], lower[:r], upper[:r]
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from perch_core import bernstein
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
-from perch_planner.body_rate_bound import rate_at, rate_coarse_bound, rate_parts, rate_stays_below
+from perch_planner.body_rate_bound import RATE_SLACK, rate_coarse_bound, rate_maximum, rate_parts
 from perch_planner.bounds import (
     BELOW,
-    VIOLATED,
     cross,
     dot,
     magnitude,
@@ -35,7 +34,6 @@ _PLACES = np.linspace(0.0, 1.0, 13)  # where clearance and rate are sampled
 _AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES) for n in (11, 12, 13, 14))
 
 _RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
-_RATE_ROUNDS = 8
 _FINE = 1e-10      # where a limit falls inside the enclosure
 _CLEARANCE_SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself
 
@@ -255,6 +253,8 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
         coarse[i] = rate_coarse_bound(force, jerk, yaw[i], T)
         if rate_here > rate_wanted:
             rate_wanted, out[BODY_RATE, MAXIMUM_AT] = rate_here, begin + T * rate_at_
+        if rate_here >= rate:
+            _doubt(where, BODY_RATE, i, rate_at_)
         begin += T
     out[SPEED, MINIMUM] = 0.0
     _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, clearance, gap_wanted)
@@ -270,7 +270,7 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
 @compiled
 def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, limit, sampled):
     """Prove a clearance near the sampled one, or else that the limit holds, or else find where it fails."""
-    out[3, 0], out[3, 2] = -np.inf, np.inf
+    out[CLEARANCE, MINIMUM], out[CLEARANCE, MAXIMUM] = -np.inf, np.inf
     for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, limit):
         if gap < limit:
             continue
@@ -285,46 +285,32 @@ def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extensio
                 break
             begin += durations[i]
         if failed < 0:
-            out[3, 0] = gap
+            out[CLEARANCE, MINIMUM] = gap
             return
         if gap == limit:
-            where[3, 0], where[3, 1] = failed, place
+            _doubt(where, CLEARANCE, failed, place)
 
 
 @compiled
 def _prove_rate(out, where, coefficients, yaw, durations, coarse, limit, sampled):
-    """Prove a body rate near the greatest that is attained, or else that the limit holds, or else where it fails."""
-    out[4, 0], out[4, 2] = 0.0, np.inf
-    attained, slack = sampled, 1.04
-    parts = np.empty((len(durations), 11, 49))
-    known = np.zeros(len(durations), np.bool_)
-    for k in range(_RATE_ROUNDS):
-        bound = slack * attained
-        if not bound < limit or k == _RATE_ROUNDS - 1:
-            bound = limit
-        failed, verdict, place = -1, BELOW, 0.0
-        for i in range(len(durations)):
-            if coarse[i] < bound:
-                continue
-            if not known[i]:
-                T = durations[i]
-                parts[i] = rate_parts(specific_force(coefficients[i], T), time_derivative(coefficients[i], 3, T), yaw[i], T)
-                known[i] = True
-            verdict, place = rate_stays_below(parts[i], bound)
-            if verdict != BELOW:
-                failed = i
-                break
-        if failed < 0:
-            out[4, 2] = bound
-            return
-        if bound == limit:
-            where[4, 0], where[4, 1] = failed, place
-            return
-        if verdict == VIOLATED:
-            attained = max(attained, rate_at(parts[failed], place))
-            begin = 0.0
-            for i in range(failed):
-                begin += durations[i]
-            out[4, 3] = begin + place * durations[failed]
-        else:
-            slack *= 1.1
+    """Prove a body rate near the greatest that is attained, or find where the limit fails.
+
+    `sampled` is the greatest of `_sample`; `coarse` bounds the rate on each segment.
+    """
+    out[BODY_RATE, MINIMUM], out[BODY_RATE, MAXIMUM] = 0.0, np.inf
+    if sampled >= limit:
+        return
+    attained, most, begin = sampled, sampled, 0.0
+    for i in range(len(durations)):
+        T, proved = durations[i], coarse[i]
+        if proved > min(RATE_SLACK * attained, limit):
+            parts = rate_parts(specific_force(coefficients[i], T), time_derivative(coefficients[i], 3, T), yaw[i], T)
+            attained, proved, place = rate_maximum(parts, attained, limit)
+            if place >= 0.0:
+                out[BODY_RATE, MAXIMUM_AT] = begin + place * T
+            if proved > limit:
+                _doubt(where, BODY_RATE, i, max(place, 0.0))
+                return
+        most = max(most, proved)
+        begin += T
+    out[BODY_RATE, MAXIMUM] = most
