@@ -194,7 +194,4 @@ def rotor_bounds(thrusts: tuple[np.ndarray, np.ndarray], coefficients: np.ndarra
         coefficients, yaw, durations: the plan.
         rotors: of `rotor_thrusts.rotor_model`.
     """
-    segments, places, gradients, lower, upper = linear_bounds(*thrusts, coefficients, yaw, durations, low, high, *rotors)
-    count = len(lower)
-    return Bounds(np.repeat(np.arange(count), 3), np.repeat(segments, 3), np.repeat(places, 3), np.tile((2, 3, 4), count),
-                  gradients.reshape(-1, 3), lower, upper)
+    return Bounds(*linear_bounds(*thrusts, coefficients, yaw, durations, low, high, *rotors))

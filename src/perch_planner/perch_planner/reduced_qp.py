@@ -248,7 +248,9 @@ def _further(durations, bubbles, unit, spread, centre, owner, segments, places, 
     column, constant = np.empty(m), np.empty(3)
     for q in range(len(owner)):
         i, r = segments[q], owner[q]
-        _place(_functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, column, constant)
+        # Terms of one functional often follow each other.
+        if q == 0 or i != segments[q - 1] or places[q] != places[q - 1] or orders[q] != orders[q - 1]:
+            _place(_functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, column, constant)
         for d in range(3):
             for k in range(m):
                 rows[r, d * m + k] += direction[q, d] * column[k]

@@ -19,10 +19,10 @@ from perch_core.flatness import commanded_frame, heading_derivatives
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_planner.bounds import derivative, derivatives_at, value
+from perch_planner.bounds import time_derivative
 
 _PLACES = np.linspace(0.0, 1.0, 49)
-_AT10, _AT11, _AT12, _AT13, _AT14 = (np.ascontiguousarray(bernstein.basis(n, _PLACES).T) for n in range(10, 15))
+_BASES = tuple(bernstein.basis(n, _PLACES) for n in range(10, 15))
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
 _ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
@@ -53,9 +53,29 @@ def thrusts_of(f, j, s, heading, mass, J, mixing):
 
 
 @compiled
-def _heading_at(yaw, duration, s):
-    """Yaw and its two derivatives at one place of a segment, 3 floats."""
-    return (value(yaw, s), value(derivative(yaw, 1), s) / duration, value(derivative(yaw, 2), s) / duration**2)
+def _motion(coefficients, yaw, duration):
+    """Specific force, jerk and snap, yaw and its first two derivatives at the places of a segment, shape (49, 12)."""
+    out = np.zeros((len(_PLACES), 12))
+    for order in range(2, 5):
+        rows, basis = time_derivative(coefficients, order, duration), _BASES[4 - order]
+        for k in range(len(_PLACES)):
+            for d in range(3):
+                for i in range(rows.shape[1]):
+                    out[k, 3 * (order - 2) + d] += basis[k, i] * rows[d, i]
+    for order in range(3):
+        rows, basis = time_derivative(yaw.reshape((1, 15)), order, duration), _BASES[4 - order]
+        for k in range(len(_PLACES)):
+            for i in range(rows.shape[1]):
+                out[k, 9 + order] += basis[k, i] * rows[0, i]
+    for k in range(len(_PLACES)):
+        out[k, 2] += GRAVITY
+    return out
+
+
+@compiled
+def _thrusts_at(x, mass, J, mixing):
+    """Rotor thrusts [N] of one row of `_motion`."""
+    return thrusts_of((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8]), (x[9], x[10], x[11]), mass, J, mixing)
 
 
 @compiled
@@ -93,18 +113,9 @@ def sampled(coefficients, yaw, durations, mass, J, mixing):
     begin = 0.0
     for i in range(f):
         T = durations[i]
-        a, j, s = np.empty((3, 13)), np.empty((3, 12)), np.empty((3, 11))
-        for d in range(3):
-            a[d] = derivative(coefficients[i, d], 2) / T**2
-            j[d] = derivative(coefficients[i, d], 3) / T**3
-            s[d] = derivative(coefficients[i, d], 4) / T**4
-        a, j, s = a @ _AT12, j @ _AT11, s @ _AT10
-        h, dh = yaw[i] @ _AT14, derivative(yaw[i], 1) @ _AT13 / T
-        ddh = derivative(yaw[i], 2) @ _AT12 / T**2
+        motion = _motion(coefficients[i], yaw[i], T)
         for k in range(len(_PLACES)):
-            out[i, k] = thrusts_of(
-                (a[0, k], a[1, k], a[2, k] + GRAVITY), (j[0, k], j[1, k], j[2, k]), (s[0, k], s[1, k], s[2, k]),
-                (h[k], dh[k], ddh[k]), mass, J, mixing)
+            out[i, k, 0], out[i, k, 1], out[i, k, 2], out[i, k, 3] = _thrusts_at(motion[k], mass, J, mixing)
         for q in range(4):
             place, found = _vertex(out[i, :, q], out[i, :, q].argmin(), -1.0)
             if found < row[0]:
@@ -126,49 +137,59 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        (segments, places, gradients, lower, upper): where, shape (n,); gradients by acceleration, jerk and snap, shape
-        (n, 3, 3); bounds of the sum of gradients times derivatives, shape (n,).
+        Fields of `segment_program.Bounds`: for each rotor and place one bound on a sum of acceleration, jerk and snap. Terms
+        of one derivative at one place stand together.
     """
     near, keep = _NEAR * (high - low), _KEEP * (high - low)
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
     below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
-    chosen = np.zeros(thrusts.shape, np.int8)
     count = 0
     for i in range(thrusts.shape[0]):
         for k in range(thrusts.shape[1]):
             for q in range(4):
-                if thrusts[i, k, q] < low + near:
-                    chosen[i, k, q] = 1
-                elif thrusts[i, k, q] > high - near:
-                    chosen[i, k, q] = 2
-                count += chosen[i, k, q] > 0
-    segments, places, gradients = np.empty(count, np.int64), np.empty(count), np.empty((count, 3, 3))
+                count += thrusts[i, k, q] < low + near or thrusts[i, k, q] > high - near
+    owner, segments, orders = np.empty(3 * count, np.int64), np.empty(3 * count, np.int64), np.empty(3 * count, np.int64)
+    places, direction = np.empty(3 * count), np.empty((3 * count, 3))
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
-    n = 0
+    r = t = 0
+    slopes, known = np.empty((4, 9)), np.empty(4)
     for i in range(thrusts.shape[0]):
+        motion, ready = np.empty((0, 12)), False
         for k in range(thrusts.shape[1]):
-            if not chosen[i, k].any():
-                continue
-            place = _PLACES[k]
-            x = derivatives_at(coefficients[i], durations[i], place, 5)[2:]
-            heading = _heading_at(yaw[i], durations[i], place)
-            slopes = np.empty((4, 3, 3))
-            for order in range(3):
-                for d in range(3):
-                    z = x.copy()
-                    z[order, d] += _STEPS[order]
-                    moved = thrusts_of((z[0, 0], z[0, 1], z[0, 2] + GRAVITY), (z[1, 0], z[1, 1], z[1, 2]),
-                                       (z[2, 0], z[2, 1], z[2, 2]), heading, mass, J, mixing)
-                    for q in range(4):
-                        slopes[q, order, d] = (moved[q] - thrusts[i, k, q]) / _STEPS[order]
+            chosen = 0
             for q in range(4):
-                if chosen[i, k, q]:
-                    known = (slopes[q] * x).sum() - thrusts[i, k, q]
-                    segments[n], places[n] = i, place
-                    gradients[n] = slopes[q]
-                    if chosen[i, k, q] == 1:
-                        lower[n] = above + known
-                    else:
-                        upper[n] = below + known
-                    n += 1
-    return segments, places, gradients, lower, upper
+                chosen += thrusts[i, k, q] < low + near or thrusts[i, k, q] > high - near
+            if chosen == 0:
+                continue
+            if not ready:
+                motion, ready = _motion(coefficients[i], yaw[i], durations[i]), True
+            x = motion[k]
+            for q in range(4):
+                known[q] = -thrusts[i, k, q]
+            for e in range(9):
+                step, value = _STEPS[e // 3], x[e]
+                x[e] += step
+                moved = _thrusts_at(x, mass, J, mixing)
+                x[e] = value
+                if e == 2:
+                    value -= GRAVITY  # the bound is on the acceleration
+                for q in range(4):
+                    slopes[q, e] = (moved[q] - thrusts[i, k, q]) / step
+                    known[q] += slopes[q, e] * value
+            first = r
+            for q in range(4):
+                if thrusts[i, k, q] < low + near:
+                    lower[r] = above + known[q]
+                    r += 1
+                elif thrusts[i, k, q] > high - near:
+                    upper[r] = below + known[q]
+                    r += 1
+            for order in range(3):
+                r = first
+                for q in range(4):
+                    if thrusts[i, k, q] < low + near or thrusts[i, k, q] > high - near:
+                        owner[t], segments[t], places[t], orders[t] = r, i, _PLACES[k], order + 2
+                        for d in range(3):
+                            direction[t, d] = slopes[q, 3 * order + d]
+                        r, t = r + 1, t + 1
+    return owner, segments, places, orders, direction, lower, upper
