@@ -46,3 +46,56 @@ def test_cells_in_which_faces_meet(world, half):
     agree = np.isclose(ours, theirs, rtol=1e-4, atol=1e-2).all(axis=0)
     assert agree.mean() > 0.999  # the odd sample lies on an edge
     assert 0.1 < (ours[0] > 1e-6).mean()
+
+
+def test_classified_cells(world):
+    rng, M, _, _ = world
+    nodes = np.concatenate([rng.uniform(-0.5, 0.5, (2, 9 * 7)), np.ones((1, 9 * 7))]).astype(np.float32)
+    index = np.arange(9 * 7).reshape(7, 9)
+    corner_nodes = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1).reshape(-1, 4)
+    half, bounded = np.full((FACES, 2), np.inf, np.float32), np.array([-1, 0, -1, 1, -1])
+    half[[1, 3]] = 0.2
+    crossed = rng.random((2, len(corner_nodes))) < 0.2
+    found = []
+    for draw in (kernels.classify, kernels.classify_numpy):
+        out = np.empty(len(corner_nodes), np.int64), np.empty(len(corner_nodes), bool), crossed.copy()
+        draw(M, half, bounded, nodes, corner_nodes, *out)
+        found.append(out)
+    for ours, theirs in zip(*found):
+        np.testing.assert_array_equal(ours, theirs)
+    first, uniform, shown = found[0]
+    assert len(set(first)) > 1 and 0 < shown[0].sum() < len(first) and not (uniform & crossed.any(axis=0)).any()
+
+
+def test_levels_of_the_atlas(world):
+    rng, M, _, _ = world
+    centres = np.concatenate([rng.uniform(-0.5, 0.5, (CELLS, 2)), np.ones((CELLS, 1))], axis=1).astype(np.float32)
+    cells, face = rng.permutation(CELLS)[:40], rng.integers(0, FACES, 40)
+    table, levels = rng.normal(size=(FACES, 9, 4)).astype(np.float32), np.array([9, 4, 9, 1, 9])
+    angle, texel = np.full(CELLS, 0.004, np.float32), rng.uniform(0.0005, 0.02, FACES)
+    ours, theirs = np.empty((2, 40, 4), np.float32)
+    for draw, out in ((kernels.affine_of_cells, ours), (kernels.affine_of_cells_numpy, theirs)):
+        draw(M, np.full(FACES, 1.5), texel, centres, angle, table, levels, cells, face, 2, 2, out)
+    np.testing.assert_array_equal(ours, theirs)
+    assert len(np.unique(ours[:, 0])) > 3
+
+
+def test_faces_behind(world):
+    rng, M, _, corners = world
+    room, cells = np.array([0, 2, 3]), rng.permutation(CELLS)[:40]
+    ours, theirs = np.zeros((2, 3, 40), bool)
+    kernels.faces_behind(M, room, corners, cells, ours)
+    kernels.faces_behind_numpy(M, room, corners, cells, theirs)
+    np.testing.assert_array_equal(ours, theirs)
+    assert ours.any(axis=0).all() and (ours.sum(axis=0) > 1).any()
+
+
+@pytest.mark.parametrize("samples", [1, 4, 9])
+def test_placed_texels(samples):
+    rng = np.random.default_rng(5)
+    texels, cells = rng.integers(0, 256, (6, 64 * samples), np.uint8), np.array([7, 0, 3, 11, 5, 8])
+    ours, theirs = np.zeros((2, 3, 8, 4, 8), np.uint8)
+    kernels.place_texels(texels, cells, samples, ours)
+    kernels.place_texels_numpy(texels, cells, samples, theirs)
+    np.testing.assert_array_equal(ours, theirs)
+    assert ours[1, 2, 3, 5] == round(texels[0, 21 * samples: 22 * samples].mean() + 1e-9)

@@ -1,4 +1,4 @@
-"""The renderer's inner loops over samples, compiled.
+"""The renderer's inner loops over cells and samples, compiled.
 
 In numpy each arithmetic operation is a pass over all samples of all cells; compiled, a sample is finished in registers, and
 without the interpreter lock, so that the drawing threads do not hold up the node's steps. The functions in numpy serve
@@ -10,6 +10,85 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core.jit import COMPILED, compiled
+
+
+@compiled(nogil=True)
+def _classify(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.ndarray, corner_nodes: np.ndarray,
+              first: np.ndarray, uniform: np.ndarray, shown: np.ndarray) -> None:
+    count = nodes.shape[1]
+    winner = np.empty(count, np.int32)
+    hits = np.zeros((len(shown), count), np.bool_)
+    for i in range(count):
+        x, y, z = nodes[0, i], nodes[1, i], nodes[2, i]
+        nearest, winner[i] = np.float32(0.0), -1
+        for f in range(len(M)):
+            inverse = M[f, 2, 0] * x + M[f, 2, 1] * y + M[f, 2, 2] * z
+            if inverse > 1e-6:
+                row = bounded[f]
+                if row >= 0:
+                    u = M[f, 0, 0] * x + M[f, 0, 1] * y + M[f, 0, 2] * z
+                    v = M[f, 1, 0] * x + M[f, 1, 1] * y + M[f, 1, 2] * z
+                    if abs(u) > half[f, 0] * inverse or abs(v) > half[f, 1] * inverse:
+                        continue
+                    hits[row, i] = True
+                if inverse > nearest:
+                    nearest, winner[i] = inverse, f
+    for cell in range(len(first)):
+        a, b, c, d = corner_nodes[cell]
+        one = winner[a]
+        first[cell] = one
+        alike = winner[b] == one and winner[c] == one and winner[d] == one
+        for row in range(len(shown)):
+            if shown[row, cell]:
+                alike = False
+            elif hits[row, a] or hits[row, b] or hits[row, c] or hits[row, d]:
+                shown[row, cell] = True
+        uniform[cell] = alike
+
+
+@compiled(nogil=True)
+def _affine_of_cells(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
+                     table: np.ndarray, levels: np.ndarray, cells: np.ndarray, face: np.ndarray, supersampling: int,
+                     levels_per_octave: int, out: np.ndarray) -> None:
+    for i in range(len(cells)):
+        f, cell = face[i], cells[i]
+        inverse = max(M[f, 2, 0] * centres[cell, 0] + M[f, 2, 1] * centres[cell, 1] + M[f, 2, 2] * centres[cell, 2], 1e-3)
+        slant = min(max(inverse * distance[f], 0.02), 1.0)
+        footprint = pixel_angle[cell] / (inverse * texel[f] * np.sqrt(slant))
+        level = round(levels_per_octave * np.log2(footprint / supersampling))
+        out[i] = table[f, int(min(max(level, 0), levels[f] - 1))]
+
+
+@compiled(nogil=True)
+def _faces_behind(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: np.ndarray, shown: np.ndarray) -> None:
+    for i in range(len(cells)):
+        rays = corners[cells[i]]
+        for c in range(4):
+            best, nearest = 0, np.float32(-np.inf)
+            for k in range(len(room)):
+                m = M[room[k], 2]
+                inverse = m[0] * rays[0, c] + m[1] * rays[1, c] + m[2] * rays[2, c]
+                if inverse > nearest:
+                    best, nearest = k, inverse
+            shown[best, i] = True
+
+
+@compiled(nogil=True)
+def _place_texels(texels: np.ndarray, cells: np.ndarray, samples: int, image: np.ndarray) -> None:
+    size, cols = image.shape[1], image.shape[2]
+    for i in range(len(cells)):
+        row, col = cells[i] // cols, cells[i] % cols
+        for a in range(size):
+            if samples == 1:
+                for b in range(size):
+                    image[row, a, col, b] = texels[i, a * size + b]
+                continue
+            for b in range(size):
+                first = (a * size + b) * samples
+                total = samples // 2
+                for s in range(first, first + samples):
+                    total += texels[i, s]
+                image[row, a, col, b] = total // samples
 
 
 @compiled(nogil=True)
@@ -66,6 +145,90 @@ def _nearer_samples(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners
                     to_y[s] = sy * (v * scale) + oy
 
 
+def classify_numpy(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.ndarray, corner_nodes: np.ndarray,
+                   first: np.ndarray, uniform: np.ndarray, shown: np.ndarray) -> None:
+    """Which face each cell shows.
+
+    Args:
+        M: of the faces, see `View`, float32, shape (faces, 3, 3).
+        half: half extents, infinite where a face is not bounded, float32, shape (faces, 2) [m].
+        bounded: row in `shown` of each face, -1 for those without edges, shape (faces,).
+        nodes: rays at the corners of cells, float32, shape (3, n).
+        corner_nodes: each cell's corners, shape (cells, 4).
+        first: filled with the face at each cell's first corner, -1: none, shape (cells,).
+        uniform: filled with whether the cell shows that face alone, shape (cells,) bool.
+        shown: holds the cells that an edge of each bounded face crosses; gets those added in which a corner's ray hits the
+            face, shape (bounded faces, cells) bool.
+    """
+    q = (M.reshape(-1, 3) @ nodes).reshape(len(M), 3, nodes.shape[1])
+    inverse = q[:, 2]
+    hit = inverse > 1e-6
+    edged = np.flatnonzero(bounded >= 0)
+    hit[edged] &= np.all(np.abs(q[edged, :2]) <= half[edged][:, :, None] * inverse[edged][:, None, :], axis=1)
+    inverse = np.where(hit, inverse, -1.0)
+    winner = np.where(inverse.max(axis=0) > 0, inverse.argmax(axis=0), -1)[corner_nodes]
+    first[:] = winner[:, 0]
+    uniform[:] = (winner == first[:, None]).all(axis=1) & ~shown.any(axis=0)
+    shown[bounded[edged]] |= hit[edged][:, corner_nodes].any(axis=2)
+
+
+def affine_of_cells_numpy(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
+                          table: np.ndarray, levels: np.ndarray, cells: np.ndarray, face: np.ndarray, supersampling: int,
+                          levels_per_octave: int, out: np.ndarray) -> None:
+    """The atlas level that fits each cell: its texels are as large as a sample's footprint on the face.
+
+    Args:
+        M, distance: of the faces, see `View`.
+        texel: size of the faces' texels at level 0 [m], shape (faces,).
+        centres, pixel_angle: of the grid's cells, see `CellGrid`.
+        table, levels: `Atlas.affine`, `Atlas.levels`.
+        cells, face: the cells to draw and the face that each shows, shapes (n,).
+        supersampling: samples per pixel and direction.
+        levels_per_octave: of the atlas.
+        out: filled with (sx, ox, sy, oy), float32, shape (n, 4).
+    """
+    footprint = texels_per_pixel(M, distance, texel, centres, pixel_angle, cells, face) / supersampling
+    level = np.rint(levels_per_octave * np.log2(footprint))
+    out[:] = table[face, np.clip(level, 0, levels[face] - 1).astype(int)]
+
+
+def texels_per_pixel(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
+                     cells: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Geometric mean of a pixel's footprint on faces, at the cells' centres, shape (n,); arguments as in `affine_of_cells`."""
+    inverse = np.maximum(np.einsum("ij,ij->i", M[face, 2], centres[cells]), 1e-3)
+    slant = np.clip(inverse * distance[face], 0.02, 1.0)  # cosine between ray and normal
+    return pixel_angle[cells] / (inverse * texel[face] * np.sqrt(slant))
+
+
+def faces_behind_numpy(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: np.ndarray, shown: np.ndarray) -> None:
+    """The faces of the room behind everything else, cell by cell.
+
+    Args:
+        M: of the faces, see `View`, float32, shape (faces, 3, 3).
+        room: the faces without edges, shape (r,).
+        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
+        cells: the cells asked for, shape (n,).
+        shown: set where a corner of the cell sees the face, shape (r, n) bool.
+    """
+    behind = (M[room, 2] @ corners[cells]).argmax(axis=1)  # (n, 4)
+    shown[behind, np.arange(len(cells))[:, None]] = True
+
+
+def place_texels_numpy(texels: np.ndarray, cells: np.ndarray, samples: int, image: np.ndarray) -> None:
+    """Texels, averaged per pixel, into the image's cells.
+
+    Args:
+        texels: uint8, shape (n, pixels of a cell * samples).
+        cells: where they belong, shape (n,).
+        samples: per pixel.
+        image: uint8, shape (rows, size, columns, size) of cells.
+    """
+    size, cols = image.shape[1], image.shape[2]
+    total = texels.reshape(len(cells), size, size, samples).sum(axis=-1, dtype=np.int64)
+    row, col = np.divmod(cells, cols)
+    image[row, :, col, :] = (total + samples // 2) // samples
+
+
 def uniform_samples_numpy(M: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray, face: np.ndarray,
                           weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
     """Atlas coordinates of the samples of cells that show one face each.
@@ -115,5 +278,9 @@ def nearer_samples_numpy(m: np.ndarray, half: np.ndarray, affine: np.ndarray, co
     nearest[rows] = before
 
 
+classify = _classify if COMPILED else classify_numpy
+affine_of_cells = _affine_of_cells if COMPILED else affine_of_cells_numpy
+faces_behind = _faces_behind if COMPILED else faces_behind_numpy
+place_texels = _place_texels if COMPILED else place_texels_numpy
 uniform_samples = _uniform_samples if COMPILED else uniform_samples_numpy
 nearer_samples = _nearer_samples if COMPILED else nearer_samples_numpy

@@ -12,7 +12,7 @@ import numpy as np
 from perch_core.camera import Camera
 from perch_sim.rendering.atlas import LEVELS_PER_OCTAVE, Atlas
 from perch_sim.rendering.grid import CELL, CellGrid, sample_weights
-from perch_sim.rendering.kernels import nearer_samples, uniform_samples
+from perch_sim.rendering.kernels import affine_of_cells, faces_behind, nearer_samples, place_texels, texels_per_pixel, uniform_samples
 from perch_sim.rendering.visibility import FaceArrays, View, look
 
 MIXED_SUPERSAMPLING = 2  # where faces meet, in each direction
@@ -35,8 +35,7 @@ class Rasterizer:
         """
         grid, faces = self.grid, self.faces
         view = look(faces, grid, self.camera, p_WC, R_WC, shift_W)
-        first = view.winner[:, 0]
-        uniform = (view.winner == first[:, None]).all(axis=1) & ~view.crossed.any(axis=0)
+        first, uniform = view.first, view.uniform
         image = np.full((grid.rows, CELL, grid.cols, CELL), int(self.atlas.image[
             int(self.atlas.void[1]), int(self.atlas.void[0])]), np.uint8)
         fine_face = np.zeros(len(faces.fine) + 1, dtype=bool)
@@ -44,7 +43,7 @@ class Rasterizer:
         lit = ~grid.blind & (first >= 0)
         fine = uniform & fine_face[first]
         mixed = ~uniform & ~grid.blind
-        tagged = mixed & self._shows_pad(view)
+        tagged = mixed & view.shown[faces.fine[faces.bounded]].any(axis=0)
         supersampling = self._fine_supersampling(view, np.flatnonzero((fine & lit) | tagged))
         self._draw_uniform(image, view, np.flatnonzero(uniform & lit & ~fine), first, 1)
         self._draw_uniform(image, view, np.flatnonzero(fine & lit), first, supersampling)
@@ -56,32 +55,23 @@ class Rasterizer:
             image = np.where(blind[: self.camera.height, : self.camera.width], 0, image)
         return np.ascontiguousarray(image)
 
-    def _shows_pad(self, view: View) -> np.ndarray:
-        rows = np.flatnonzero(self.faces.fine[self.faces.bounded])
-        return (view.crossed[rows].any(axis=0) | view.inside[rows].any(axis=(0, 2)))
-
-    def _texels_per_pixel(self, view: View, cells: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """Geometric mean of a pixel's footprint on faces, at the cells' centres; shape of `cells`."""
-        inverse = np.maximum(np.einsum("ij,ij->i", view.M[face, 2], self.grid.centres[cells]), 1e-3)
-        slant = np.clip(inverse * view.distance[face], 0.02, 1.0)  # cosine between ray and normal
-        return self.grid.pixel_angle[cells] / (inverse * self.faces.texel[face] * np.sqrt(slant))
-
     def _fine_supersampling(self, view: View, cells: np.ndarray) -> int:
         """Samples per pixel and direction for the cells that show the pad."""
         if not len(cells):
             return 1
         pad = np.full(len(cells), np.flatnonzero(self.faces.fine)[0])
-        footprint = float(np.median(self._texels_per_pixel(view, cells, pad)))
+        footprint = float(np.median(texels_per_pixel(view.M, view.distance, self.faces.texel, self.grid.centres,
+                                                     self.grid.pixel_angle, cells, pad)))
         wanted = np.ceil(PAD_SUPERSAMPLING * min(footprint, 1.0))
         affordable = int(np.sqrt(FINE_SAMPLES / (len(cells) * CELL**2)))
         return int(np.clip(wanted, 1, max(1, affordable)))
 
     def _affine(self, view: View, cells: np.ndarray, face: np.ndarray, supersampling: int) -> np.ndarray:
         """(sx, ox, sy, oy) of the atlas level that fits each cell, shape (cells, 4): see `Atlas.affine`."""
-        footprint = self._texels_per_pixel(view, cells, face) / supersampling
-        level = np.rint(LEVELS_PER_OCTAVE * np.log2(footprint))
-        level = np.clip(level, 0, self.atlas.levels[face] - 1).astype(int)
-        return self.atlas.affine[face, level]
+        out = np.empty((len(cells), 4), np.float32)
+        affine_of_cells(view.M, view.distance, self.faces.texel, self.grid.centres, self.grid.pixel_angle, self.atlas.affine,
+                        self.atlas.levels, cells, face, supersampling, LEVELS_PER_OCTAVE, out)
+        return out
 
     def _draw_uniform(self, image: np.ndarray, view: View, cells: np.ndarray, first: np.ndarray,
                       supersampling: int) -> None:
@@ -108,15 +98,10 @@ class Rasterizer:
 
     def _candidates(self, view: View, cells: np.ndarray) -> list[tuple[int, np.ndarray]]:
         """Faces that may show in mixed cells, each with the rows of `cells` where it may."""
-        room = self.faces.half[:, 0] == np.inf
-        found = []
-        behind = view.M[:, 2][room] @ self.grid.corners[cells]  # (cells, room faces, 4): the room behind the panels
-        behind = np.flatnonzero(room)[behind.argmax(axis=1)]
-        for face in np.flatnonzero(room & view.front):
-            found.append((int(face), np.flatnonzero((behind == face).any(axis=1))))
-        for row, face in enumerate(self.faces.bounded):
-            shown = view.crossed[row, cells] | view.inside[row, cells].any(axis=1)
-            found.append((int(face), np.flatnonzero(shown)))
+        behind = np.zeros((len(self.faces.room), len(cells)), bool)
+        faces_behind(view.M, self.faces.room, self.grid.corners, cells, behind)
+        found = [(int(face), np.flatnonzero(rows)) for face, rows in zip(self.faces.room, behind) if view.front[face]]
+        found += [(int(face), np.flatnonzero(rows)) for face, rows in zip(self.faces.bounded, view.shown[:, cells])]
         return [(face, rows) for face, rows in found if len(rows)]
 
     def _look_up(self, image: np.ndarray, cells: np.ndarray, x: np.ndarray, y: np.ndarray,
@@ -124,8 +109,4 @@ class Rasterizer:
         """Texels at x, y (cells, samples), averaged per pixel, into the image's cells."""
         # remap wants sides below 32768, which whole cells in rows keep
         texels = cv2.remap(self.atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        if supersampling > 1:
-            texels = texels.reshape(-1, supersampling**2)
-            texels = cv2.reduce(texels, 1, cv2.REDUCE_AVG)
-        row, col = np.divmod(cells, self.grid.cols)
-        image[row, :, col, :] = texels.reshape(-1, CELL, CELL)
+        place_texels(texels, cells, supersampling**2, image)

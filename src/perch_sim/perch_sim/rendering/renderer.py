@@ -95,7 +95,7 @@ class Renderer:
             return 1
         (p0, R0), (p1, R1) = (self.mount.pose(*pose) for pose in (poses[0], poses[-1]))
         depth = np.maximum(np.abs((self._faces.centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
-        turn = np.linalg.norm(so3.log(R0.T @ R1))
+        turn = 2.0 * np.arcsin(min(np.linalg.norm(R1 - R0) / np.sqrt(8.0), 1.0))
         motion = self.mount.camera.fx * (turn + np.linalg.norm(p1 - p0) / np.median(np.sort(depth)[:3]))
         return int(np.clip(np.ceil(motion / BLUR_STEP), 1, MAX_SUBFRAMES))
 
@@ -109,5 +109,5 @@ def spread(poses: list[Pose], count: int) -> list[Pose]:
         before = min(int(share), len(poses) - 2)
         part = share - before
         (p0, R0), (p1, R1) = poses[before], poses[before + 1]
-        out.append((p0 + part * (p1 - p0), R0 @ so3.exp(part * so3.log(R0.T @ R1))))
+        out.append((p0, R0) if part == 0.0 else (p0 + part * (p1 - p0), R0 @ so3.exp(part * so3.log(R0.T @ R1))))
     return out

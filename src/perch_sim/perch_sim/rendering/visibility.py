@@ -13,6 +13,7 @@ import numpy as np
 
 from perch_core.camera import Camera
 from perch_sim.rendering.grid import CellGrid
+from perch_sim.rendering.kernels import classify
 from perch_sim.rendering.scene import Face
 
 EDGE_SAMPLES = 128  # points per edge by which the cells are found that an edge crosses
@@ -28,7 +29,8 @@ class FaceArrays:
         half: half extents, shape (n, 2) [m]; infinite where the face is not bounded.
         texel: [m], shape (n,).
         moving, fine: bool, shape (n,): moves with the target; drawn with several samples per pixel.
-        bounded: indices of the faces with edges, shape (m,).
+        bounded: indices of the faces with edges, shape (m,); room: of the others.
+        row: place of each face in `bounded`, -1 for those without edges, shape (n,).
         edges_W: points on their edges, shape (m, 4 * EDGE_SAMPLES, 3).
     """
 
@@ -41,6 +43,8 @@ class FaceArrays:
     moving: np.ndarray
     fine: np.ndarray
     bounded: np.ndarray
+    room: np.ndarray
+    row: np.ndarray
     edges_W: np.ndarray
 
     @classmethod
@@ -48,12 +52,14 @@ class FaceArrays:
         """From the faces of a scene."""
         bounded = [i for i, face in enumerate(faces) if face.bounded]
         edges = [_edge_points(faces[i]) for i in bounded]
+        row = np.full(len(faces), -1)
+        row[bounded] = np.arange(len(bounded))
         return cls(
             np.array([f.centre_W for f in faces]), np.array([f.right_W for f in faces]),
             np.array([f.up_W for f in faces]), np.array([f.normal_W for f in faces]),
             np.array([f.half if f.bounded else (np.inf, np.inf) for f in faces]),
             np.array([f.texel for f in faces]), np.array([f.moving for f in faces]),
-            np.array([f.kind == "pad" for f in faces]), np.array(bounded, dtype=int),
+            np.array([f.kind == "pad" for f in faces]), np.array(bounded, dtype=int), np.flatnonzero(row < 0), row,
             np.array(edges).reshape(len(bounded), 4 * EDGE_SAMPLES, 3),
         )
 
@@ -73,17 +79,18 @@ class View:
         M: ray in C -> (u/range, v/range, 1/range), float32, shape (n, 3, 3); zero for faces that turn away.
         distance: of the camera from each face's plane [m], shape (n,).
         front: faces that turn towards the camera, shape (n,) bool.
-        winner: face that each cell shows at its four corners (-1: none), shape (cells, 4).
-        inside: for each bounded face, whether the corners' rays hit it, shape (m, cells, 4).
-        crossed: for each bounded face, whether one of its edges crosses a cell, shape (m, cells).
+        first: face that each cell shows at its first corner (-1: none), shape (cells,).
+        uniform: whether the cell shows that face alone, shape (cells,) bool.
+        shown: for each bounded face, the cells that one of its edges crosses or in which a corner's ray hits it, shape
+            (m, cells) bool.
     """
 
     M: np.ndarray
     distance: np.ndarray
     front: np.ndarray
-    winner: np.ndarray
-    inside: np.ndarray
-    crossed: np.ndarray
+    first: np.ndarray
+    uniform: np.ndarray
+    shown: np.ndarray
 
 
 def face_matrices(faces: FaceArrays, p_WC: np.ndarray, R_WC: np.ndarray,
@@ -112,27 +119,20 @@ def look(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_
         shift_W: displacement of the moving faces [m], shape (3,).
     """
     M, distance, front = face_matrices(faces, p_WC, R_WC, shift_W)
-    n, nodes = len(M), grid.nodes.shape[1]
-    q = (M.reshape(-1, 3) @ grid.nodes).reshape(n, 3, nodes)
-    inverse = q[:, 2]
-    hit = inverse > 1e-6
-    bounded = faces.bounded
-    limit = faces.half[bounded].astype(np.float32)[:, :, None] * inverse[bounded][:, None, :]
-    hit[bounded] &= np.all(np.abs(q[bounded, :2]) <= limit, axis=1)
-    inverse = np.where(hit, inverse, -1.0)
-    winner = np.where(inverse.max(axis=0) > 0, inverse.argmax(axis=0), -1)
-    corner = grid.corner_nodes
-    return View(M, distance, front, winner[corner], hit[bounded][:, corner],
-                _crossings(faces, grid, camera, p_WC, R_WC, shift_W, front))
+    shown = _crossings(faces, grid, camera, p_WC, R_WC, shift_W, front)
+    cells = shown.shape[1]
+    view = View(M, distance, front, np.empty(cells, np.int64), np.empty(cells, bool), shown)
+    classify(M, faces.half.astype(np.float32), faces.row, grid.nodes, grid.corner_nodes, view.first, view.uniform, shown)
+    return view
 
 
 def _crossings(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_WC: np.ndarray,
                shift_W: np.ndarray, front: np.ndarray) -> np.ndarray:
     crossed = np.zeros((len(faces.bounded), grid.rows * grid.cols), dtype=bool)
-    for row, face in enumerate(faces.bounded):
-        if not front[face]:
-            continue
-        points_C = (faces.edges_W[row] + faces.moving[face] * shift_W - p_WC) @ R_WC
-        cells = grid.cell_of(camera.project(points_C)[0])
-        crossed[row, cells[cells >= 0]] = True
+    rows = np.flatnonzero(front[faces.bounded])
+    moved = faces.moving[faces.bounded[rows], None, None] * shift_W
+    points_C = (faces.edges_W[rows] + moved - p_WC) @ R_WC
+    cells = grid.cell_of(camera.project(points_C.reshape(-1, 3))[0]).reshape(points_C.shape[:2])
+    for row, touched in zip(rows, cells):
+        crossed[row, touched[touched >= 0]] = True
     return crossed
