@@ -224,13 +224,13 @@ class ControllerNode(PerchNode[ControllerParameters]):
     def _publish_diagnostics(self, now: float) -> None:
         flight = self._flight
         values: dict[str, Any] = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
-                                  "odometry_age_s": float(min(flight.odometry_age, 1e6))}
+                                  "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio}
         if self._costs:
             values |= {"step_us_median": 1e6 * float(np.median(self._costs)),
                        "step_us_p99": 1e6 * float(np.percentile(self._costs, 99))}
         if self._participant.lockstep is False:
             values |= self._deadlines.report()
-        level = 2 if flight.state.name == "FAILED" else 1 if flight.state.name in ("RECOVERING", "LANDING") else 0
+        level = 2 if flight.state.name == "FAILED" else 1 if flight.health.weak or flight.state.name in ("RECOVERING", "LANDING") else 0
         self.publish_diagnostics(now, values, level, flight.maneuvers.message)
 
     # -- services ----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.law import moment
 from perch_control.geometric.step import rotors_for
-from perch_control.monitors import Persistent
+from perch_control.persistent import Persistent
 from perch_control.settings import GeometricGains
 
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]

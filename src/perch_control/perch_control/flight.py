@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
 
@@ -18,12 +19,14 @@ from perch_control.maneuvers import Maneuvers
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.reference import Following
+from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import RotorEstimate, thrusts
 from perch_control.settings import GeometricGains
 from perch_control.supervisor import Supervisor
 
 _AIRBORNE = 0.1              # so far above where it was armed, the ground no longer carries the vehicle [m]
 _SPARE_SHARE = 0.01          # weight of a step in the mean margin: 0.2 s
+_TOUCHING = 0.1              # from so long before a planned contact on, a surface may act on the vehicle [s]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
@@ -34,6 +37,9 @@ class Law(Protocol):
 
     def begin(self) -> None:
         """The law takes over: what it remembers of an earlier flight does not count."""
+
+    def believe(self, vehicle: Vehicle) -> None:
+        """Fly a vehicle whose thrust differs from what its file says."""
 
     def prepare(self, source: Any, contact: bool) -> Any:
         """The reference to follow for a trajectory, which ends in a contact or not."""
@@ -56,7 +62,8 @@ class FlightController:
         self._spare = 1.0            # mean margin in hover
         self.position_error = 0.0
         self.compensator: L1Augmentation | None = None
-        self._ground_height = -inf  # where the vehicle was armed [m]
+        self.health = RotorHealth(settings.rotors, 4.0 * vehicle.thrust_max / vehicle.hover_thrust)
+        self._nominal, self._felt = vehicle, 0.0  # specific force along b3, as measured last [m/s^2]
         self._imu_stamp = -inf
         self._constants = packed_vehicle(vehicle)
         self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
@@ -73,6 +80,8 @@ class FlightController:
         if law is not self.law:
             law.begin()
         self.law, self.maneuvers.gains, self.maneuvers.settings = law, gains, settings
+        self.health.settings = settings.rotors
+        law.believe(self.vehicle)
         self.gate.limits = settings.odometry
         self.supervisor.restart()
 
@@ -132,6 +141,8 @@ class FlightController:
             raise CommandRefused(f"arm is refused: {m.state.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry.timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({self._refused})" if self._refused else ""))
+        self.health.reset()
+        self._believe_rotors()
         if m.attached_to is not None:
             m.recover("came off the surface")
             return
@@ -139,7 +150,7 @@ class FlightController:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
         m.enter(State.ARMED, "armed")
         m.rotors = RotorEstimate.at_idle(self.vehicle)
-        self._ground_height = m.belief[2]
+        m.ground = m.belief[2]
 
     def follow(self, order: Order) -> None:
         """Take a trajectory; it starts at its stamp and replaces the running one there.
@@ -198,7 +209,7 @@ class FlightController:
 
         Its time also shows that odometry with an old stamp is late.
         """
-        self._imu_stamp = stamp
+        self._imu_stamp, self._felt = stamp, accel[2]
         if self.maneuvers.blind is not None:
             self.maneuvers.blind.imu(stamp, gyro, accel)
         else:
@@ -228,6 +239,7 @@ class FlightController:
             return self._descend()
         self._activate()
         if m.flying:
+            self._judge_rotors()
             self.supervisor.act(self.margin)
         return self._fly() if m.flying else self._idle()
 
@@ -278,11 +290,8 @@ class FlightController:
         m = self.maneuvers
         setpoint = m.setpoint()
         self.position_error = norm(axpy(-1.0, setpoint.p, m.belief[0:3]))
-        contact = inf
-        if m.state is State.TRACKING and m.order.at_end is AtEnd.CONTACT:
-            contact = max(m.order.source.duration - m.elapsed, 0.0)
-        extra = self._compensation(contact)
-        out = self.law.control(m.belief, m, m.rotors, extra, contact)
+        contact = m.time_to_contact
+        out = self.law.control(m.belief, m, m.rotors, self._compensation(contact), contact)
         m.rotors = m.rotors.following(out.rotor_speed)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
@@ -292,12 +301,33 @@ class FlightController:
             return self._idle()
         return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event())
 
+    def _judge_rotors(self) -> None:
+        """Compare felt and promised thrust; weak rotors are a weaker vehicle from now on."""
+        m, vehicle = self.maneuvers, self._nominal
+        if m.belief[2] - m.ground < _AIRBORNE or m.time_to_contact < _TOUCHING or norm(m.belief[10:13]) > self.health.settings.rate_most:
+            self.health.pause(m.now)
+            return
+        promised = sum(thrusts(m.rotors.speed, vehicle.thrust_coefficient)) / vehicle.mass
+        if self.health.update(self._felt, promised, m.now):
+            self._believe_rotors()
+
+    def _believe_rotors(self) -> None:
+        m, vehicle = self.maneuvers, self._nominal
+        if self.health.weak and not m.weak:
+            m.events.append(f"weak rotors: {100.0 * self.health.ratio:.0f} % of the thrust that was commanded is felt")
+        m.weak = self.health.weak
+        self.vehicle = m.vehicle = replace(vehicle, thrust_coefficient=self.health.believed * vehicle.thrust_coefficient) if m.weak else vehicle
+        self._constants = packed_vehicle(self.vehicle)
+        self.law.believe(self.vehicle)
+        if self.compensator is not None:
+            self.compensator.believe(self.vehicle)
+
     def _compensation(self, contact: float) -> tuple[float, ...]:
         """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
         m = self.maneuvers
         if self.compensator is None:
             return NO_COMPENSATION
-        if m.belief[2] - self._ground_height < _AIRBORNE:
+        if m.belief[2] - m.ground < _AIRBORNE:
             self.compensator.reset()
             return NO_COMPENSATION
         if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from perch_control.odometry_gate import OdometryLimits
 from perch_control.recovery import RecoverySettings
+from perch_control.rotor_health import RotorHealthSettings
 from perch_core.config import part, quantity
 
 Vector3 = tuple[float, float, float]
@@ -48,3 +49,4 @@ class FlightSettings:
     silence_time: float = quantity(60.0, unit="s", above=0.0, doc="hovering without a new order for so long: land")
     odometry: OdometryLimits = part(OdometryLimits)
     recovery: RecoverySettings = part(RecoverySettings)
+    rotors: RotorHealthSettings = part(RotorHealthSettings)

@@ -91,6 +91,11 @@ class L1Augmentation:
         self.disturbance = _ZERO
         self._last: tuple | None = None
 
+    def believe(self, vehicle: Vehicle) -> None:
+        """Another model of the vehicle: what was estimated against the last one is forgotten."""
+        self._vehicle = packed_vehicle(vehicle)
+        self.reset()
+
     def hold(self) -> tuple[float, ...]:
         """Compensation without adaptation, while something else than air acts on the vehicle."""
         self._last = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import inf
 from typing import Any
 
 from perch_core.vector3 import axes_of, axpy, dot, norm, scale
@@ -14,14 +15,16 @@ from perch_control.guidance import BRAKE_PEAK, Hold, brake
 from perch_control.modes import FLYING, State
 from perch_control.monitors import reference_tilt_deg
 from perch_control.recovery import Recovery
-from perch_control.reference import Setpoint
+from perch_control.reference import Setpoint, peak_thrust
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
+from perch_control.weak_landing import WeakLanding
 
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
 _LEVEL = 0.8          # cosine of the tilt up to which a brake starts from the attitude as it is
 _TURNING = 4.0        # the same for the body rate [rad/s]
+_UPRIGHT = 0.7        # cosine of the tilt up to which a recovery goes on before a landing on weak rotors begins
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -40,6 +43,8 @@ class Maneuvers:
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
         events: what has happened since the last step.
+        vehicle: as it is believed to be; `weak`: its rotors give less than its file says.
+        ground: height at which the vehicle was armed [m].
     """
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings) -> None:
@@ -57,6 +62,8 @@ class Maneuvers:
         self.attached_to: tuple[float, ...] | None = None
         self.blind: BlindDescent | None = None
         self.events: list[str] = []
+        self.weak, self.ground = False, -inf
+        self._judged: tuple[Any, Vehicle, bool] | None = None  # whether this reference is too much for this vehicle
 
     @property
     def flying(self) -> bool:
@@ -133,9 +140,8 @@ class Maneuvers:
         """Return to a hover from any attitude; from a surface, push off first."""
         normal = self._surface_normal() or self.attached_to
         self.attached_to = None
-        thrust_max = 4.0 * self.vehicle.thrust_max / self.vehicle.mass
         self.enter(State.RECOVERING, f"recovering: {message}")
-        self.run(Recovery(self.settings.recovery, thrust_max, self.belief, normal))
+        self.run(Recovery(self.settings.recovery, self.specific_thrust_max, self.belief, normal))
 
     def land(self, message: str) -> None:
         """Descend until the ground is felt."""
@@ -144,6 +150,29 @@ class Maneuvers:
         self.enter(State.LANDING, message)
         down = (0.0, 0.0, -self.settings.land_speed)
         self.run(brake(p, v, a, setpoint.h, down, self.settings.brake_deceleration))
+
+    def land_weak(self, message: str) -> None:
+        """Land at once, with what thrust there is."""
+        self.enter(State.LANDING, f"landing on weak rotors: {message}")
+        self.run(WeakLanding(self.settings.rotors, self.settings.land_speed, self.belief, self.ground))
+        self.source.update(self.belief, self.specific_thrust_max)
+
+    @property
+    def specific_thrust_max(self) -> float:
+        """Greatest collective thrust / mass, as believed [m/s^2]."""
+        return 4.0 * self.vehicle.thrust_max / self.vehicle.mass
+
+    def beyond_what_is_left(self) -> str:
+        """Why weak rotors cannot go on with what is flown; empty: they can."""
+        left, s = self.specific_thrust_max, self.settings.rotors
+        said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
+        if self.state is State.TRACKING:
+            if self._judged is None or self._judged[0] is not self.source or self._judged[1] is not self.vehicle:
+                self._judged = self.source, self.vehicle, peak_thrust(self.source, self.elapsed) > s.reserve * left
+            return f"{said}, less than the trajectory needs" if self._judged[2] else ""
+        if self.state is State.RECOVERING and axes_of(self.belief[6:10])[2][2] < _UPRIGHT:
+            return ""
+        return said if left < s.hover_least * GRAVITY else ""
 
     def descend(self, message: str, moving: bool = True) -> None:
         """Descend without position: level, with a little less thrust than the weight; `moving`: the velocity can be trusted."""
@@ -164,6 +193,13 @@ class Maneuvers:
         if near and self.state in (State.TRACKING, State.HOVERING):
             return setpoint.p, setpoint.v, setpoint.a
         return self.belief[0:3], self.belief[3:6], _ZERO
+
+    @property
+    def time_to_contact(self) -> float:
+        """Time to the planned contact of the running trajectory [s], 0 after it, infinite where there is none."""
+        if self.state is not State.TRACKING or self.order.at_end is not AtEnd.CONTACT:
+            return inf
+        return max(self.order.source.duration - self.elapsed, 0.0)
 
     @property
     def committed(self) -> bool:

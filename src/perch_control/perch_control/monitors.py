@@ -1,4 +1,4 @@
-"""Conditions that must hold for a while before the supervisor acts on them."""
+"""What the supervisor watches while a reference is followed."""
 
 from __future__ import annotations
 
@@ -8,24 +8,8 @@ from math import acos, degrees
 from perch_core.vector3 import axes_of, axpy, dot, norm
 from perch_core.vehicle import GRAVITY
 from perch_control.flight_settings import FlightSettings
+from perch_control.persistent import Persistent
 from perch_control.reference import Setpoint
-
-
-@dataclass
-class Persistent:
-    """A condition with memory: `update` is true from `hold` seconds of it on."""
-
-    hold: float
-    since: float | None = None
-
-    def update(self, condition: bool, now: float) -> bool:
-        """Take the condition at a time [s]."""
-        if not condition:
-            self.since = None
-            return False
-        if self.since is None:
-            self.since = now
-        return now - self.since >= self.hold
 
 
 def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:

@@ -38,6 +38,15 @@ class RecoverySettings:
     timeout: float = quantity(6.0, unit="s", above=0.0, doc="then descend")
 
 
+def towards(f: tuple[float, ...], b1: tuple[float, ...], b3: tuple[float, ...], ahead: float) -> tuple[float, ...] | None:
+    """The direction that is `ahead` [rad] from b3 on the shortest turn to `f`; None: `f` is nearer than that."""
+    if dot(b3, f) >= cos(ahead) * norm(f):
+        return None
+    across = axpy(-dot(b3, f), b3, f)
+    across = scale(1.0 / norm(across), across) if norm(across) > 1e-6 * norm(f) else b1  # opposite ones turn about b2
+    return axpy(sin(ahead), across, scale(cos(ahead), b3))
+
+
 class Recovery:
     """Guidance from the present state; `update` first in each period, then `setpoint`."""
 
@@ -82,13 +91,9 @@ class Recovery:
         side = limited((demand[0], demand[1], 0.0), s.acceleration_max)
         up = min(max(demand[2], -0.4 * GRAVITY), s.thrust_share * self._thrust_max - GRAVITY)
         f = (side[0], side[1], up + GRAVITY)
-        ahead = radians(s.turn_ahead_deg)
-        c = dot(b3, f) / norm(f)
-        if c < cos(ahead):
-            # Turn from b3 towards f, in their plane; opposite ones turn about b2.
-            across = axpy(-dot(b3, f), b3, f)
-            across = scale(1.0 / norm(across), across) if norm(across) > 1e-6 * norm(f) else b1
-            f = scale(s.thrust_share * self._thrust_max, axpy(sin(ahead), across, scale(cos(ahead), b3)))
+        direction = towards(f, b1, b3, radians(s.turn_ahead_deg))
+        if direction is not None:
+            f = scale(s.thrust_share * self._thrust_max, direction)
         # Turning upright, the heading can wait: b2 stays where it is.
         h = b2 if b3[2] < 0.5 else horizontal(b2)
         self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=h)

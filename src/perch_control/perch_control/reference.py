@@ -148,6 +148,13 @@ class SampledReference:
                         _floats(turn[:, 1]), _floats(turn2[:, 1]), _floats(b3), _floats(db3), _floats(ddb3))
 
 
+def peak_thrust(source, begin: float) -> float:
+    """Greatest specific thrust that a source asks for from a time on, to its end [m/s^2]; sampled every 40 ms."""
+    times = np.append(np.arange(begin, source.duration, 0.04), max(source.duration, begin))
+    a = packed_many(source, times)[:, 6:9] + (0.0, 0.0, GRAVITY)
+    return float(np.linalg.norm(a, axis=1).max())
+
+
 def packed_many(source, times: np.ndarray) -> np.ndarray:
     """Setpoints of a source at many times [s], packed, shape (n, 33); a flat trajectory is evaluated in one go."""
     if not isinstance(source, FlatReference):

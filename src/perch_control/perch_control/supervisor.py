@@ -6,9 +6,11 @@ from perch_core.vector3 import axes_of, norm
 from perch_control.admission import AtEnd, Order
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import State
-from perch_control.monitors import Persistent, TrackingMonitor
+from perch_control.monitors import TrackingMonitor
+from perch_control.persistent import Persistent
 from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint
+from perch_control.weak_landing import WeakLanding
 
 _COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
 
@@ -49,6 +51,13 @@ class Supervisor:
             self.restart()
         if self._down.update(self._is_down(), m.now):
             m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
+            return
+        if isinstance(m.source, WeakLanding):
+            m.source.update(m.belief, m.specific_thrust_max)
+            return
+        asked = m.beyond_what_is_left() if m.weak else ""
+        if asked:
+            m.land_weak(asked)
             return
         if isinstance(m.source, Recovery):
             m.source.update(m.belief, m.elapsed)
@@ -95,5 +104,8 @@ class Supervisor:
     def landed(self, setpoint: Setpoint) -> bool:
         """The reference has descended away from under the vehicle for a while: the ground carries it."""
         m = self._maneuvers
-        resting = abs(m.belief[5]) < 0.1 and m.belief[2] - setpoint.p[2] > m.settings.ground_gap
+        if isinstance(m.source, WeakLanding):
+            resting = m.source.resting(m.belief)
+        else:
+            resting = abs(m.belief[5]) < 0.1 and m.belief[2] - setpoint.p[2] > m.settings.ground_gap
         return m.state is State.LANDING and self._ground.update(resting, m.now)

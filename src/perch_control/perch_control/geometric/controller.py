@@ -98,6 +98,10 @@ class GeometricController:
         gains = self.gains
         return (gains.feedback_max, cone, gains.thrust_floor, self._rate_max, gains.acceleration_max, gains.feedback_rate)
 
+    def believe(self, vehicle: Vehicle) -> None:
+        """Fly a vehicle that differs from the one at the start in its thrust."""
+        self.vehicle, self._vehicle = vehicle, packed_vehicle(vehicle)
+
     def begin(self) -> None:
         """Take over in flight: nothing is remembered from one period to the next."""
 

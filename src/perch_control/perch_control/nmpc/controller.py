@@ -94,6 +94,12 @@ class NmpcController:
         """Take over in flight: the first iterate is the reference."""
         self._warm = False
 
+    def believe(self, vehicle: Vehicle) -> None:
+        """Fly a vehicle that differs from the one at the start in its thrust: what is compiled in knows thrusts alone."""
+        self.vehicle, self._constants = vehicle, packed_vehicle(vehicle)
+        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR)
+        self.fallback.believe(vehicle)
+
     def prepare(self, source: Any, contact: bool) -> Any:
         """The reference to follow for a trajectory: itself; the horizon sees the rotors' limits before they act."""
         return source

@@ -1,0 +1,91 @@
+"""How strong the rotors are: the specific force felt along b3 against the thrust that their commands promise.
+
+In free air the accelerometer reads the thrust per mass. Both sides go through the same low-pass filter, so that a change
+of thrust alone leaves their ratio at 1; what is left is lost thrust, or a mass that is not the file's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+from perch_control.persistent import Persistent
+from perch_core.config import quantity
+from perch_core.vehicle import GRAVITY
+
+_STEP = 0.02  # the believed ratio follows in steps of this size
+
+
+@dataclass(frozen=True)
+class RotorHealthSettings:
+    """When rotors count as weak, and what is still flown then."""
+
+    time_constant: float = quantity(0.05, unit="s", above=0.0, high=1.0,
+                                    doc="of the filter; with 0.316 m/s^2 of noise at 500 Hz the ratio is good to 1 %")
+    weak: float = quantity(0.77, unit="-", low=0.0, high=1.0,
+                           doc="felt / promised thrust below which the rotors are weak; +20 % mass reads 0.83, -15 % on one rotor 0.96")
+    hold: float = quantity(0.02, unit="s", low=0.0, high=1.0, doc="for so long")
+    thrust_least: float = quantity(0.5, unit="-", above=0.0, high=1.0, doc="promised thrust / weight below which the ratio is not judged")
+    rate_most: float = quantity(10.0, unit="rad/s", above=0.0, doc="body rate above which it is not judged")
+    reserve: float = quantity(0.95, unit="-", above=0.0, high=1.0, doc="a trajectory may ask for this share of what is left")
+    hover_least: float = quantity(1.12, unit="-", above=0.0, high=2.0, doc="greatest thrust / weight that is left, below which the vehicle lands at once")
+    touch_speed: float = quantity(1.2, unit="m/s", above=0.0, doc="such a landing does not lean where it would touch the ground faster than this")
+    lean_deg: float = quantity(15.0, unit="deg", above=0.0, high=45.0, doc="it leans so far to brake its speed across, or as far as the weight is still carried ...")
+    lean_most_deg: float = quantity(30.0, unit="deg", above=0.0, high=60.0, doc="... but no further than this")
+
+
+class RotorHealth:
+    """Owns the filter and the verdict.
+
+    Attributes:
+        ratio: felt / promised thrust, 1: as the vehicle's file says.
+        believed: what is flown with: 1 until the rotors are weak, then `ratio` in steps, at most 1.
+    """
+
+    def __init__(self, settings: RotorHealthSettings, thrust_to_weight: float) -> None:
+        """`thrust_to_weight`: of the vehicle's file. Rotors are believed to just carry the weight even where they do not."""
+        self.settings, self._least = settings, 1.001 / thrust_to_weight
+        self.reset()
+
+    def reset(self) -> None:
+        """Rotors as the vehicle's file says."""
+        self.ratio = self.believed = 1.0
+        self._felt = self._promised = GRAVITY
+        self._low, self._last = Persistent(self.settings.hold), 0.0
+
+    @property
+    def weak(self) -> bool:
+        """The rotors were found weak since they were started."""
+        return self.believed < 1.0
+
+    def pause(self, now: float) -> None:
+        """Something else than air acts on the vehicle, or it turns too fast: what is felt now says nothing."""
+        self._low.update(False, now)
+        self._last = now
+
+    def update(self, felt: float, promised: float, now: float) -> bool:
+        """Take a sample in free air.
+
+        Args:
+            felt: specific force along b3 [m/s^2].
+            promised: thrust of the rotors' model per mass, with the file's thrust coefficient [m/s^2].
+            now: [s].
+
+        Returns:
+            Whether `believed` has changed.
+        """
+        s = self.settings
+        if promised < s.thrust_least * GRAVITY:
+            self.pause(now)
+            return False
+        k = 1.0 - exp(-min(max(now - self._last, 0.0), 0.02) / s.time_constant)
+        self._felt += k * (felt - self._felt)
+        self._promised += k * (promised - self._promised)
+        self._last, self.ratio = now, self._felt / self._promised
+        if not self._low.update(self.ratio < s.weak, now) and not self.weak:
+            return False
+        ratio = min(max(self.ratio, self._least), 1.0 - _STEP)
+        if abs(ratio - self.believed) < _STEP:
+            return False
+        self.believed = ratio
+        return True

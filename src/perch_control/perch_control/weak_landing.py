@@ -1,0 +1,72 @@
+"""Down to the ground on rotors that are too weak to go on: level, slow, and braked as well as the thrust that is left allows.
+
+Height comes first: the vehicle leans only as far as its weight is still carried, or by a small angle where it is not, not at
+all where it falls too fast, and stands level when it touches, since a rotor that touches first breaks.
+"""
+
+from __future__ import annotations
+
+from math import acos, radians, sin, sqrt
+
+from perch_control.guidance import horizontal
+from perch_control.recovery import towards
+from perch_control.reference import Setpoint
+from perch_control.rotor_health import RotorHealthSettings
+from perch_core.vector3 import axes_of, limited, scale
+from perch_core.vehicle import GRAVITY
+
+_GAIN = 8.0        # of the vertical speed [1/s]
+_SIDE_GAIN = 4.0   # of the speed across [1/s]
+_LEAST = 0.6       # thrust / weight at least, so that the rotors keep their moment
+_LEVEL = 0.08      # level below this height [m], and ...
+_PER_HEIGHT = 1.5  # ... leaning by at most so much per height above it [rad/m]
+_LEAN_LEAST = radians(2.0)
+_NEARLY_UPRIGHT = 0.9
+_GENTLE = 0.08    # [rad]
+_DELAY = 0.1       # until the rotors have answered [s]
+
+
+class WeakLanding:
+    """Guidance from the present state; `update` first in each period, then `setpoint`."""
+
+    duration = float("inf")
+    by_state = True
+
+    def __init__(self, settings: RotorHealthSettings, speed: float, state: tuple[float, ...], ground: float) -> None:
+        """
+        Args:
+            settings: how far to lean.
+            speed: of the descent [m/s].
+            state: where it begins, 13 floats (p, v, q, w).
+            ground: height at which the vehicle was armed [m].
+        """
+        self._settings, self._speed, self._ground = settings, speed, ground
+        self._setpoint = Setpoint(state[0:3], state[3:6], h=horizontal(axes_of(state[6:10])[1]))
+
+    def update(self, state: tuple[float, ...], specific_thrust_max: float) -> None:
+        """Take the present state and the greatest collective thrust / mass that is left [m/s^2]."""
+        s, p, v, most = self._settings, state[0:3], state[3:6], specific_thrust_max
+        carried = acos(min(GRAVITY / most, 1.0))
+        lean = min(max(carried, radians(s.lean_deg)), radians(s.lean_most_deg))
+        height = p[2] - self._ground
+        fall = max(v[2] ** 2 - s.touch_speed**2, 0.0) if v[2] < 0.0 else 0.0
+        needed = (GRAVITY + 0.5 * fall / max(height + _DELAY * v[2], 0.05)) / most  # thrust that stops the fall, as a share
+        lean = min(lean, acos(min(needed, 1.0))) if fall > 0.0 else lean
+        lean = max(min(lean, _PER_HEIGHT * (height - _LEVEL)), _LEAN_LEAST)
+        side = limited((-_SIDE_GAIN * v[0], -_SIDE_GAIN * v[1], 0.0), most * sin(lean))
+        top = sqrt(max(most**2 - side[0] ** 2 - side[1] ** 2, 0.0))
+        up = min(max(GRAVITY - _GAIN * (v[2] + self._speed), _LEAST * GRAVITY), top)
+        f = (side[0], side[1], up)
+        b1, _, b3 = axes_of(state[6:10])
+        if fall > 0.0 and b3[2] > _NEARLY_UPRIGHT:  # moments cost thrust, the small tilt costs less: turn gently
+            direction = towards(f, b1, b3, _GENTLE)
+            f = scale(most, direction) if direction is not None else f
+        self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._setpoint.h)
+
+    def setpoint(self, t: float) -> Setpoint:
+        """The demand of the last `update`: an acceleration without position or velocity error."""
+        return self._setpoint
+
+    def resting(self, state: tuple[float, ...]) -> bool:
+        """The descent that is asked for does not happen: something carries the vehicle."""
+        return abs(state[5]) < min(0.1, 0.5 * self._speed)

@@ -1,0 +1,135 @@
+"""Rotors that lose thrust in flight are noticed, believed and landed on; what is merely disturbed is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from closed_loop.loop import make_loop, perch
+from closed_loop.plant import Disturbances
+from perch_control.admission import AtEnd
+from perch_control.flight_settings import FlightSettings
+from perch_control.modes import State
+from perch_control.rotor_health import RotorHealth, RotorHealthSettings
+from perch_control.weak_landing import WeakLanding
+from perch_core.trajectory import rest_to_rest
+from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
+
+NOISE = 0.316  # of the accelerometer per sample [m/s^2]
+
+
+def health():
+    return RotorHealth(RotorHealthSettings(), 1.83)
+
+
+def seen(loop, seed=0):
+    """The accelerometer's noise as in flight."""
+    rng, imu = np.random.default_rng(seed), loop.controller.imu
+    loop.controller.imu = lambda t, w, f: imu(t, w, tuple((np.array(f) + rng.normal(size=3) * NOISE).tolist()))
+    return loop
+
+
+@pytest.mark.parametrize("share", [0.55, 0.7, 0.83, 0.96, 1.0])
+def test_the_ratio_is_known_within_150_ms(share):
+    x, rng = health(), np.random.default_rng(1)
+    for k in range(500):
+        promised = 10.0 + 6.0 * np.sin(0.02 * k)
+        changed = x.update((share if k >= 250 else 1.0) * promised + NOISE * rng.normal(), promised, 0.002 * k)
+        assert not (changed and k < 250)
+        if k == 325:
+            assert x.weak == (share < 0.77)
+    assert x.ratio == pytest.approx(share, abs=0.03)
+    assert x.believed == pytest.approx(share if share < 0.77 else 1.0, abs=0.03)
+
+
+def test_little_thrust_says_nothing():
+    x = health()
+    for k in range(500):
+        assert not x.update(0.0, 0.4 * GRAVITY, 0.002 * k)
+    assert x.ratio == 1.0
+
+
+@pytest.mark.parametrize("disturbances", [
+    Disturbances(), Disturbances(mass_factor=1.2), Disturbances(rotor_factor=(0.85, 1, 1, 1)), Disturbances(lag_factor=2.0),
+    Disturbances(inertia_factor=1.3), Disturbances(mass_factor=1.2, wind=(5.0, 0.0, 0.0)),
+], ids=["nominal", "mass", "rotor", "lag", "inertia", "wind and mass"])
+def test_disturbances_are_not_taken_for_weak_rotors(disturbances):
+    plan = perch("surface_90_1.7m")
+    loop = seen(make_loop(floor=-10.0, disturbances=disturbances))
+    loop.begin_in_hover()
+    loop.plant.wall = plan.contact, plan.normal
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(plan.trajectory.duration + 2.0)  # the contact, and a recovery where it is missed
+    assert not loop.controller.health.weak and not any("weak" in text for _, _, text in loop.events)
+
+
+@pytest.mark.parametrize("share", [0.53, 0.6, 0.7])
+def test_weak_rotors_land_level_and_slowly(share):
+    loop = seen(make_loop())
+    loop.take_off(1.2)
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [3, 0, 0], 0, 0, 2.5), id=3)
+    loop.run(1.0)
+    assert np.linalg.norm(loop.plant.v) > 1.0
+    loop.plant.disturbances = Disturbances(rotor_factor=(share,) * 4)
+    tilt = []
+
+    def watch(x):
+        if x.plant.p[2] < 0.05:
+            tilt.append(np.degrees(np.arccos(x.plant.R[2, 2])))
+        return x.controller.state is State.DISARMED
+
+    assert loop.run(15.0, until=watch) or loop.controller.state is State.HOVERING, loop.events
+    assert any("weak rotors" in text for _, _, text in loop.events)
+    assert loop.plant.impact_speed < 2.0 and (not tilt or max(tilt) < 20.0), "rotors touch first beyond 20 deg"
+
+
+def test_weak_rotors_hover_on_what_is_left():
+    """The law takes the rotors' own thrust: no sag, and the limits are those that are left."""
+    loop = seen(make_loop())
+    loop.begin_in_hover()
+    loop.plant.disturbances = Disturbances(rotor_factor=(0.7,) * 4)
+    loop.run(1.5)
+    loop.states.clear(), loop.references.clear()
+    loop.run(1.0)
+    assert loop.controller.state is State.HOVERING and np.all(loop.rmse < 0.03)
+    nominal = load_vehicle("snapdragon").thrust_max
+    assert loop.controller.vehicle.thrust_max == pytest.approx(0.7 * nominal, rel=0.03)
+    assert loop.controller.maneuvers.vehicle is loop.controller.vehicle is loop.controller.law.vehicle
+
+
+def test_weak_rotors_fly_on_where_the_contact_is_near():
+    plan = perch("surface_90_1.7m")
+    loop = seen(make_loop(floor=-10.0))
+    loop.begin_in_hover()
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(0.04 + plan.trajectory.duration - 0.25)
+    loop.plant.disturbances = Disturbances(rotor_factor=(0.55,) * 4)
+    loop.run(0.2)
+    assert loop.controller.health.weak and loop.controller.state is State.TRACKING
+
+
+def demand(v, height, left, tilt_deg=0.0):
+    half = np.radians(tilt_deg) / 2
+    state = (0.0, 0.0, height, *v, 0.0, float(np.sin(half)), 0.0, float(np.cos(half)), 0.0, 0.0, 0.0)
+    x = WeakLanding(FlightSettings().rotors, 0.35, state, 0.0)
+    x.update(state, left)
+    return np.array(x.setpoint(0.0).a) + (0.0, 0.0, GRAVITY)
+
+
+def test_height_comes_before_braking():
+    strong, weak = demand((2.0, 0, 0), 1.0, 1.3 * GRAVITY), demand((2.0, 0, 0), 1.0, 1.0 * GRAVITY)
+    assert strong[0] < weak[0] < 0.0, "it leans as far as the weight is carried"
+    assert demand((2.0, 0, 0), 0.09, 1.3 * GRAVITY)[0] > -0.5, "level when it touches"
+    falling = demand((2.0, 0, -1.8), 0.5, 1.05 * GRAVITY)
+    assert abs(falling[0]) < 0.5 and falling[2] == pytest.approx(1.05 * GRAVITY, rel=1e-3), "a fast fall takes all thrust"
+    gently = demand((2.0, 0, -1.8), 0.5, 1.05 * GRAVITY, tilt_deg=20.0)
+    assert np.degrees(np.arctan2(gently[0], gently[2])) == pytest.approx(20.0 - np.degrees(0.08), abs=0.1)
+
+
+@pytest.mark.parametrize("seed", [11, 20])
+def test_a_perching_flight_on_weak_rotors_has_a_good_end(seed):
+    """117 % and 101 % of the weight are left, during the dip before the wall."""
+    fault = next(f for f in FAULTS if f.name == "low thrust margin")
+    assert fly_fault(fault, seed).end in END_STATES
