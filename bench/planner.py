@@ -39,20 +39,29 @@ print(imported, time.perf_counter() - begin)
 """
 
 
-def _plan_times(waypoints: int, settings: PerchSettings, count: int) -> tuple[np.ndarray, int]:
-    """Time of one plan for each of `count` random problems [ms], and how many were refused."""
+def _plan_times(waypoints: int, settings: PerchSettings, count: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Wall-clock and CPU time of one plan for each of `count` random problems [ms], and how many were refused."""
     vehicle, times, refused = load_vehicle("snapdragon"), [], 0
     for seed in range(count):
         problem = paper_like_problem(np.random.default_rng(seed), waypoints)
         try:
             if not seed:
                 plan(problem, settings, vehicle)
-            begin = time.perf_counter()
+            begin, cpu = time.perf_counter(), time.process_time()
             plan(problem, settings, vehicle)
-            times.append(1e3 * (time.perf_counter() - begin))
+            times.append((1e3 * (time.perf_counter() - begin), 1e3 * (time.process_time() - cpu)))
         except PerchRefusal:
             refused += 1
-    return np.array(times), refused
+    wall, cpu = np.array(times).T
+    return wall, cpu, refused
+
+
+def _additions() -> float:
+    """CPU time of a plain loop [s]: what this machine is worth at this moment."""
+    begin, total = time.process_time(), 0
+    for k in range(10_000_000):
+        total += k
+    return time.process_time() - begin
 
 
 def _wrong_verdicts(count: int) -> float:
@@ -103,15 +112,19 @@ def figures(quick: bool) -> list[Figure]:
     count = 60 if quick else 400
     out = []
     for waypoints, median, p99 in ((3, 0.5, 1.0), (10, 1.0, 2.0)):
-        times, refused = _plan_times(waypoints, PerchSettings(), count)
+        times, cpu, refused = _plan_times(waypoints, PerchSettings(), count)
         name = f"plan with certificates, {waypoints} waypoints"
         out += [figure(name, "ms", times, median), figure(f"{name}, p99", "ms", times, p99, "p99 <="),
-                figure(f"{name}: refused of {count}", "problems", [refused])]
+                figure(f"{name}, CPU time", "ms", cpu), figure(f"{name}: refused of {count}", "problems", [refused])]
     for waypoints, bar in ((3, 15.0), (10, 30.0)):
-        times, _ = _plan_times(waypoints, PerchSettings(solver="osqp"), count // 4)
+        times, _, _ = _plan_times(waypoints, PerchSettings(solver="osqp"), count // 4)
         out.append(figure(f"plan with OSQP, {waypoints} waypoints", "ms", times, bar))
-    times, _ = _plan_times(0, PerchSettings(), count)
+    times, _, _ = _plan_times(0, PerchSettings(), count)
     out.append(figure("plan with certificates, no waypoints", "ms", times))
+    times, cpu, _ = _plan_times(3, PerchSettings(rotors="preferred"), count // 4)
+    out += [figure("plan within single rotors' limits, 3 waypoints", "ms", times),
+            figure("plan within single rotors' limits, 3 waypoints, CPU time", "ms", cpu)]
+    out.append(figure("ten million additions in plain Python, CPU time: the machine's speed", "s", [_additions()]))
     verdicts = 300 if quick else 10_000
     out.append(figure(f"wrong verdicts of {verdicts} polynomials, margins to 1e-9", "verdicts", [_wrong_verdicts(verdicts)],
                       0.0, "max =="))
