@@ -26,7 +26,6 @@ from perch_sim.cable_contact import CableLine
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = {"vio": "rendered", "target": "rendered"}
-SEEDS = range(1, 11)
 AROUND = 1.5  # the map is judged within this of the target point [m]
 
 
@@ -136,7 +135,7 @@ def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, li
     results = Results(effort.state / f"line_flights_{digest[:12]}.sqlite", "line flights", digest, resume=True)
     try:
         tasks = []
-        for number, (seed, case) in enumerate((seed, case) for seed in SEEDS for case in cases):
+        for number, (seed, case) in enumerate((seed, case) for seed in range(1, effort.line_seeds + 1) for case in cases):
             mapping: dict[str, Any] = config.read_yaml(config.find("scenarios", case))
             tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, RENDERED))
         known = {r.number for r in results.all()}
@@ -148,4 +147,4 @@ def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, li
         found = results.all()
     finally:
         results.close()
-    return {case: [r for r in found if r.values["scenario"] == case] for case in cases}
+    return {case: [r for r in found if r.values["scenario"] == case and r.seed <= effort.line_seeds] for case in cases}

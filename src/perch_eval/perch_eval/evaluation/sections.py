@@ -77,6 +77,7 @@ class Effort:
         out: folder of the results.
         state: folder of what a full evaluation resumes from.
         fresh: forget what an earlier evaluation has done.
+        line_seeds: flights of each powerline scenario; of the same code, those that were flown before count.
     """
 
     full: bool
@@ -84,6 +85,7 @@ class Effort:
     out: Path
     state: Path
     fresh: bool = False
+    line_seeds: int = 10
 
     @property
     def seeds(self) -> range:
