@@ -15,7 +15,7 @@ import pytest
 
 from perch_core import so3
 from perch_core.errors import ConfigError, PlanningRefusal
-from perch_core.lines import Segment
+from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, V
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
@@ -56,6 +56,14 @@ def test_a_recovery_begins_even_where_the_flight_has_eaten_the_margin(planner: P
     state[P] -= 0.028 * REQUEST.perch.s3_W  # 2 mm of air are left
     plan = planner.plan(replace(REQUEST, start=state, perch=None, recovery_only=True))
     assert all(bound.holds for bound in plan.bounds)
+
+
+def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
+    """A vehicle that missed the wire is centimetres from where the plan has it."""
+    recovery, vehicle = planned.plan.recovery, planner.vehicle
+    later = recovery.states[recovery.times > 0.3 * recovery.duration]
+    nearest = min(float(scaled_clearance(later[:, P], later[:, Q], line, vehicle.body_radii).min()) for line in planned.request.lines)
+    assert (1 + nearest) ** 2 > (1 + planner.settings.margins.leaving) / (1 - planner.settings.margins.leaving) - 0.02
 
 
 def test_a_recovery_from_inside_a_wire_is_refused(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
