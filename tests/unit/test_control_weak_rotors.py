@@ -104,7 +104,7 @@ def test_weak_rotors_fly_on_where_the_contact_is_near():
     loop = seen(make_loop(floor=-10.0))
     loop.begin_in_hover()
     loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
-    loop.run(0.04 + plan.trajectory.duration - 0.25)
+    loop.run(0.04 + plan.trajectory.duration - 0.32)
     loop.plant.disturbances = Disturbances(rotor_factor=(0.55,) * 4)
     loop.run(0.2)
     assert loop.controller.health.weak and loop.controller.state is State.TRACKING

@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
 
-from perch_core.vector3 import axes_of, axpy, norm
+from perch_core.vector3 import axes_of, axpy, norm, scale
 from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.flight_settings import FlightSettings
@@ -91,6 +91,11 @@ class FlightController:
         return self.maneuvers.state
 
     @property
+    def thrust_known(self) -> float | None:
+        """Thrust / mass as measured, as a share of the file's, at most 1; None without the augmentation: nothing is made of it."""
+        return min(self.health.mean, 1.0) if self.compensator is not None else None
+
+    @property
     def blind(self) -> bool:
         """A descent without position is under way."""
         return self.maneuvers.blind is not None
@@ -165,6 +170,8 @@ class FlightController:
             raise TrajectoryRefused(f"the thrust margin in hover is {self._spare:.2f}; a perch needs {self.settings.margin_perch:g}")
         check_joints(order.source.trajectory, self.settings.joint_gap)
         check_start(order, m.now, m.expected(max(order.start, m.now)), self.settings)
+        if order.at_end is AtEnd.CONTACT and m.state is State.HOVERING and self.compensator is not None:
+            self._adopt_thrust()
         self._pending = order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT)
 
     def keep_ready(self, order: Order) -> None:
@@ -311,12 +318,27 @@ class FlightController:
         if self.health.update(self._felt, promised, m.now):
             self._believe_rotors()
 
+    def _adopt_thrust(self) -> None:
+        """Before a contact: what L1 makes up for in hover because thrust / mass is not the file's belongs to the thrust.
+
+        As an acceleration it would be wrong as soon as the vehicle tilts and the thrust changes, and too fast for any filter.
+        """
+        m, vehicle, before = self.maneuvers, self._nominal, self.health.believed
+        if self.health.adopt():
+            kept = self.compensator.disturbance
+            self._believe_rotors()
+            promised = sum(thrusts(m.rotors.speed, vehicle.thrust_coefficient)) / vehicle.mass
+            b3 = axes_of(m.belief[6:10])[2]
+            self.compensator.disturbance = kept
+            self.compensator.believe(self.vehicle, scale((self.health.believed - before) * promised, b3))
+            m.events.append(f"thrust / mass is {100.0 * self.health.believed:.0f} % of the file's")
+
     def _believe_rotors(self) -> None:
         m, vehicle = self.maneuvers, self._nominal
         if self.health.weak and not m.weak:
             m.events.append(f"weak rotors: {100.0 * self.health.ratio:.0f} % of the thrust that was commanded is felt")
         m.weak = self.health.weak
-        self.vehicle = m.vehicle = replace(vehicle, thrust_coefficient=self.health.believed * vehicle.thrust_coefficient) if m.weak else vehicle
+        self.vehicle = m.vehicle = replace(vehicle, thrust_coefficient=self.health.believed * vehicle.thrust_coefficient)
         self._constants = packed_vehicle(self.vehicle)
         self.law.believe(self.vehicle)
         if self.compensator is not None:

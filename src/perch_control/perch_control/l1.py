@@ -91,10 +91,19 @@ class L1Augmentation:
         self.disturbance = _ZERO
         self._last: tuple | None = None
 
-    def believe(self, vehicle: Vehicle) -> None:
-        """Another model of the vehicle: what was estimated against the last one is forgotten."""
+    def believe(self, vehicle: Vehicle, explained: tuple[float, ...] | None = None) -> None:
+        """Another model of the vehicle.
+
+        Args:
+            vehicle: the model.
+            explained: acceleration in W that it now explains [m/s^2], 3 floats: the rest of the estimate stays; None: what
+                was estimated against the last model is forgotten.
+        """
         self._vehicle = packed_vehicle(vehicle)
+        kept = self.disturbance
         self.reset()
+        if explained is not None:
+            self.disturbance = (*axpy(-1.0, explained, kept[0:3]), *kept[3:6])
 
     def hold(self) -> tuple[float, ...]:
         """Compensation without adaptation, while something else than air acts on the vehicle."""

@@ -1,7 +1,8 @@
 """How strong the rotors are: the specific force felt along b3 against the thrust that their commands promise.
 
 In free air the accelerometer reads the thrust per mass. Both sides go through the same low-pass filter, so that a change
-of thrust alone leaves their ratio at 1; what is left is lost thrust, or a mass that is not the file's.
+of thrust alone leaves their ratio at 1; what is left is lost thrust, or a mass that is not the file's. A fast filter watches
+for rotors that fail in flight, a slow one knows the ratio well enough to plan with it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from perch_control.persistent import Persistent
 from perch_core.config import quantity
 from perch_core.vehicle import GRAVITY
 
-_STEP = 0.02  # the believed ratio follows in steps of this size
+_STEP = 0.02           # the believed ratio follows in steps of this size
+_MEAN_TIME = 0.5       # time constant of the mean [s]
+_GREATEST = 1.1        # a vehicle is believed to be no stronger than this
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ class RotorHealth:
 
     Attributes:
         ratio: felt / promised thrust, 1: as the vehicle's file says.
-        believed: what is flown with: 1 until the rotors are weak, then `ratio` in steps, at most 1.
+        mean: the same over a longer time.
+        believed: what is flown with: 1 until the rotors are weak (then `ratio` in steps), or the mean was adopted.
+        weak: the rotors were found weak since they were started.
     """
 
     def __init__(self, settings: RotorHealthSettings, thrust_to_weight: float) -> None:
@@ -49,14 +54,10 @@ class RotorHealth:
 
     def reset(self) -> None:
         """Rotors as the vehicle's file says."""
-        self.ratio = self.believed = 1.0
-        self._felt = self._promised = GRAVITY
+        self.ratio = self.mean = self.believed = 1.0
+        self.weak = False
+        self._felt = self._promised = self._mean_felt = self._mean_promised = GRAVITY
         self._low, self._last = Persistent(self.settings.hold), 0.0
-
-    @property
-    def weak(self) -> bool:
-        """The rotors were found weak since they were started."""
-        return self.believed < 1.0
 
     def pause(self, now: float) -> None:
         """Something else than air acts on the vehicle, or it turns too fast: what is felt now says nothing."""
@@ -78,13 +79,22 @@ class RotorHealth:
         if promised < s.thrust_least * GRAVITY:
             self.pause(now)
             return False
-        k = 1.0 - exp(-min(max(now - self._last, 0.0), 0.02) / s.time_constant)
+        dt = min(max(now - self._last, 0.0), 0.02)
+        k, slow = 1.0 - exp(-dt / s.time_constant), 1.0 - exp(-dt / _MEAN_TIME)
         self._felt += k * (felt - self._felt)
         self._promised += k * (promised - self._promised)
-        self._last, self.ratio = now, self._felt / self._promised
-        if not self._low.update(self.ratio < s.weak, now) and not self.weak:
-            return False
-        ratio = min(max(self.ratio, self._least), 1.0 - _STEP)
+        self._mean_felt += slow * (felt - self._mean_felt)
+        self._mean_promised += slow * (promised - self._mean_promised)
+        self._last, self.ratio, self.mean = now, self._felt / self._promised, self._mean_felt / self._mean_promised
+        self.weak = self._low.update(self.ratio < s.weak, now) or self.weak
+        return self.weak and self._believe(self.ratio)
+
+    def adopt(self) -> bool:
+        """Believe the mean from now on; returns whether that changes anything. Weak rotors are believed already."""
+        return not self.weak and self._believe(self.mean)
+
+    def _believe(self, ratio: float) -> bool:
+        ratio = min(max(ratio, self._least), _GREATEST)
         if abs(ratio - self.believed) < _STEP:
             return False
         self.believed = ratio

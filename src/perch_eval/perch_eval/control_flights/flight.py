@@ -7,6 +7,7 @@ localised without an error of its own, so that what is measured is the controlle
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -204,8 +205,15 @@ class ControlFlight:
         """
         pad = self.simulation.pad
         surface = PerchSurface(pad.p_WS + shift, pad.R_WS, pad.size)
-        found = plan(PerchProblem(StartState(p), surface), self._planner, self.vehicle).trajectory
+        found = plan(PerchProblem(StartState(p), surface), self._planned_with(), self.vehicle).trajectory
         return FlatTrajectory(found.durations, found.coefficients, start)
+
+    def _planned_with(self) -> PerchingPlannerParameters:
+        """The planner's parameters; with L1, `thrust_max` is what the controller has measured of it in hover."""
+        settings, left = self._planner, self.controller.thrust_known
+        if left is None:
+            return settings
+        return replace(settings, thrust_max=left * (settings.thrust_max or settings.thrust_reserve * 4.0 * self.vehicle.thrust_max))
 
     def perch(self, place: np.ndarray) -> bool:
         """Plan a perch from the place of the hover [m], and order it where the vehicle rests; the controller refuses it elsewhere."""
