@@ -134,6 +134,32 @@ def test_tracks_a_perch_within_vios_own_drift():
     assert np.degrees(np.abs(errors[-1, 6:9]).max()) < 2.0
 
 
+def test_it_is_where_vio_is_however_vio_drifts():
+    """VIO has used the same IMU and the images: the filter must not be further from the truth than VIO."""
+    flight, off, own = Flight(6, latency=0.0), [], []
+    for k in range(len(flight.truth.times)):
+        flight.step(k)
+        if k > 600 and k in flight.poses:
+            off.append(flight.estimator.estimate.p_WB - flight.poses[k].p_WB)
+            own.append(flight.truth.p_WB[k] - flight.poses[k].p_WB)
+    assert np.linalg.norm(own, axis=1).max() > 0.02                           # VIO drifts by centimetres
+    assert np.sqrt(np.mean(np.square(off))) < 0.6 * WHITE[0]                  # and the filter with it
+
+
+def test_vios_velocity_is_followed_as_far_as_its_covariance_is_good():
+    """A velocity that VIO knows well is taken with the pose; one that it hardly knows changes nothing."""
+    errors = {}
+    for sigma in (0.003, 3.0):
+        flight = Flight(7, latency=0.0).fly(end=1200)
+        k = min(k for k in flight.poses if k >= 1200)
+        wrong = flight.truth.v_WB[k] + [0.03, 0.0, 0.0]
+        flight.poses[k] = replace(flight.poses[k], v_WB=wrong, velocity_covariance=np.eye(3) * sigma**2)
+        flight.fly(start=1200, end=k + 1)
+        errors[sigma] = np.abs(flight.estimator.estimate.v_WB - wrong).max()
+        flight.assert_sane()
+    assert errors[0.003] < 0.005 < 0.015 < errors[3.0]
+
+
 def test_forty_milliseconds_of_delay_cost_less_than_a_fifth():
     prompt, late = relative_rmse(0.0), relative_rmse(0.040)
     assert late < 1.2 * prompt

@@ -41,7 +41,6 @@ class VioNoise:
 
     position: float = quantity(0.002, unit="m", above=0.0, doc="1 sigma, white from pose to pose")
     attitude: float = quantity(0.002, unit="rad", above=0.0, doc="1 sigma, white from pose to pose")
-    velocity: float = quantity(0.05, unit="m/s", above=0.0, doc="1 sigma, white, where the velocity is used")
     correlation_time: float = quantity(30.0, unit="s", above=0.0, doc="of VIO's drift")
     drift_position: float = quantity(0.002, unit="m/sqrt(s)", low=0.0, doc="least growth of the drift")
     drift_attitude: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="least growth of the drift")
@@ -59,7 +58,7 @@ class UkfConfig:
     kappa: float = quantity(0.0, doc="secondary spread")
     gate_probability: float = quantity(0.999, above=0.0, high=0.999999, doc="chi2 gate of the innovation")
     gate_patience: int = quantity(15, low=1, doc="rejections in a row after which VIO is believed to have jumped")
-    use_velocity: bool = quantity(False, doc="also update with VIO's velocity")
+    use_velocity: bool = quantity(True, doc="follow VIO's velocity as well as its pose")
     history: float = quantity(0.5, unit="s", above=0.0, high=5.0, doc="IMU kept for replay: oldest usable VIO stamp")
     future: float = quantity(0.05, unit="s", low=0.0, high=0.5, doc="VIO stamps this far ahead wait for the IMU; later ones are refused")
     coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose")

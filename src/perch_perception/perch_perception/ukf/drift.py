@@ -60,6 +60,27 @@ def advance(belief: Belief, noise: VioNoise, W: np.ndarray, dt: float) -> Belief
     return dataclasses.replace(belief, x=x, P=P)
 
 
+def follow(belief: Belief, pose: VioPose, velocity: bool) -> Belief:
+    """Belief with VIO's pose, and its velocity, as mean: what an update took for drift moves the vehicle instead.
+
+    Given all that VIO has used, its errors have mean zero, and it has used the IMU samples of this filter, and the images
+    besides. What this filter believes to know of the drift is the same samples with fewer facts. (White noise stays out: the
+    pose is p + d after the update.) Of the velocity, VIO's covariance C decides: v moves by P (P + max(0, C - P))^-1 of the
+    difference, which is all of it unless VIO has just started anew; the biases follow as they are correlated with v.
+    """
+    x, P = belief.x.copy(), belief.P
+    x[at.POSITION] += x[16:19]
+    x[at.QUATERNION] = so3.quat_multiply(so3.quat_exp(x[19:22]), x[at.QUATERNION])
+    x[at.DRIFT] = 0.0
+    if velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
+        own = P[at.D_VELOCITY, at.D_VELOCITY]
+        weighed = np.linalg.solve(own + _missing(pose.velocity_covariance, own), pose.v_WB - x[at.VELOCITY])
+        x[at.VELOCITY] += own @ weighed
+        x[at.GYRO_BIAS] += P[at.D_GYRO_BIAS, at.D_VELOCITY] @ weighed
+        x[at.ACCEL_BIAS] += P[at.D_ACCEL_BIAS, at.D_VELOCITY] @ weighed
+    return dataclasses.replace(belief, x=x)
+
+
 def no_better_than(belief: Belief, pose: VioPose) -> Belief:
     """Belief whose pose and velocity are not surer than VIO's.
 

@@ -31,7 +31,7 @@ class Estimator:
         self.config = config
         self._transform = UnscentedTransform(config)
         self._imu = ImuBuffer(config.imu, config.faults, config.history)
-        self._gates = {m: float(chi2.ppf(config.gate_probability, m)) for m in (6, 9)}
+        self._gate = float(chi2.ppf(config.gate_probability, 6))
         self._base: Belief | None = None  # at the stamp of the last applied pose
         self._covariance: np.ndarray | None = None  # VIO's covariance at that pose
         self._live: Belief | None = None  # covariance up to a few steps ago
@@ -155,22 +155,18 @@ class Estimator:
         innovation = self._innovate(prior, pose)
         self._nis = innovation.nis
         outcome = VioOutcome.APPLIED
-        if innovation.nis > self._gates[len(innovation.residual)]:
+        if innovation.nis > self._gate:
             self._refused_in_row += 1
             if self._refused_in_row < self.config.gate_patience:
                 return VioOutcome.GATED
             prior = self._doubt(prior, innovation)
             innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
-        self._settle(drift.no_better_than(self._transform.correct(prior, innovation), pose), pose)
+        belief = drift.follow(self._transform.correct(prior, innovation), pose, self.config.use_velocity)
+        self._settle(drift.no_better_than(belief, pose), pose)
         return outcome
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
-        noise, R = self.config.vio, drift.white(self.config.vio)
-        if not self.config.use_velocity or pose.v_WB is None:
-            return self._transform.innovate(prior, pose.p_WB, pose.q_WB, R)
-        R9 = np.eye(9) * noise.velocity**2
-        R9[:6, :6] = R
-        return self._transform.innovate(prior, pose.p_WB, pose.q_WB, R9, pose.v_WB)
+        return self._transform.innovate(prior, pose.p_WB, pose.q_WB, drift.white(self.config.vio))
 
     def _doubt(self, prior: Belief, innovation: Innovation) -> Belief:
         """Belief in which the state and VIO's map may each be off by the whole disagreement.

@@ -48,9 +48,9 @@ class Innovation:
     """What a measurement said against the prediction.
 
     Attributes:
-        residual: measured minus predicted, shape (m,).
-        S: its covariance, shape (m, m).
-        gain: Kalman gain, shape (21, m).
+        residual: measured minus predicted, shape (6,).
+        S: its covariance, shape (6, 6).
+        gain: Kalman gain, shape (21, 6).
         nis: residual^T S^-1 residual.
     """
 
@@ -129,18 +129,16 @@ class UnscentedTransform:
         Q[12 + d, 12 + d] = self.config.imu.accel_bias_walk**2 * T
         return Q
 
-    def innovate(self, belief: Belief, p_WB: np.ndarray, q_WB: np.ndarray, R: np.ndarray,
-                 v_WB: np.ndarray | None = None) -> Innovation:
+    def innovate(self, belief: Belief, p_WB: np.ndarray, q_WB: np.ndarray, R: np.ndarray) -> Innovation:
         """Innovation and gain for a VIO pose at the belief's time.
 
-        The prediction of a sigma point is p + drift_p and exp(drift_theta) R_WB (and v): VIO's own map is off by the
+        The prediction of a sigma point is p + drift_p and exp(drift_theta) R_WB: VIO's own map is off by the
         drift. Attitude residuals are rotation vectors in W about the predicted attitude of the centre.
 
         Args:
             belief: predicted to the pose's stamp.
             p_WB, q_WB: VIO's pose, shapes (3,), (4,).
-            R: white measurement noise, shape (m, m), m = 6 or, with velocity, 9.
-            v_WB: VIO's velocity in W, shape (3,), or None.
+            R: white measurement noise, shape (6, 6).
 
         Raises:
             CovarianceError: the covariance is not positive definite.
@@ -151,8 +149,6 @@ class UnscentedTransform:
         back = so3.quat_conjugate(q_pred[0])
         Z = np.concatenate([X[:, at.POSITION] + X[:, 16:19], so3.quat_log(so3.quat_multiply(q_pred, back))], axis=1)
         z = np.concatenate([p_WB, so3.quat_log(so3.quat_multiply(q_WB, back))])
-        if v_WB is not None:
-            Z, z = np.concatenate([Z, X[:, at.VELOCITY]], axis=1), np.concatenate([z, v_WB])
         mean = self.points.Wm @ Z
         weighted = (Z - mean) * self.points.Wc[:, None]
         S = weighted.T @ (Z - mean) + R
