@@ -152,7 +152,7 @@ def test_takes_off_follows_switches_and_lands(vehicle):
 
     answer = vehicle.call(vehicle.choose, SetController.Request(type="pid"))
     assert not answer.success and answer.error_code == 1 and "geometric, nmpc" in answer.message
-    vehicle.spin_until(lambda: vehicle.node_under_test._nmpc is not None, "the compiled NMPC")
+    vehicle.spin_until(lambda: vehicle.node_under_test._assembly.nmpc is not None, "the compiled NMPC")
     before = np.array(vehicle.commands[-1].rotor_speed)
     answer = vehicle.call(vehicle.choose, SetController.Request(type="nmpc", adaptive=True))
     assert answer.success, answer.message

@@ -17,13 +17,10 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from perch_control.admission import AtEnd, Order
-from perch_control.flight import FlightController
-from perch_control.geometric import GeometricController
-from perch_control.l1 import L1Augmentation
+from perch_control.assembly import Assembly, LawNotReady
 from perch_control.modes import Command, StepResult
-from perch_control.nmpc import NmpcController, chosen_lines
+from perch_control.nmpc import chosen_lines
 from perch_control.parameters import ControllerParameters
-from perch_control.reference import FlatReference, SampledReference
 from perch_control.ros.powerline_map import mapped_segments
 from perch_core.errors import ConfigError, PerchError
 from perch_core.ros import qos
@@ -47,18 +44,10 @@ class ControllerNode(PerchNode[ControllerParameters]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("controller", ControllerParameters, self._change, **kwargs)
-        self._vehicle = load_vehicle(self.params.vehicle)
-        gains = self.params.gain_set(self._vehicle.name)
-        self._geometric = GeometricController(self._vehicle, gains)
-        self._nmpc: NmpcController | None = None
-        self._flight = FlightController(self._vehicle, self._geometric, gains, self.params.flight)
-        if self.params.controller.adaptive:
-            self._flight.compensator = L1Augmentation(self._vehicle, self.params.l1)
-        if self.params.controller.type == "nmpc":
-            self._build_nmpc()
-            self._flight.use(self._nmpc, gains, self.params.flight)
-        elif self.params.controller.standby:
-            Thread(target=self._build_nmpc, daemon=True).start()
+        self._assembly = Assembly(self.params, load_vehicle(self.params.vehicle))
+        self._flight = self._assembly.flight
+        if self._assembly.nmpc is None and self.params.controller.standby:
+            Thread(target=self._assembly.build_nmpc, daemon=True).start()
         self._costs: deque[float] = deque(maxlen=DIAGNOSTICS_STEPS)
         self._deadlines = Deadlines()
         self._steps = 0
@@ -89,30 +78,18 @@ class ControllerNode(PerchNode[ControllerParameters]):
         """New gains and limits count from the next step."""
         if value.vehicle != self.params.vehicle:
             raise ConfigError(self.get_name(), "vehicle", "is fixed after the start")
-        gains = value.gain_set(self._vehicle.name)
-        self._geometric = GeometricController(self._vehicle, gains)
-        if self._nmpc is not None:
-            self._nmpc.retune(value.nmpc, self._geometric)
-        if self._flight.compensator is not None:
-            self._flight.compensator.settings = value.l1
-        self._flight.use(self._nmpc if self._flight.law is self._nmpc else self._geometric, gains, value.flight)
-
-    def _build_nmpc(self) -> None:
-        """Compile the predictive controller, or find it compiled; seconds the first time, a tenth of one later."""
-        self._nmpc = NmpcController(self._vehicle, self.params.nmpc, self._geometric)
+        self._assembly.change(value)
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
     def _receive_trajectory(self, msg: Trajectory) -> None:
         try:
             trajectory = from_message(msg)
-            source = (FlatReference(trajectory) if isinstance(trajectory, FlatTrajectory)
-                      else SampledReference(trajectory, self._vehicle.mass))
             try:
                 at_end = AtEnd(msg.at_end)
             except ValueError:
                 raise PerchError(f"at_end {msg.at_end} is not one of 0..3") from None
-            self._flight.follow(Order(msg.id, source, trajectory.start_time, at_end, float(msg.contact_time),
+            self._flight.follow(Order(msg.id, self._assembly.reference(trajectory), trajectory.start_time, at_end, float(msg.contact_time),
                                       float(msg.recovery_start)))
         except PerchError as error:
             self._flight.maneuvers.message = f"trajectory {msg.id} refused: {error}"
@@ -123,8 +100,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
             trajectory = from_message(msg)
             if isinstance(trajectory, FlatTrajectory):
                 raise PerchError("a way out must carry states")
-            self._flight.keep_ready(Order(msg.id, SampledReference(trajectory, self._vehicle.mass), trajectory.start_time,
-                                          AtEnd.HOLD, 0.0, 0.0))
+            self._flight.keep_ready(Order(msg.id, self._assembly.reference(trajectory), trajectory.start_time, AtEnd.HOLD, 0.0, 0.0))
         except PerchError as error:
             self.get_logger().warning(f"way out of trajectory {msg.id} refused: {error}")
 
@@ -136,9 +112,9 @@ class ControllerNode(PerchNode[ControllerParameters]):
             self.get_logger().warning(f"command: {error}")
 
     def _receive_lines(self, msg: PowerlineArray) -> None:
-        if self._nmpc is not None:
+        if self._assembly.nmpc is not None:
             p_WB = np.array(self._flight.maneuvers.belief[0:3])
-            self._nmpc.lines(chosen_lines(mapped_segments(msg), p_WB, self.params.nmpc.lines.watched))
+            self._assembly.nmpc.lines(chosen_lines(mapped_segments(msg), p_WB, self.params.nmpc.lines.watched))
 
     def _receive_estimator(self, msg: EstimatorStatus) -> None:
         self._flight.supervisor.estimator(msg.state, float(msg.vio_age), msg.message)
@@ -236,23 +212,13 @@ class ControllerNode(PerchNode[ControllerParameters]):
     # -- services ----------------------------------------------------------------------------------------------------
 
     def _set_controller(self, request: SetController.Request, response: SetController.Response) -> SetController.Response:
-        laws = {"geometric": self._geometric, "nmpc": self._nmpc}
-        response.success, response.error_code = False, 1
-        if request.type not in laws:
-            response.message = f"type {request.type!r} is not one of {', '.join(laws)}"
+        try:
+            self._assembly.choose(request.type, request.adaptive)
+        except (LawNotReady, ConfigError) as error:
+            response.success, response.message = False, str(error)
+            response.error_code = 2 if isinstance(error, LawNotReady) else 1
             return response
-        law = laws[request.type]
-        if law is None:
-            response.error_code = 2
-            response.message = "nmpc is not ready: it is being compiled, or controller.standby is false"
-            return response
-        flight = self._flight
-        if request.adaptive and flight.compensator is None:
-            flight.compensator = L1Augmentation(self._vehicle, self.params.l1)
-        elif not request.adaptive:
-            flight.compensator = None
-        flight.use(law, self.params.gain_set(self._vehicle.name), self.params.flight)
-        response.success, response.error_code, response.message = True, 0, f"{flight.law_name} flies"
+        response.success, response.error_code, response.message = True, 0, f"{self._flight.law_name} flies"
         return response
 
     def _abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

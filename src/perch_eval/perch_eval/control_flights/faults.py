@@ -96,7 +96,7 @@ def _jump(flight: FaultyFlight, rng: np.random.Generator) -> str:
 
 
 def _lose_vio(flight: FaultyFlight, rng: np.random.Generator) -> str:
-    flight.vio_lost = True
+    flight.sensing.vio_lost = True
     return "no VIO pose any more"
 
 

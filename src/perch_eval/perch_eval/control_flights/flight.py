@@ -6,21 +6,17 @@ localised without an error of its own, so that what is measured is the controlle
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
 
 from perch_control.admission import AtEnd, Order
-from perch_control.flight import FlightController
-from perch_control.geometric import GeometricController
-from perch_control.l1 import L1Augmentation
+from perch_control.assembly import Assembly
 from perch_control.mission import State as BodyState
 from perch_control.mission import Target
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.parameters import MissionParameters
 from perch_control.modes import Command, State, StepResult
-from perch_control.nmpc import NmpcController
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference
 from perch_core import so3
@@ -29,19 +25,14 @@ from perch_core.scenario import Scenario
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
-from perch_eval.in_process.estimation import Estimation, Odometry
-from perch_eval.in_process.mailbox import Mailbox
+from perch_eval.in_process.estimation import Odometry
 from perch_eval.in_process.parameters import NodeParameters
-from perch_eval.in_process.stamps import seconds
-from perch_eval.in_process.vio_source import ModelledVio
-from perch_perception.ukf import Health, ImuSample, UkfConfig
+from perch_eval.in_process.sensing import Sensing
+from perch_perception.ukf import Health, ImuSample
 from perch_planner.perching_planner_node import PerchingPlannerParameters
 from perch_planner.planner import plan
 from perch_planner.problem import PerchProblem, StartState
 from perch_sim.contact_event import ContactEvent
-from perch_sim.plant import PERIOD
-from perch_sim.simulation import Simulation
-from perch_sim.vio_model import VioModelParameters
 
 LEAD = 0.04     # from an order to its start [s]
 TICK_STEPS = 10  # the mission decides at 50 Hz
@@ -53,13 +44,12 @@ class ControlFlight:
 
     Attributes:
         controller: the flight controller with its supervisor.
-        odometry: what the estimator says at this step.
+        sensing, simulation: the vehicle, and what is known of it.
         target, plan, contact_due: pad, trajectory and time of contact [s] of the perch that was ordered.
         references: time [s], reference (3) and true position (3) [m] of each step in flight.
         events: (time [s], state, text) of the controller.
         contacts: what the vehicle truly touched.
         orders_lost: no trajectory reaches the controller any more.
-        vio_lost: no VIO pose reaches the estimator any more.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
@@ -68,55 +58,48 @@ class ControlFlight:
             ConfigError: the scenario or a node's parameter is refused.
         """
         params = NodeParameters(scenario, seed)
-        self.scenario, self.simulation = scenario, Simulation(scenario, seed)
+        self.scenario, self.sensing = scenario, Sensing(scenario, params, seed)
+        self.simulation = self.sensing.simulation
         vehicle = self.vehicle = self.simulation.vehicle
-        self.vio = ModelledVio(params.of("vio_model", VioModelParameters), vehicle.mounts["down"])
-        self.estimation = Estimation(params.of("estimator", UkfConfig))
         self.params = params.of("controller", ControllerParameters)
-        self.controller = _controller(self.params, vehicle)
+        self.controller = Assembly(self.params, vehicle).flight
         self.mission = params.of("mission", MissionParameters).mission
         self._planner = params.of("perching_planner", PerchingPlannerParameters)
-        self._latency = round(scenario.latency.vio * 1e9)
         self._adhesion, self._felt = AdhesionMonitor(self.mission.adhesion), []
-        self._poses, self._frames = Mailbox(), deque()
-        self._index, self._orders = 0, 0
-        self.odometry: Odometry | None = None
+        self._orders = 0
         self.target: Target | None = None
         self.plan: FlatTrajectory | None = None
         self.contact_due = np.inf
         self.events: list[tuple[float, str, str]] = []
         self.contacts: list[ContactEvent] = []
         self.references: list[tuple[float, ...]] = []
-        self.orders_lost = self.vio_lost = False
+        self.orders_lost = False
 
     @property
     def time(self) -> float:
         """[s]"""
-        return seconds(self.simulation.time)
+        return self.sensing.time
+
+    @property
+    def odometry(self) -> Odometry:
+        """What the estimator says at this step."""
+        return self.sensing.odometry
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
     def step(self) -> None:
         """One control period."""
-        output = self.simulation.advance()
-        stamp, time = output.time, seconds(output.time)
-        imu = ImuSample(stamp, tuple(output.imu.gyro.tolist()), tuple(output.imu.accel.tolist()))
-        self.vio.see(output.state, imu)
-        for pose in self._poses.released(stamp):
-            if not self.vio_lost:
-                self.estimation.add_vio(pose)
-        self.odometry = self.estimation.step(imu)
+        output = self.sensing.step()
+        time, imu = self.time, self.sensing.imu
         self.controller.imu(time, imu.w_B, imu.f_B)
         result = self.answer(time)
         if result is not None:
             self._carry_out(time, result, output.state.p_WB)
-        if self._index % HEALTH_STEPS == 0:
-            status = self.estimation.status
+        if (self.sensing.index - 1) % HEALTH_STEPS == 0:
+            status = self.sensing.estimation.status
             self.controller.supervisor.estimator(status.health.value, float(status.vio_age), status.message)
-        self._look(stamp)
         self.contacts.extend(output.contacts)
         self._feel(imu)
-        self._index += 1
 
     def answer(self, time: float) -> StepResult | None:
         """The controller's answer to the odometry of this step; None: it was not asked."""
@@ -129,20 +112,10 @@ class ControlFlight:
         if result.setpoint is not None:
             self.references.append((time, *result.setpoint.p, *p_WB.tolist()))
 
-    def _look(self, stamp: int) -> None:
-        camera = self.simulation.cameras["down"]
-        if camera.due(stamp) is not None:
-            self._frames.append(camera.take())
-        while self._frames and self.vio.covers(self._frames[0]):
-            delivery = self._frames.popleft()
-            pose = self.vio.answer(delivery)
-            if pose is not None:
-                self._poses.post(max(delivery.frame.middle + self._latency, stamp + PERIOD), pose)
-
     def _feel(self, imu: ImuSample) -> None:
         """What the mission does after a perch: the motors stop where the surface is felt to carry the vehicle."""
         self._felt.append(imu.f_B)
-        if self._index % TICK_STEPS:
+        if (self.sensing.index - 1) % TICK_STEPS:
             return
         self._adhesion.add(np.array(self._felt))
         self._felt.clear()
@@ -167,9 +140,9 @@ class ControlFlight:
         Raises:
             PerchError: the estimator is not ready within 10 s.
         """
-        while self.estimation.status.health is not Health.RUNNING:
+        while self.sensing.estimation.status.health is not Health.RUNNING:
             if self.time > 11.0:
-                raise PerchError(f"the estimator is not ready: {self.estimation.status.message}")
+                raise PerchError(f"the estimator is not ready: {self.sensing.estimation.status.message}")
             self.step()
         self.run(self.time + 0.2)
         self.controller.command(Command.ARM, "scripted flight")
@@ -229,15 +202,3 @@ class ControlFlight:
         self.target = Target(self.time, pad.p_WS + shift, so3.quat_from_matrix(pad.R_WS), 0.0, 0.0)
         self.contact_due, self.plan = start + trajectory.duration, trajectory
         return True
-
-
-def _controller(params: ControllerParameters, vehicle) -> FlightController:
-    """As the node `controller` builds it."""
-    gains = params.gain_set(vehicle.name)
-    geometric = GeometricController(vehicle, gains)
-    out = FlightController(vehicle, geometric, gains, params.flight)
-    if params.controller.adaptive:
-        out.compensator = L1Augmentation(vehicle, params.l1)
-    if params.controller.type == "nmpc":
-        out.use(NmpcController(vehicle, params.nmpc, geometric), gains, params.flight)
-    return out

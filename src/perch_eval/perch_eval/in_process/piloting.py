@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_control.admission import AtEnd, Order
-from perch_control.flight import FlightController
-from perch_control.geometric import GeometricController
-from perch_control.l1 import L1Augmentation
+from perch_control.assembly import Assembly
 from perch_control.modes import Command, StepResult
-from perch_control.nmpc import NmpcController, chosen_lines
+from perch_control.nmpc import chosen_lines
 from perch_control.parameters import ControllerParameters
-from perch_control.reference import FlatReference, SampledReference
 from perch_core.errors import PerchError
 from perch_core.lines import Segment
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
@@ -51,17 +48,9 @@ class Piloting:
     """Owns the flight controller."""
 
     def __init__(self, params: ControllerParameters, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        gains = params.gain_set(vehicle.name)
-        geometric = GeometricController(vehicle, gains)
-        self._flight = FlightController(vehicle, geometric, gains, params.flight)
-        if params.controller.adaptive:
-            self._flight.compensator = L1Augmentation(vehicle, params.l1)
+        self._assembly = Assembly(params, vehicle)
+        self._flight, self._nmpc = self._assembly.flight, self._assembly.nmpc
         self._watched = params.nmpc.lines.watched
-        self._nmpc: NmpcController | None = None
-        if params.controller.type == "nmpc":
-            self._nmpc = NmpcController(vehicle, params.nmpc, geometric)
-            self._flight.use(self._nmpc, gains, params.flight)
 
     def command(self, command: Command, reason: str) -> None:
         """A command that counts from this step on."""
@@ -72,8 +61,7 @@ class Piloting:
 
     def follow(self, order: FlownTrajectory) -> None:
         """A trajectory that counts from this step on."""
-        flat = isinstance(order.trajectory, FlatTrajectory)
-        source = FlatReference(order.trajectory) if flat else SampledReference(order.trajectory, self._vehicle.mass)
+        source = self._assembly.reference(order.trajectory)
         try:
             take = self._flight.keep_ready if order.ready else self._flight.follow
             take(Order(order.id, source, order.trajectory.start_time, order.at_end, order.contact_time, order.recovery_start))

@@ -5,8 +5,6 @@ The controller knows the state that the estimator has and a map with an error; t
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from perch_control.admission import AtEnd
@@ -17,19 +15,13 @@ from perch_core.lines import Segment
 from perch_core.scenario import Scenario
 from perch_core.trajectory import rest_to_rest
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
-from perch_eval.in_process.estimation import Estimation
-from perch_eval.in_process.mailbox import Mailbox
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.piloting import FlownTrajectory, Piloting
-from perch_eval.in_process.stamps import seconds
-from perch_eval.in_process.vio_source import ModelledVio
+from perch_eval.in_process.sensing import Sensing
 from perch_eval.inspection.measures import Inspected, inspected, reference_of, segments
-from perch_perception.ukf import Health, ImuSample, UkfConfig
+from perch_perception.ukf import Health
 from perch_sim import seeding
 from perch_sim.contact_event import ContactEvent, ContactState
-from perch_sim.plant import PERIOD
-from perch_sim.simulation import Simulation
-from perch_sim.vio_model import VioModelParameters
 
 MAP_ERROR = 0.02   # 1 sigma of each axis of both ends of a mapped line [m]; the mapper's bar is 3 cm
 MAP_STEPS = 50     # the map is published at 10 Hz
@@ -46,58 +38,35 @@ def mapped(lines: list[Segment], rng: np.random.Generator) -> list[Segment]:
 class _Flight:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         params = NodeParameters(scenario, seed)
-        self.simulation = Simulation(scenario, seed)
-        mount = self.simulation.vehicle.mounts["down"]
-        self.vio = ModelledVio(params.of("vio_model", VioModelParameters), mount)
-        self.latency = round(scenario.latency.vio * 1e9)
-        self.estimation = Estimation(params.of("estimator", UkfConfig))
+        self.sensing = Sensing(scenario, params, seed)
         controller = params.of("controller", ControllerParameters)
-        self.piloting = Piloting(controller, self.simulation.vehicle)
+        self.piloting = Piloting(controller, self.sensing.simulation.vehicle)
         self.ramp = controller.nmpc.lines.ramp_time
-        self.believed: np.ndarray = np.zeros(3)  # position as estimated
-        self.poses: Mailbox = Mailbox()
-        self.waiting: deque = deque()
         self.map: list[Segment] = []
-        self.index = 0
         self.contacts: list[ContactEvent] = []
         self.rows: list[tuple[float, ...]] = []
 
     @property
     def time(self) -> float:
-        return seconds(self.simulation.time)
+        return self.sensing.time
 
     def step(self) -> None:
-        output = self.simulation.advance()
-        stamp, time = output.time, seconds(output.time)
-        imu = ImuSample(stamp, tuple(output.imu.gyro.tolist()), tuple(output.imu.accel.tolist()))
-        self.vio.see(output.state, imu)
-        for pose in self.poses.released(stamp):
-            self.estimation.add_vio(pose)
-        odometry = self.estimation.step(imu)
-        self.believed = odometry.estimate.p_WB
-        if self.map and self.index % MAP_STEPS == 0:
+        sensing, index = self.sensing, self.sensing.index
+        output = sensing.step()
+        if self.map and index % MAP_STEPS == 0:
             self.piloting.see(self.map)
-        result = self.piloting.step(time, imu, odometry)
-        self.simulation.motors.command(self.simulation.time, result.armed, np.array(result.rotor_speed))
-        if self.index % HEALTH_STEPS == 0:
-            self.piloting.hear(self.estimation.status)
-        camera = self.simulation.cameras["down"]
-        if camera.due(stamp) is not None:
-            self.waiting.append(camera.take())
-        while self.waiting and self.vio.covers(self.waiting[0]):
-            delivery = self.waiting.popleft()
-            answer = self.vio.answer(delivery)
-            if answer is not None:
-                self.poses.post(max(delivery.frame.middle + self.latency, stamp + PERIOD), answer)
+        result = self.piloting.step(self.time, sensing.imu, sensing.odometry)
+        sensing.simulation.motors.command(sensing.simulation.time, result.armed, np.array(result.rotor_speed))
+        if index % HEALTH_STEPS == 0:
+            self.piloting.hear(sensing.estimation.status)
         self.contacts.extend(output.contacts)
-        if self.index % RECORD == 0:
+        if index % RECORD == 0:
             x = output.state
-            self.rows.append((time, *x.p_WB.tolist(), *x.q_WB.tolist(), *x.v_WB.tolist(), *x.w_WB_B.tolist()))
-        self.index += 1
+            self.rows.append((self.time, *x.p_WB.tolist(), *x.q_WB.tolist(), *x.v_WB.tolist(), *x.w_WB_B.tolist()))
 
     def run(self, duration: float) -> None:
         end = self.time + duration
-        while self.time < end and not self.simulation.plant.crashed:
+        while self.time < end and not self.sensing.simulation.plant.crashed:
             self.step()
 
 
@@ -135,16 +104,16 @@ def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
 
 def _take_off(flight: _Flight, scenario: Scenario) -> None:
     first = scenario.inspection.waypoints[0]
-    while flight.estimation.status.health is not Health.RUNNING:
+    while flight.sensing.estimation.status.health is not Health.RUNNING:
         if flight.time > 10.0:
-            raise PerchError(f"the estimator is not ready: {flight.estimation.status.message}")
+            raise PerchError(f"the estimator is not ready: {flight.sensing.estimation.status.message}")
         flight.step()
     flight.run(0.2)
     flight.piloting.command(Command.ARM, "inspection")
     flight.run(0.2)
     yaw = float(np.radians(first.yaw_deg))
     duration = max(2.0, first.position[2] / 0.8)
-    flight.piloting.follow(FlownTrajectory(1, rest_to_rest(flight.believed, np.array(first.position), yaw, yaw, duration, flight.time + LEAD),
+    flight.piloting.follow(FlownTrajectory(1, rest_to_rest(flight.sensing.odometry.estimate.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD),
                                            AtEnd.HOLD))
     flight.run(duration + LEAD + SETTLE)
     if State(flight.piloting.status.state) is not State.HOVERING:
