@@ -1,4 +1,4 @@
-"""Monte-Carlo runs of VIO and estimator on rendered perches: NEES and NIS with their bounds, as JSON and a picture.
+"""Monte-Carlo runs of VIO, estimator and target on rendered perches: NEES and NIS with their bounds, as JSON and a picture.
 
 Judged in the air: on the ground the vehicle stands exactly where it was told, and no covariance of use is as small as that.
 
@@ -17,10 +17,12 @@ from perch_core.scenario import load_scenario
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
 from perch_eval.consistency import Consistency
+from perch_eval.target_sightings import Sightings, see_target
 
 GROUPS = {"estimator: all 15 states": slice(0, 15), "estimator: position": slice(0, 3), "estimator: velocity": slice(3, 6),
           "estimator: attitude": slice(6, 9)}
 AIRBORNE_AFTER = 0.4  # from the first thrust until the vehicle is clear of the ground [s]
+LOOK = (-1.5, 0.4)    # the pad is looked at from the hover until it leaves the view, relative to the perch's begin [s]
 
 
 def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Consistency], dict[str, object]]:
@@ -32,9 +34,9 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
         first_seed: seeds count up from here.
 
     Returns:
-        Estimator and VIO NEES over time, and a summary with RMSE through the perch and mean NIS.
+        NEES of estimator, VIO and target over time, and a summary with RMSE through the perch and mean NIS.
     """
-    scenario, tracks, vio_nees, rmse, nis, vio_nis = load_scenario(scenario_name), [], [], [], [], []
+    scenario, tracks, vio_nees, rmse, nis, vio_nis, sightings = load_scenario(scenario_name), [], [], [], [], [], []
     grid = None
     for seed in range(first_seed, first_seed + runs):
         flight = flights.fly(scenario, seed)
@@ -42,6 +44,7 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
         airborne = flight.motion.settings.ground + AIRBORNE_AFTER
         track = flights.run_estimator(flight, steps, begin=airborne)
         tracks.append(track)
+        sightings.append(see_target(scenario, flight, track, seed, flight.perch_time + LOOK[0], flight.perch_time + LOOK[1]))
         perching = track.times >= flight.perch_time
         rmse.append(np.sqrt((track.errors[perching, :3] ** 2).mean(axis=0)))
         nis.append(track.nis)
@@ -58,6 +61,7 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     results = [consistency.judge(name, tracks[0].times[:n], consistency.nees(errors[..., s], covariances[..., s, s]), s.stop - s.start)
                for name, s in GROUPS.items()]
     results.append(consistency.judge("vio: pose", grid, np.array(vio_nees), 6))
+    results += _judge_target(sightings)
     rmse = 100 * np.array(rmse)
     summary = {"scenario": scenario_name, "runs": runs, "rmse_cm_median": np.median(rmse, axis=0).tolist(),
                "rmse_cm_worst": rmse.max(axis=0).tolist(), "estimator_nis_over_6": float(np.concatenate(nis).mean() / 6),
@@ -65,6 +69,15 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
                "nees": {r.name: {"inside": r.inside, "above": r.above, "mean_over_dimension": float(r.mean.mean() / r.dimension)}
                         for r in results}}
     return results, summary
+
+
+def _judge_target(sightings: list[Sightings]) -> list[Consistency]:
+    """NEES of the target's pose, at the images in which every run found the pad."""
+    errors, covariances = np.array([s.errors for s in sightings]), np.array([s.covariances for s in sightings])
+    seen = np.isfinite(errors).all(axis=(0, 2))
+    groups = {"target: pose": slice(0, 6), "target: position": slice(0, 3), "target: attitude": slice(3, 6)}
+    return [consistency.judge(name, sightings[0].times[seen], consistency.nees(errors[:, seen, s], covariances[:, seen, s, s]),
+                              s.stop - s.start) for name, s in groups.items()]
 
 
 def main() -> None:

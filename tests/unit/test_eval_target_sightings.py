@@ -1,0 +1,45 @@
+"""The pad along a flight of the evaluation: what is wrong with the body's pose is wrong with the target's, and counted."""
+
+import numpy as np
+import pytest
+from perch_core.scenario import load_scenario
+from perch_core.vehicle import load_vehicle
+from perch_eval import consistency
+from perch_eval.estimation_flight import EstimatorTrack, Flight, motion_of
+from perch_eval.perch_motion import ImuReadings
+from perch_eval.target_sightings import estimated_body, see_target
+
+OFF = np.array([0.02, -0.01, 0.015])
+
+
+@pytest.fixture(scope="module")
+def hover():
+    """A flight without images of its own, and its scenario."""
+    scenario = load_scenario("surface_90_ideal")
+    motion = motion_of(scenario, 3)
+    truth = motion.sample(np.arange(0.0, motion.duration - 0.003, 0.02))
+    nothing = np.zeros((len(truth.times), 3))
+    return scenario, Flight(motion, truth, ImuReadings(nothing, nothing, nothing, nothing), load_vehicle("snapdragon").mounts["down"],
+                            (), motion.duration - motion.settings.perch)
+
+
+def track_of(flight, error=np.zeros(15), sigma=1e-3):
+    n = len(flight.truth.times)
+    return EstimatorTrack(flight.truth.times, np.tile(error, (n, 1)), np.tile(np.eye(15) * sigma**2, (n, 1, 1)), np.zeros(0))
+
+
+def test_the_estimated_body_is_the_truth_less_the_error(hover):
+    _, flight = hover
+    body = estimated_body(flight, track_of(flight, np.r_[OFF, np.zeros(12)]), 3.5)
+    np.testing.assert_allclose(flight.motion.sample(np.array([3.5])).p_WB[0] - body.p_WB, OFF, atol=1e-9)
+
+
+def test_errors_of_the_body_are_errors_of_the_target(hover):
+    scenario, flight = hover
+    exact = see_target(scenario, flight, track_of(flight), 3, 3.5, 3.8)
+    wrong = see_target(scenario, flight, track_of(flight, np.r_[OFF, np.zeros(12)], sigma=0.015), 3, 3.5, 3.8)
+    assert np.isfinite(exact.errors).all() and len(exact.times) == 9
+    assert np.linalg.norm(exact.errors[:, :3], axis=1).max() < 0.01
+    np.testing.assert_allclose(wrong.errors[:, :3] - exact.errors[:, :3], np.tile(OFF, (9, 1)), atol=2e-3)
+    nees = consistency.nees(wrong.errors, wrong.covariances)
+    assert nees.max() < 16.8 < consistency.nees(wrong.errors, exact.covariances).min()  # 99 % of chi2 with 6 degrees of freedom
