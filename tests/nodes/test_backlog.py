@@ -16,8 +16,7 @@ from perch_core.ros.conversions import to_stamp
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode
 from perch_core.ros.wire import stamp_of
-
-PERIOD = 2_000_000
+from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds, to_stamp
 from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.wire import stamp_of
-
-PERIOD = 2_000_000
+from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
 
 
 class Graph:

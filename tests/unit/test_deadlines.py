@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from perch_core.ros.deadlines import PERIOD, WINDOW, Deadlines
+from perch_core.ros.deadlines import WINDOW, Deadlines
+from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
 
 START = 1_000_000_000  # stamp of the first step [ns]
 AHEAD = 77_000_000_000  # of the monotonic clock, unknown to the node [ns]

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from perch_core.scenario import load_scenario
+from perch_core.timing import CONTROL_PERIOD
 from perch_eval import estimation_flight as flights
 from perch_perception.ukf import Estimator, Health, ImuSample
 from perch_perception.vio import FrameOutcome, VioConfig
@@ -118,7 +119,7 @@ def test_a_covered_camera_is_reported_and_survived():
     # the estimator coasts meanwhile and says so
     whole, estimator, healths = flight(), Estimator(), {}
     poses = [flights.vio_pose(s.result) for s in steps if s.result.estimate is not None]
-    for k in range(int(4.4 / flights.PERIOD)):
+    for k in range(int(4.4 / CONTROL_PERIOD)):
         while poses and poses[0].stamp * 1e-9 + 0.04 <= whole.truth.times[k]:
             estimator.add_vio(poses.pop(0))
         estimator.add_imu(whole.sample(k))

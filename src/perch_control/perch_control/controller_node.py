@@ -30,13 +30,13 @@ from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import from_message
 from perch_core.ros.wire import MotorCommandTemplate, read_imu, read_odometry, stamp_of
+from perch_core.timing import CONTROL_PERIOD
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import load_vehicle
 
 STATUS_STEPS = 10        # 50 Hz: the mission takes controller/status at every tenth step
 ESTIMATOR_STEPS = 50     # 10 Hz: estimator/status
 DIAGNOSTICS_STEPS = 500  # 1 Hz
-PERIOD = 0.002
 
 
 class ControllerNode(PerchNode[ControllerParameters]):
@@ -129,7 +129,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         In lockstep the vehicle waits for the estimator, however long it takes on this machine, so only the timer may
         conclude that it is gone; in real time the IMU goes on and shows it.
         """
-        if seconds(stamp_of(data)) <= self._flight.maneuvers.now + PERIOD / 2:
+        if seconds(stamp_of(data)) <= self._flight.maneuvers.now + CONTROL_PERIOD / 2:
             return
         if self._unanswered is None:
             self._unanswered_since = time.monotonic()

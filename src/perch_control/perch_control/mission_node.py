@@ -20,6 +20,7 @@ from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import flat_message
 from perch_core.ros.wire import OdometryReading, read_imu, read_odometry, stamp_of
+from perch_core.timing import CONTROL_PERIOD_NS
 from perch_control.mission import (
     ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters
@@ -27,7 +28,7 @@ from perch_control.ros.goal_server import GoalServer
 from perch_control.ros.planner_clients import PlannerClients, perch_message
 from perch_control.ros.powerline_map import mapped_target
 
-TICK = TICK_STEPS * 2_000_000  # the mission decides at 50 Hz [ns]
+TICK = TICK_STEPS * CONTROL_PERIOD_NS  # the mission decides at 50 Hz [ns]
 
 
 class MissionNode(PerchNode[MissionParameters]):

@@ -14,6 +14,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.scenario import Scenario
+from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import load_vehicle
 from perch_eval.consistency import attitude_error
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
@@ -22,7 +23,6 @@ from perch_perception.vio import VioConfig, VioResult, VisualInertialOdometry
 from perch_sim.calibration import true_mount
 from perch_sim.rendering import Renderer, build_scene
 
-PERIOD = 0.002  # of the IMU [s]
 DURATIONS = {1.7: 1.8, 3.0: 2.0}  # of the perch by distance: 570-700 deg/s at 90 deg [m -> s]
 
 
@@ -77,7 +77,7 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
     real = mount if scenario.realism == "ideal" else true_mount(mount, rng)
     motion = motion_of(scenario, seed)
     end = min(motion.duration, until)
-    truth = motion.sample(np.arange(0.0, end - 1.5 * PERIOD, PERIOD))
+    truth = motion.sample(np.arange(0.0, end - 1.5 * CONTROL_PERIOD, CONTROL_PERIOD))
     renderer = Renderer(build_scene(scenario, seed), real, seed)
     frames = []
     for middle in np.arange(0.02 + rng.uniform(0, 1 / mount.rate), end - 0.02, 1 / mount.rate):

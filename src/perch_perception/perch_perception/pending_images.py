@@ -10,7 +10,6 @@ import math
 from collections import deque
 from typing import Any, Callable
 
-from perch_core.errors import PerchError
 
 FUTURE = 0.5      # an image stamped this much ahead of the odometry cannot be right [s]
 LOOK = 0.05       # odometry is taken with each image and tick, and this often where neither comes [s], wall clock

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.scenario import Scenario
+from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding
 from perch_sim.attachment import FREE
@@ -19,9 +20,8 @@ from perch_sim.obstacles import make_obstacles
 from perch_sim.state_history import TrueState
 from perch_sim.wind import WindField
 
-PERIOD = 2_000_000  # control period [ns]
 SUBSTEPS = 4        # Runge-Kutta steps per period: 0.5 ms each
-STEP = PERIOD * 1e-9 / SUBSTEPS
+STEP = CONTROL_PERIOD / SUBSTEPS
 
 
 class PlantOutput(NamedTuple):
@@ -61,7 +61,7 @@ class Plant:
         self.rotor_speed = np.zeros(4)
         self._start = start
         self._x = resting_state(scenario, self.body)
-        self._wind = WindField(scenario.wind, PERIOD * 1e-9, seeding.stream(seed, "wind"))
+        self._wind = WindField(scenario.wind, CONTROL_PERIOD, seeding.stream(seed, "wind"))
         self._distances = np.zeros((len(self.obstacles.names), 2))
         self._warm_up()
 
@@ -109,10 +109,10 @@ class Plant:
                 self.obstacles.surfaces, self.hold, begin, STEP, path[done:last], total, self._distances)
             before = path[done + made - 2] if made > 1 else before
             done += made
-            contacts += self._touches(self.time + done * PERIOD // SUBSTEPS, before)
-        states = [TrueState(self.time + (k + 1) * PERIOD // SUBSTEPS, x[:3], x[3:7], x[7:10], x[10:13])
+            contacts += self._touches(self.time + done * CONTROL_PERIOD_NS // SUBSTEPS, before)
+        states = [TrueState(self.time + (k + 1) * CONTROL_PERIOD_NS // SUBSTEPS, x[:3], x[3:7], x[7:10], x[10:13])
                   for k, x in enumerate(path)]
-        self.time += PERIOD
+        self.time += CONTROL_PERIOD_NS
         elapsed = (self.time - self._start) * 1e-9
         contacts += [e._replace(time=self.time * 1e-9) for e in self.cables.update(elapsed, self._x)]
         return PlantOutput(tuple(states), total / SUBSTEPS, tuple(contacts))

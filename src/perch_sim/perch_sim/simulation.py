@@ -19,6 +19,7 @@ import numpy as np
 from perch_core.errors import ConfigError
 from perch_core.scenario import Scenario
 from perch_core.surface import PerchSurface
+from perch_core.timing import CONTROL_PERIOD_NS
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_sim import seeding
 from perch_sim.calibration import true_mount
@@ -28,7 +29,7 @@ from perch_sim.contact_event import ContactEvent
 from perch_sim.imu import Imu, ImuSample
 from perch_sim.motors import Motors
 from perch_sim.obstacles import pad_surface
-from perch_sim.plant import PERIOD, SUBSTEPS, Plant
+from perch_sim.plant import SUBSTEPS, Plant
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.rendering.sensor import control_exposure
 from perch_sim.state_history import StateHistory, TrueState
@@ -66,13 +67,13 @@ class Simulation:
         """
         self.scenario = scenario
         self.vehicle: Vehicle = load_vehicle(scenario.vehicle)
-        if round(SECOND / self.vehicle.imu.rate) != PERIOD:
+        if round(SECOND / self.vehicle.imu.rate) != CONTROL_PERIOD_NS:
             raise ConfigError(f"vehicles/{scenario.vehicle}", "imu.rate",
-                              f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / PERIOD:g} Hz")
+                              f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout)
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
-        self._history = StateHistory(MEMORY * SUBSTEPS // PERIOD)
+        self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
         self.cameras = self._make_cameras(seed, render, pool)
 

@@ -21,6 +21,7 @@ from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
 from perch_core.scenario import load_scenario
+from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_sim.camera_stream import Delivery
 from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.motors import MotorCommandError
@@ -28,7 +29,6 @@ from perch_sim.pacing import Pacing
 from perch_sim.parameters import CAMERAS, VehicleParameters
 from perch_sim.participants import CONTROLLER, triggers
 from perch_sim.phase_times import PhaseTimes
-from perch_sim.plant import PERIOD
 from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 from perch_sim.ros.vehicle_topics import VehicleTopics
 
@@ -77,7 +77,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._pacing: Pacing | None = None
         self._allowance = 0                    # steps that the wall clock allows a flight without controller
         if params.lockstep:
-            self._idle_clock = self.create_timer(PERIOD * 1e-9, self._advance, clock=steady)
+            self._idle_clock = self.create_timer(CONTROL_PERIOD, self._advance, clock=steady)
             self._idle_clock.cancel()
             self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps, self._ticks],
                                         params.lockstep_timeout, params.start_timeout)
@@ -86,8 +86,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
         else:
             for camera in self._simulation.cameras.values():
                 camera.most_waiting = MOST_WAITING
-            self._pacing = Pacing(PERIOD, time.monotonic_ns())
-            self.create_timer(PERIOD * 1e-9, self._keep_pace, clock=steady)
+            self._pacing = Pacing(CONTROL_PERIOD_NS, time.monotonic_ns())
+            self.create_timer(CONTROL_PERIOD, self._keep_pace, clock=steady)
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
@@ -142,7 +142,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         for name, delivery in frames:
             for trigger in watch.triggers:
                 if trigger.camera == name and (delivery.image is not None or not trigger.needs_image):
-                    due = max(delivery.frame.middle + round(trigger.latency * 1e9), stamp + PERIOD)
+                    due = max(delivery.frame.middle + round(trigger.latency * 1e9), stamp + CONTROL_PERIOD_NS)
                     watch.trigger(trigger.node, delivery.frame.stamp, due)
         for trigger in watch.triggers:
             if trigger.period and self._index % trigger.period == 0:
@@ -158,7 +158,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
                 self._idle_clock.cancel()
             return True
         if self._pacing is None:
-            self._pacing = Pacing(PERIOD, time.monotonic_ns())
+            self._pacing = Pacing(CONTROL_PERIOD_NS, time.monotonic_ns())
             self._idle_clock.reset()
         if self._allowance == 0:
             self._allowance = self._pacing.due(time.monotonic_ns())
@@ -254,7 +254,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
     def _diagnose(self) -> None:
         self._times.end("waiting")
         values: dict[str, Any] = {"time_s": self._simulation.time * 1e-9, "steps": self._index,
-                                  **self._times.report(PERIOD * 1e-9), **self._counts,
+                                  **self._times.report(CONTROL_PERIOD), **self._counts,
                                   "motors_timed_out": self._simulation.motors.timed_out,
                                   "crashed": self._simulation.plant.crashed}
         if self._command_delays:

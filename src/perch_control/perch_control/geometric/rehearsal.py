@@ -14,6 +14,7 @@ import numpy as np
 
 from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
+from perch_core.timing import CONTROL_PERIOD
 from perch_core.vector3 import quaternion_of
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.geometric.step import control_step, drag_compensation, predicted
@@ -24,7 +25,6 @@ from perch_control.rotor_lag import RotorEstimate, approached, thrusts
 _ROUNDS = 5
 _SPAN = 1.5     # the last part of the trajectory is rehearsed [s]
 _QUIET = 0.3    # the offset no longer accelerates: the rotation at the end [s]
-_PERIOD = 0.002
 _POSITION_SCALE, _SPEED_SCALE = 0.05, 0.2  # misses that weigh the same [m], [m/s]
 _CLOSE = 0.1    # the sum of both, with which the rounds end
 _LARGEST = 0.5  # an offset beyond this belongs to the planner [m, m/s]
@@ -73,12 +73,12 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
         The reference to follow; `source` itself where it is too short, or where the rehearsal comes no closer.
     """
     T = source.duration
-    n = int(min(_SPAN, T) / _PERIOD)
-    growth = n * _PERIOD - _QUIET
+    n = int(min(_SPAN, T) / CONTROL_PERIOD)
+    growth = n * CONTROL_PERIOD - _QUIET
     if growth < _QUIET:
         return source
-    begin, lead = T - n * _PERIOD, controller.lead
-    times = np.arange(n) * _PERIOD + lead
+    begin, lead = T - n * CONTROL_PERIOD, controller.lead
+    times = np.arange(n) * CONTROL_PERIOD + lead
     table = packed_many(source, begin + times)
     start, rotors = _on_reference(source.setpoint(begin), vehicle)
     end = source.setpoint(T)
@@ -89,7 +89,7 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
     for _ in range(_ROUNDS):
         shifted = table.copy()
         shifted[:, :15] += _offset(delta, growth).many(times)
-        final = controller.rehearse(start, rotors, shifted, _PERIOD, n * _PERIOD)
+        final = controller.rehearse(start, rotors, shifted, CONTROL_PERIOD, n * CONTROL_PERIOD)
         miss = np.array([final[0:3], final[3:6]]) - wanted
         error = float(np.linalg.norm(miss[0]) / _POSITION_SCALE + np.linalg.norm(miss[1]) / _SPEED_SCALE)
         if error < least:

@@ -13,11 +13,12 @@ from perch_control.nmpc.condensing import condense, expand, unpack
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import DISTURBANCE, INPUTS, LINE, LINES, REFERENCE, WEIGHTS, StageLayout
 from perch_control.nmpc.qp import QpFailure, solve
-from perch_control.nmpc.reference_rows import PERIOD, ReferenceRows
+from perch_control.nmpc.reference_rows import ReferenceRows
 from perch_control.nmpc.settings import NmpcSettings
 from perch_control.reference import Following, Resting
 from perch_control.rotor_lag import RotorEstimate, approached, reachable, thrusts
 from perch_core.errors import ConfigError
+from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
 
 _REFERENCE_FLOOR = 0.5   # specific thrust below which the reference's attitude is noise [m/s^2]
@@ -35,8 +36,8 @@ class NmpcController:
     def __init__(self, vehicle: Vehicle, settings: NmpcSettings, fallback: GeometricController) -> None:
         self.vehicle, self.settings, self.fallback = vehicle, settings, fallback
         N, n = settings.nodes, 17 if settings.thrust_states else 13
-        self._spacing = max(1, round(settings.horizon / N / PERIOD))
-        self._dt = self._spacing * PERIOD
+        self._spacing = max(1, round(settings.horizon / N / CONTROL_PERIOD))
+        self._dt = self._spacing * CONTROL_PERIOD
         self._layout = StageLayout(n, settings.lines.any)
         self._stages = Linearisation(vehicle, self._dt, self._layout, N + 1)
         self._constants = packed_vehicle(vehicle)
@@ -207,7 +208,7 @@ class NmpcController:
 
     def _fill_lines(self, z: np.ndarray) -> None:
         weights = self.settings.lines
-        self._line_time += PERIOD if self._lines else 0.0
+        self._line_time += CONTROL_PERIOD if self._lines else 0.0
         ramp = min(self._line_time / weights.ramp_time, 1.0) if weights.ramp_time > 0.0 else float(bool(self._lines))
         flat = [v for k in range(LINES) for v in (self._lines[k] if k < len(self._lines) else _FAR_LINE)]
         watched = ramp if self._lines else 0.0

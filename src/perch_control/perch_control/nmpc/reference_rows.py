@@ -12,10 +12,10 @@ import numpy as np
 
 from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
-from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, scale, times
+from perch_core.timing import CONTROL_PERIOD
+from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, times
 from perch_core.vehicle import GRAVITY
 
-PERIOD = 0.002
 _KEPT = 4096
 
 
@@ -79,11 +79,11 @@ class ReferenceRows:
         """
         if source is not self._source or len(self._rows) > _KEPT:
             self._source, self._rows = source, {}
-        rows, first = self._rows, round(elapsed / PERIOD)
+        rows, first = self._rows, round(elapsed / CONTROL_PERIOD)
         for k in range(len(out)):
             index = first + k * spacing
             row = rows.get(index)
             if row is None:
-                row = reference_row(source.setpoint(index * PERIOD).packed, self._floor, self._vehicle)
+                row = reference_row(source.setpoint(index * CONTROL_PERIOD).packed, self._floor, self._vehicle)
                 rows[index] = row
             out[k] = row

@@ -22,7 +22,7 @@ def to_seconds(stamp: Time) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
-def seconds(time: int) -> float:
+def seconds(time: int | np.ndarray) -> float | np.ndarray:
     """Nanoseconds in seconds, to the last bit as `to_seconds` of their stamp."""
     return time // NANOSECONDS + 1e-9 * (time % NANOSECONDS)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 
-PERIOD = 2_000_000  # of the control loop [ns]
+from perch_core.timing import CONTROL_PERIOD_NS
+
 WINDOW = 500        # answers from which the clocks' offset and the figures are taken
 
 
@@ -38,8 +39,8 @@ class Deadlines:
         self._coming = min(self._coming, offset)
         lateness = offset - min(self._least, self._coming)
         self._lateness.append(lateness)
-        skipped = 0 if self._last is None else max(0, (stamp - self._last) // PERIOD - 1)
-        self.missed += skipped + (lateness > PERIOD)
+        skipped = 0 if self._last is None else max(0, (stamp - self._last) // CONTROL_PERIOD_NS - 1)
+        self.missed += skipped + (lateness > CONTROL_PERIOD_NS)
         self.answers += 1 + skipped
         self._last = stamp
 

@@ -19,6 +19,7 @@ from perch_core.camera import CameraMount
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 from perch_core.tag_board import load_board
+from perch_core.timing import CONTROL_PERIOD_NS
 from perch_eval.in_process.commanding import TICK_STEPS, Commanding, goal_of
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
 from perch_eval.in_process.estimation import Estimation, Odometry
@@ -41,7 +42,6 @@ from perch_sim import seeding
 from perch_sim.calibration import true_mount
 from perch_sim.camera_stream import Delivery
 from perch_sim.participants import triggers
-from perch_sim.plant import PERIOD
 from perch_sim.simulation import Output, Simulation
 from perch_sim.state_history import StateHistory
 from perch_sim.vio_model import VioModelParameters
@@ -167,7 +167,7 @@ class _Flight:
             consumer = self.vio if name == "down" else self.target
             while waiting and consumer.covers(waiting[0]):
                 delivery = waiting.popleft()
-                due = max(delivery.frame.middle + self.latency[node], stamp + PERIOD)
+                due = max(delivery.frame.middle + self.latency[node], stamp + CONTROL_PERIOD_NS)
                 if name == "down":
                     answer = self.vio.answer(delivery)
                 else:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 
 from perch_core.scenario import Scenario
+from perch_core.timing import CONTROL_PERIOD_NS
 from perch_eval.in_process.estimation import Estimation, Odometry
 from perch_eval.in_process.mailbox import Mailbox
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.stamps import seconds
 from perch_eval.in_process.vio_source import ModelledVio
 from perch_perception.ukf import ImuSample, UkfConfig
-from perch_sim.plant import PERIOD
 from perch_sim.simulation import Output, Simulation
 from perch_sim.vio_model import VioModelParameters
 
@@ -69,4 +69,4 @@ class Sensing:
             delivery = self._frames.popleft()
             pose = self._vio.answer(delivery)
             if pose is not None:
-                self._poses.post(max(delivery.frame.middle + self._latency, stamp + PERIOD), pose)
+                self._poses.post(max(delivery.frame.middle + self._latency, stamp + CONTROL_PERIOD_NS), pose)

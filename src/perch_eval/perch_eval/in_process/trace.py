@@ -10,7 +10,7 @@ from perch_msgs.msg import PowerlineArray
 from perch_control.mission import Target
 from perch_core.surface import PerchSurface
 from perch_eval.in_process.piloting import FlownTrajectory
-from perch_eval.in_process.stamps import SECOND
+from perch_eval.in_process.stamps import seconds
 from perch_perception.ukf import Status, VioPose
 from perch_sim.contact_event import ContactEvent
 
@@ -66,8 +66,7 @@ class FlightTrace:
     @property
     def times(self) -> np.ndarray:
         """Time of every step [s], shape (n,)."""
-        stamps = np.array(self.stamps, dtype=np.int64)
-        return stamps // SECOND + 1e-9 * (stamps % SECOND)
+        return seconds(np.array(self.stamps, dtype=np.int64))
 
     def part(self, which: slice) -> np.ndarray:
         """`TRUTH` or `ESTIMATE` of every step, shape (n, 13)."""

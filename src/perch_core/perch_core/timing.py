@@ -1,0 +1,4 @@
+"""The period that IMU, estimator, controller and lockstep share: 500 Hz."""
+
+CONTROL_PERIOD_NS = 2_000_000
+CONTROL_PERIOD = 0.002  # [s]
