@@ -175,6 +175,13 @@ def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
     assert caught.value.constraint and str(caught.value)
 
 
+def test_a_refusal_names_one_limit_where_one_is_enough():
+    problem, settings = PerchProblem(HOVER, surface(90.0)), PerchSettings(body_rate_max=1.0, duration_max=6.0)
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, settings, VEHICLE)
+    assert caught.value.limits == ("body_rate",)  # the thrust range fails in most attempts, too
+
+
 def test_a_refusal_is_confirmed_by_relaxing_what_it_names():
     problem = PerchProblem(HOVER, surface(90.0))
     with pytest.raises(PerchRefusal) as caught:

@@ -26,7 +26,8 @@ _PREVENTED = ((-1, 0.6), (-1, 0.8), (0, 0.0), (0, 0.15))  # segments from the la
 _LEANS = ((1.0, 0.0), (0.980, 0.199))  # the thrust is upright or leans 11 degrees back where it is greatest
 _RAISE = 1.02       # cuts of the thrust from below
 _HEIGHT_ROOM = 2e-3  # [m]
-_BESIDE = 1.0 / 24.0  # of a segment
+_BESIDE = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
+_FLAT = 0.97        # of the limit; a peak is cut beside its place where the thrust is above this share
 
 
 @compiled
@@ -46,18 +47,24 @@ def _specific_force(coefficients, duration, place):
 
 @compiled
 def _thrust_cuts(coefficients, durations, extrema, low, high, side):
-    count = 0
+    most = 0
     for i in range(len(durations)):
-        count += (extrema[i, 4] > high) + (extrema[i, 1] < low)
-    owner, segments, places, orders, direction, lower, upper = _empty(count, count)
+        most += 3 * (extrema[i, 4] > high) + (extrema[i, 1] < low)
+    owner, segments, places, orders, direction, lower, upper = _empty(most, most)
     r = 0
     for i in range(len(durations)):
         if extrema[i, 4] > high:
-            x, y, z, norm = _specific_force(coefficients[i], durations[i], extrema[i, 5])
-            owner[r], segments[r], places[r] = r, i, extrema[i, 5]
-            direction[r, 0], direction[r, 1], direction[r, 2] = x / norm, y / norm, z / norm
-            upper[r] = _KEEP * high - direction[r, 2] * GRAVITY
-            r += 1
+            for beside in range(-1, 2):
+                place = extrema[i, 5] + beside * _BESIDE
+                if place < 0.0 or place > 1.0:
+                    continue
+                x, y, z, norm = _specific_force(coefficients[i], durations[i], place)
+                if beside != 0 and norm < _FLAT * high:
+                    continue
+                owner[r], segments[r], places[r] = r, i, place
+                direction[r, 0], direction[r, 1], direction[r, 2] = x / norm, y / norm, z / norm
+                upper[r] = _KEEP * high - direction[r, 2] * GRAVITY
+                r += 1
         if extrema[i, 1] < low:
             x, y, z, norm = _specific_force(coefficients[i], durations[i], extrema[i, 2])
             owner[r], segments[r], places[r] = r, i, extrema[i, 2]
@@ -67,7 +74,7 @@ def _thrust_cuts(coefficients, durations, extrema, low, high, side):
                 direction[r, 0], direction[r, 1], direction[r, 2] = side[0], side[1], side[2]
             lower[r] = _RAISE * low - direction[r, 2] * GRAVITY
             r += 1
-    return owner, segments, places, orders, direction, lower, upper
+    return owner[:r], segments[:r], places[:r], orders[:r], direction[:r], lower[:r], upper[:r]
 
 
 def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.ndarray, low: float, high: float,
@@ -129,7 +136,6 @@ def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_h
             continue
         i = int(where[row, 0])
         for beside in range(-1, 2):
-            # The body rate has a flat top: it is bounded on both sides of the place, too.
             s = where[row, 1] + beside * _BESIDE
             if beside != 0 and (row != BODY_RATE or s < 0.0 or s > 1.0):
                 continue

@@ -113,33 +113,45 @@ def _search(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle,
 
 
 def _refusal(search: Search, best: Outcome) -> PerchRefusal:
-    """Find out what stands in the way: limits are taken away, the most often violated first, until there is a plan."""
-    limits, taken, failures = search.limits, [], search.failures
+    """Find out what stands in the way: each limit that failed is taken away, then several, until there is a plan."""
     asked = Limits.of(search.settings, search.vehicle)
     proofs = () if best.results is None else certificates(best.results, asked, search.vehicle.mass)
     tried = f"{search.iterations} programs up to {search.attempts[-1].duration:.2f} s"
-    while True:
-        name = next((n for n, _ in failures.most_common() if n in plan_checks.NAMES and n not in taken), None)
-        if name is None:
-            break
-        taken.append(name)
-        limits = limits.without(name)
-        relaxed = Search(search.problem, search.settings, search.vehicle, limits)
+    alone = {(name,): Search(search.problem, search.settings, search.vehicle, search.limits.without(name))
+             for name in _failed(search)}
+    for taken, relaxed in alone.items():
         _, outcome = relaxed.run()
-        failures = relaxed.failures
         if outcome.proved:
-            margin, words = _needed(certificates(outcome.results, asked, search.vehicle.mass), taken)
-            constraint = " and ".join(_WORDS[n] for n in taken)
-            return PerchRefusal(_CODES[taken[0]], constraint, margin,
-                                f"no plan keeps the {constraint} ({tried}); without it there is one that takes {words}; "
-                                f"{_ADVICE[taken[0]]}", proofs, search.iterations, tuple(taken))
+            return _named(search, taken, outcome, asked, proofs, tried)
+    taken, relaxed = next(iter(alone.items()), ((), search))
+    while name := next((n for n in _failed(relaxed) if n not in taken), None):
+        taken += (name,)
+        relaxed = Search(search.problem, search.settings, search.vehicle, relaxed.limits.without(name))
+        _, outcome = relaxed.run()
+        if outcome.proved:
+            return _named(search, taken, outcome, asked, proofs, tried)
     name = "solver" if search.failures["solver"] else ""
     return PerchRefusal(_CODES[name], _WORDS[name], float("-inf"),
                         f"{_WORDS[name]}: no plan, even without the other limits ({tried}); {_ADVICE[name]}", proofs,
                         search.iterations)
 
 
-def _needed(proofs: tuple[Certificate, ...], names: list[str]) -> tuple[float, str]:
+def _failed(search: Search) -> list[str]:
+    """Names of the limits that failed in a search, the most frequent first."""
+    return [name for name, _ in search.failures.most_common() if name in plan_checks.NAMES]
+
+
+def _named(search: Search, taken: tuple[str, ...], outcome: Outcome, asked: Limits, proofs: tuple[Certificate, ...],
+           tried: str) -> PerchRefusal:
+    """The refusal that names the limits without which there is a plan, and what that plan takes."""
+    margin, words = _needed(certificates(outcome.results, asked, search.vehicle.mass), taken)
+    constraint = " and ".join(_WORDS[n] for n in taken)
+    return PerchRefusal(_CODES[taken[0]], constraint, margin,
+                        f"no plan keeps the {constraint} ({tried}); without it there is one that takes {words}; "
+                        f"{_ADVICE[taken[0]]}", proofs, search.iterations, taken)
+
+
+def _needed(proofs: tuple[Certificate, ...], names: tuple[str, ...]) -> tuple[float, str]:
     """By how much the first named limit is exceeded by a plan without it, and its figures in words."""
     by_name = {proof.quantity: proof for proof in proofs}
     first = by_name[names[0]]

@@ -90,10 +90,12 @@ class Finding:
 
 
 def _powers(bernstein_row) -> np.ndarray:
-    """Ascending powers of s, through exact rationals."""
+    """Ascending powers of s, in exact integers over one power of two."""
     n = len(bernstein_row) - 1
-    exact = [Fraction(float(c)) for c in bernstein_row]
-    return np.array([float(sum(Fraction((-1) ** (k - i) * comb(n, k) * comb(k, i)) * exact[i] for i in range(k + 1)))
+    ratios = [float(c).as_integer_ratio() for c in bernstein_row]
+    scale = max(denominator for _, denominator in ratios)
+    exact = [numerator * (scale // denominator) for numerator, denominator in ratios]
+    return np.array([float(Fraction(sum((-1) ** (k - i) * comb(n, k) * comb(k, i) * exact[i] for i in range(k + 1)), scale))
                      for k in range(n + 1)])
 
 
@@ -110,17 +112,12 @@ def _extrema(square, degree: int) -> tuple[float, float]:
 class _Segment:
     def __init__(self, duration: float, rows) -> None:
         self.duration = float(duration)
-        self._powers = np.array([_powers(row) for row in rows])
+        self._powers = np.array([_powers(row) for row in rows]).T
 
     def at(self, s: np.ndarray, order: int) -> np.ndarray:
         """Derivatives of x, y, z, yaw at s, shape (len(s), 4)."""
-        s = np.asarray(s, float)
-        out = []
-        for row in self._powers:
-            # From the nearer end, so that powers of s do not cancel.
-            near = power.polyval(s, power.polyder(row, order) if order else row)
-            out.append(near)
-        return np.array(out).T / self.duration**order
+        table = power.polyder(self._powers, order) if order else self._powers
+        return power.polyval(np.asarray(s, float), table).T / self.duration**order
 
 
 def _rotations(f: np.ndarray, yaw: np.ndarray) -> np.ndarray:
