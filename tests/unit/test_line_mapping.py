@@ -109,6 +109,29 @@ def test_covariance_matches_the_errors_it_predicts():
     assert 0.7 * low < np.mean(values) < high  # the fit's own robust weights make it a little cautious
 
 
+def test_a_camera_that_is_mounted_askew_does_not_make_the_map_sure_of_itself():
+    """Its error is the same in all sightings, and does not average out: errors in sigmas with and without knowing that."""
+    wire, corners = WireCurve(np.array([5.0, 0.0, 4.75]), np.array([0.0, 1.0, 0.0])), np.array(
+        [[0.0, 0.0, 4.2], [0.0, 0.0, 5.0], [1.6, 0.0, 5.0], [1.6, 0.0, 4.2], [0.0, 0.0, 4.2]])
+    path = np.concatenate([np.linspace(a, b, 8, endpoint=False) for a, b in zip(corners, corners[1:])])
+    nees, errors = {}, {}
+    for sigma in (1e-4, 0.3):
+        rng, found, off = np.random.default_rng(12), [], []
+        for _ in range(25):
+            askew, seen = so3.exp(np.radians(0.3) * rng.standard_normal(3)), []
+            for k, centre in enumerate(path):
+                true = observe(rng, wire, centre, noise=2e-4)
+                seen.append(LineObservation(0.3 * k, centre, true.rays_W @ askew.T, true.ends_W @ askew.T, 5e-4, 0.005))
+            estimate = triangulate(seen, TriangulationConfig(mount_rotation=sigma))
+            point, axes = estimate.curve.at(np.array(0.0)), estimate.curve.axes[:, :2]
+            error = axes.T @ (wire.at((point - wire.point) @ wire.direction) - point)
+            found.append(error @ np.linalg.solve(axes.T @ estimate.point_covariance(0.0) @ axes, error))
+            off.append(error @ error)
+        nees[sigma], errors[sigma] = float(np.mean(found)), float(np.sqrt(np.mean(off)))
+    assert nees[0.3] < 3.0 < nees[1e-4], nees
+    assert errors[0.3] < errors[1e-4], errors
+
+
 def test_a_wrong_sighting_is_left_out():
     rng = np.random.default_rng(5)
     other = WireCurve(WIRE.point + [0.0, 0.0, 0.5], WIRE.direction, 0.02)

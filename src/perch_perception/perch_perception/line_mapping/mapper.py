@@ -150,9 +150,8 @@ class LineMapper:
         return True
 
     def _triangulate(self, track: _Track) -> None:
-        start = track.estimate.curve if track.estimate is not None else None
         try:
-            track.estimate = triangulate(track.observations, self.settings.triangulation, start)
+            track.estimate = triangulate(track.observations, self.settings.triangulation, track.estimate)
         except DegenerateBaseline as refusal:
             if track.estimate is None:
                 track.refusal = str(refusal)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class LineObservation:
         ends_W: rays to the visible ends, shape (2, 3).
         sigma: 1-sigma of a ray across the arc [rad].
         width: angle that the wire's thickness subtends [rad]; 0 where it was not measured.
+        R_WC: attitude of the camera, shape (3, 3).
     """
 
     time: float
@@ -30,6 +31,7 @@ class LineObservation:
     ends_W: np.ndarray
     sigma: float
     width: float
+    R_WC: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     @property
     def normal(self) -> np.ndarray:
@@ -46,4 +48,4 @@ def place(sighting: LineSighting, body: BodyState, mount: CameraMount) -> LineOb
     """A sighting seen by a camera on the body."""
     p_WC, R_WC = mount.pose(body.p_WB, body.R_WB)
     return LineObservation(body.time, p_WC, sighting.rays_C @ R_WC.T, sighting.ends_C @ R_WC.T, sighting.sigma,
-                           sighting.width)
+                           sighting.width, R_WC)

@@ -34,6 +34,8 @@ class TriangulationConfig:
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="random walk of the odometry; the wire is where the newest sightings see it")
     pose_rotation: float = config.quantity(0.1, unit="deg", above=0.0, high=10.0, doc="the same for its attitude")
+    mount_rotation: float = config.quantity(0.3, unit="deg", above=0.0, high=10.0,
+                                            doc="error of the camera's attitude on the body, per axis, 1 sigma: the same in all sightings")
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
                                  doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
 
@@ -55,12 +57,14 @@ class WireEstimate:
         covariance: of its five parameters (see `WireCurve.moved`), shape (5, 5).
         ratio: sigma2/sigma1 of the baseline.
         used: sightings that agree with it, shape (n,).
+        mount: error of the camera's attitude on the body that fits them best, in C [rad], shape (3,).
     """
 
     curve: WireCurve
     covariance: np.ndarray
     ratio: float
     used: np.ndarray
+    mount: np.ndarray
 
     def point_covariance(self, s: float) -> np.ndarray:
         """Covariance of the point at s in W [m^2], shape (3, 3); across the wire only."""
@@ -97,43 +101,43 @@ def intersect_planes(observations: Sequence[LineObservation], settings: Triangul
 
 
 def triangulate(observations: Sequence[LineObservation], settings: TriangulationConfig,
-                start: WireCurve | None = None) -> WireEstimate:
+                before: WireEstimate | None = None) -> WireEstimate:
     """The wire that the sightings share.
 
     Args:
         observations: sightings of one wire.
         settings: noise and limits.
-        start: an earlier result; its point keeps the origin of s where it is.
+        before: an earlier result; its point keeps the origin of s where it is.
 
     Raises:
         DegenerateBaseline: the camera's motion does not determine the wire, or puts it behind the camera.
     """
     line, ratio = intersect_planes(observations, settings)
-    curve = start if start is not None else line
+    curve, mount = (line, np.zeros(3)) if before is None else (before.curve, before.mount)
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
     used = np.ones(len(observations), bool)
     times = np.array([o.time for o in observations])
     drifted = settings.pose_drift**2 * np.maximum(np.diff(times, prepend=times[0]), 0.0)  # variance added before each sighting
-    rigid, rounds = np.zeros(len(times)), RIGID_ITERATIONS if start is None else 0
+    rigid, rounds = np.zeros(len(times)), RIGID_ITERATIONS if before is None else 0
     for walk in [rigid] * rounds + [drifted] * ITERATIONS:
-        residual, _ = _whitened(curve, observations, centres, rays, settings, walk.sum() - np.cumsum(walk))
+        residual, _ = _whitened(curve, mount, observations, centres, rays, settings, walk.sum() - np.cumsum(walk))
         size = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
         used = size < 3.0 * max(1.0, float(np.median(size)))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
-        information, gradient = _wandering(*_whitened(curve, observations, centres, rays, settings, rigid), weight, walk, settings,
-                                           curve.curvature)
+        information, gradient = _wandering(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight, walk, settings,
+                                           curve.curvature, mount)
         step = -np.linalg.solve(information, gradient)
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
-        curve = curve.moved(step)
+        curve, mount = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
         raise DegenerateBaseline(ratio, settings.min_ratio)
-    covariance = np.linalg.inv(information) * max(1.0, float(np.mean(size[used] ** 2)))
-    return WireEstimate(curve, covariance, ratio, used)
+    covariance = np.linalg.inv(information)[:PARAMETERS, :PARAMETERS] * max(1.0, float(np.mean(size[used] ** 2)))
+    return WireEstimate(curve, covariance, ratio, used, mount)
 
 
-def _wandering(residual, jacobian, weight, walk, settings, curvature):
-    """Information (5, 5) and gradient (5,) of the wire where it is after the last sighting.
+def _wandering(residual, jacobian, weight, walk, settings, curvature, mount):
+    """Information (8, 8) and gradient (8,) of the wire where it is after the last sighting, and of the camera's mount.
 
     A filter in information form from the oldest sighting to the newest: before each, the wire's two offsets lose what the
     odometry's random walk takes, W = walk G G', so that I <- (I^-1 + W)^-1. All sightings from before a drift share it:
@@ -141,8 +145,8 @@ def _wandering(residual, jacobian, weight, walk, settings, curvature):
     """
     parts = np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian)
     slopes = np.einsum("n,nki,nk->ni", weight, jacobian, residual)
-    information, gradient = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    information[4, 4], gradient[4] = 1.0 / settings.sag**2, curvature / settings.sag**2
+    tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2)])
+    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount])
     for part, slope, variance in zip(parts, slopes, walk):
         if variance > 0.0:
             a, b, c = information[0, 0] + 1.0 / variance, information[1, 1] + 1.0 / variance, information[0, 1]
@@ -153,8 +157,8 @@ def _wandering(residual, jacobian, weight, walk, settings, curvature):
     return information, gradient
 
 
-def _whitened(curve, observations, centres, rays, settings, walk):
-    """Residuals (n, k) in sigmas and their Jacobian (n, k, 5), decorrelated within each image.
+def _whitened(curve, mount, observations, centres, rays, settings, walk):
+    """Residuals (n, k) in sigmas and their Jacobian (n, k, 8) by wire and mount, decorrelated within each image.
 
     All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. `walk` (n,)
     is added to the variance of the positions [m^2].
@@ -170,6 +174,7 @@ def _whitened(curve, observations, centres, rays, settings, walk):
     sigma = np.array([o.sigma for o in observations])
     covariance = by_pose @ np.swapaxes(by_pose, 1, 2) + sigma[:, None, None] ** 2 * np.eye(k)
     root = np.linalg.cholesky(covariance)
-    both = np.linalg.solve(root, np.concatenate([against.angles.reshape(n, k, 1),
-                                                 against.jacobian.reshape(n, k, PARAMETERS)], axis=2))
+    by_mount = by_rotation.reshape(n, k, 3) @ np.array([o.R_WC for o in observations])
+    both = np.linalg.solve(root, np.concatenate([against.angles.reshape(n, k, 1) + by_mount @ mount[:, None],
+                                                 against.jacobian.reshape(n, k, PARAMETERS), by_mount], axis=2))
     return both[..., 0], both[..., 1:]
