@@ -230,11 +230,11 @@ def test_gains_change_in_flight_and_bad_ones_are_refused(vehicle):
     vehicle.take_off()
     node = vehicle.node_under_test
     ok, = node.set_parameters([Parameter("snapdragon.position", value=[5.0, 5.0, 6.0])])
-    assert ok.successful and node._geometric.gains.position == (5.0, 5.0, 6.0)
+    assert ok.successful and node._assembly.flight.law.gains.position == (5.0, 5.0, 6.0)
     for name, value, word in (("snapdragon.lead", 5.0, "0.2"), ("snapdragon.position", [1.0], "3"),
                               ("vehicle", "rpg", "fixed"), ("nmpc.nodes", 30, "fixed")):
         if name.startswith("nmpc"):
-            vehicle.spin_until(lambda: node._nmpc is not None, "the compiled NMPC")
+            vehicle.spin_until(lambda: node._assembly.nmpc is not None, "the compiled NMPC")
         refused, = node.set_parameters([Parameter(name, value=value)])
         assert not refused.successful and word in refused.reason, refused.reason
     vehicle.step(200)

@@ -171,12 +171,12 @@ def test_brake_meets_state_and_rest():
 @pytest.mark.parametrize("fault, expected, word", [
     ("fence", State.HOVERING, "geofence"), ("far", State.LANDING, "outside the geofence"), ("tilt", State.RECOVERING, "tilt"),
     ("rate", State.RECOVERING, "body rate"), ("error", State.RECOVERING, "away from the reference"),
-    ("margin", State.LANDING, "limit"), ("silence", State.LANDING, "no order"), ("coasting", State.HOVERING, "no VIO"),
+    ("margin", State.LANDING, "limit"), ("heavy", State.LANDING, "weak rotors"), ("silence", State.LANDING, "no order"), ("coasting", State.HOVERING, "no VIO"),
     ("lost", State.LANDING, "no VIO"), ("diverged", State.LANDING, "diverged"),
 ])
 def test_each_fault_leads_to_its_answer(fault, expected, word):
     settings = FlightSettings(fence_high=(1.0, 20.0, 20.0), silence_time=0.5 if fault == "silence" else 60.0,
-                              margin_time=0.3, fence_slack=0.3 if fault == "far" else 5.0)
+                              margin_time=0.3, margin_min=0.45 if fault == "margin" else 0.02, fence_slack=0.3 if fault == "far" else 5.0)
     loop = hovering(settings=settings)
     m, p = loop.controller.maneuvers, loop.plant.p.copy()
     if fault in ("fence", "far", "coasting", "lost"):
@@ -189,7 +189,9 @@ def test_each_fault_leads_to_its_answer(fault, expected, word):
     elif fault == "error":
         m.run(Hold.at(p + [1.5, 0, 0], (0, 1, 0)))
     elif fault == "margin":
-        loop.plant.disturbances.mass_factor = 2.2
+        loop.plant.disturbances.mass_factor = 1.25
+    elif fault == "heavy":
+        loop.plant.disturbances.mass_factor = 1.7
     elif fault == "coasting":
         loop.controller.supervisor.estimator(2, 1.2, "")
     elif fault == "lost":

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
 
-from perch_core.vector3 import axes_of, axpy, norm, scale
+from perch_core.vector3 import axes_of, axpy, norm
 from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import ControlOutput, packed_vehicle
 from perch_control.geometric.controller import NO_COMPENSATION
 from perch_control.geometric.step import predicted
-from perch_control.guidance import blended
 from perch_control.l1 import L1Augmentation
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import Command, CommandRefused, State, StepResult
@@ -21,12 +19,12 @@ from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.reference import Following
 from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import RotorEstimate, thrusts
+from perch_control.schedule import Schedule
 from perch_control.settings import GeometricGains
 from perch_control.supervisor import Supervisor
+from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 
-_AIRBORNE = 0.1              # so far above where it was armed, the ground no longer carries the vehicle [m]
 _SPARE_SHARE = 0.01          # weight of a step in the mean margin: 0.2 s
-_TOUCHING = 0.1              # from so long before a planned contact on, a surface may act on the vehicle [s]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
@@ -53,7 +51,7 @@ class FlightController:
     """Takes orders, judges odometry, supervises, and asks the control law for rotor commands."""
 
     def __init__(self, vehicle: Vehicle, law: Law, gains: GeometricGains, settings: FlightSettings) -> None:
-        self.vehicle, self.law = vehicle, law
+        self.law = law
         self.maneuvers = Maneuvers(vehicle, gains, settings)
         self.supervisor = Supervisor(self.maneuvers)
         self.gate = OdometryGate(settings.odometry)
@@ -62,13 +60,10 @@ class FlightController:
         self._spare = 1.0            # mean margin in hover
         self.position_error = 0.0
         self.compensator: L1Augmentation | None = None
-        self.health = RotorHealth(settings.rotors, 4.0 * vehicle.thrust_max / vehicle.hover_thrust)
-        self._nominal, self._felt = vehicle, 0.0  # specific force along b3, as measured last [m/s^2]
+        self._thrust = ThrustBelief(vehicle, self.maneuvers, settings.rotors)
         self._imu_stamp = -inf
-        self._constants = packed_vehicle(vehicle)
-        self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
         self._refused = ""
-        self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
+        self._schedule = Schedule(self.maneuvers)
 
     @property
     def settings(self) -> FlightSettings:
@@ -89,6 +84,16 @@ class FlightController:
     def state(self) -> State:
         """As published."""
         return self.maneuvers.state
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """As it is believed to be."""
+        return self._thrust.vehicle
+
+    @property
+    def health(self) -> RotorHealth:
+        """Of the rotors."""
+        return self._thrust.health
 
     @property
     def thrust_known(self) -> float | None:
@@ -135,7 +140,7 @@ class FlightController:
             raise CommandRefused(f"{command.name.lower()} is refused: {m.message}")
         elif command is Command.LAND:
             m.land(f"landing{why}")
-        elif m.state is not State.RECOVERING and not self._leave(f"hover{why}"):  # a recovery ends in a hover, and must not be cut short
+        elif m.state is not State.RECOVERING and not self._schedule.leave(f"hover{why}", self.law):  # a recovery ends in a hover, and must not be cut short
             m.stop(f"hover{why}")
 
     def _arm(self) -> None:
@@ -146,8 +151,7 @@ class FlightController:
             raise CommandRefused(f"arm is refused: {m.state.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry.timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({self._refused})" if self._refused else ""))
-        self.health.reset()
-        self._believe_rotors()
+        self._thrust.reset(self.law, self.compensator)
         if m.attached_to is not None:
             m.recover("came off the surface")
             return
@@ -171,8 +175,8 @@ class FlightController:
         check_joints(order.source.trajectory, self.settings.joint_gap)
         check_start(order, m.now, m.expected(max(order.start, m.now)), self.settings)
         if order.at_end is AtEnd.CONTACT and m.state is State.HOVERING and self.compensator is not None:
-            self._adopt_thrust()
-        self._pending = order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT)
+            self._thrust.adopt(self.law, self.compensator)
+        self._schedule.put(order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT))
 
     def keep_ready(self, order: Order) -> None:
         """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
@@ -180,34 +184,12 @@ class FlightController:
         Raises:
             TrajectoryRefused: it may not be flown.
         """
-        check_joints(order.source.trajectory, self.settings.joint_gap)
-        self._ways_out = [o for o in self._ways_out if o.id == order.id and o.start >= self.maneuvers.now] + [order]
-
-    def _leave(self, reason: str) -> bool:
-        """Leave a trajectory by the next recovery that was planned for it; False where none is near.
-
-        Until that recovery starts the trajectory is flown on, for `leave_time` at most: braking out of a tilted attitude at
-        speed needs more room than a planned way out.
-        """
-        m, order = self.maneuvers, self.maneuvers.order
-        if m.state is not State.TRACKING or order.recovery_start < 0.0:
-            return False
-        own = order.start + order.recovery_start
-        if m.now >= own:
-            m.message = f"{reason}; the recovery is under way"
-            return True
-        ways = [o for o in self._ways_out if o.id == order.id and o.start >= m.now]
-        start = min([o.start for o in ways] + [own])
-        if start - m.now > self.settings.leave_time:
-            return False
-        self._pending = next(((o, self.law.prepare(o.source, False)) for o in ways if o.start == start), None)
-        m.message = f"{reason}; planned recovery in {start - m.now:.2f} s"
-        return True
+        self._schedule.keep_ready(order)
 
     def abort(self, reason: str = "abort was requested") -> str:
         """End whatever is flown in a hover, through a recovery where the vehicle is tilted. Returns what is done."""
-        if self.state in (State.TRACKING, State.HOVERING) and not self._leave(reason):
-            self._pending = None
+        if self.state in (State.TRACKING, State.HOVERING) and not self._schedule.leave(reason, self.law):
+            self._schedule.drop()
             self.maneuvers.stop(reason)
         return self.maneuvers.message
 
@@ -216,7 +198,7 @@ class FlightController:
 
         Its time also shows that odometry with an old stamp is late.
         """
-        self._imu_stamp, self._felt = stamp, accel[2]
+        self._imu_stamp, self._thrust.felt = stamp, accel[2]
         if self.maneuvers.blind is not None:
             self.maneuvers.blind.imu(stamp, gyro, accel)
         else:
@@ -244,9 +226,9 @@ class FlightController:
                 m.stay(verdict.reason)
         if m.blind is not None:
             return self._descend()
-        self._activate()
+        self._schedule.activate()
         if m.flying:
-            self._judge_rotors()
+            self._thrust.judge(self.law, self.compensator)
             self.supervisor.act(self.margin)
         return self._fly() if m.flying else self._idle()
 
@@ -274,24 +256,9 @@ class FlightController:
             m.events.append(f"refused: {verdict.reason}")
         self._refused = verdict.reason
         if m.belief and m.flying:
+            body, _, forward, *_ = packed_vehicle(self.vehicle)
             f = thrusts(m.rotors.speed, self.vehicle.thrust_coefficient)
-            body = self._constants[0]
-            m.belief = predicted(m.belief, f, NO_COMPENSATION, dt, body[0], body[1:4], self._constants[2])
-
-    def _activate(self) -> None:
-        """Start the pending trajectory when its time has come."""
-        m = self.maneuvers
-        if self._pending is None:
-            return
-        order, source = self._pending
-        if m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
-            self._pending = None
-        elif m.now >= order.start:
-            self._pending = None
-            # On the ground there is nothing to continue; in the air the new reference is reached without a jump.
-            begin = m.now - order.start
-            end = order.recovery_start if order.recovery_start > begin else source.duration  # the wire is met there
-            m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, begin, end))
+            m.belief = predicted(m.belief, f, NO_COMPENSATION, dt, body[0], body[1:4], forward)
 
     def _fly(self) -> StepResult:
         m = self.maneuvers
@@ -308,48 +275,12 @@ class FlightController:
             return self._idle()
         return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event())
 
-    def _judge_rotors(self) -> None:
-        """Compare felt and promised thrust; weak rotors are a weaker vehicle from now on."""
-        m, vehicle = self.maneuvers, self._nominal
-        if m.belief[2] - m.ground < _AIRBORNE or m.time_to_contact < _TOUCHING or norm(m.belief[10:13]) > self.health.settings.rate_most:
-            self.health.pause(m.now)
-            return
-        promised = sum(thrusts(m.rotors.speed, vehicle.thrust_coefficient)) / vehicle.mass
-        if self.health.update(self._felt, promised, m.now):
-            self._believe_rotors()
-
-    def _adopt_thrust(self) -> None:
-        """Before a contact: what L1 makes up for in hover because thrust / mass is not the file's belongs to the thrust.
-
-        As an acceleration it would be wrong as soon as the vehicle tilts and the thrust changes, and too fast for any filter.
-        """
-        m, vehicle, before = self.maneuvers, self._nominal, self.health.believed
-        if self.health.adopt():
-            kept = self.compensator.disturbance
-            self._believe_rotors()
-            promised = sum(thrusts(m.rotors.speed, vehicle.thrust_coefficient)) / vehicle.mass
-            b3 = axes_of(m.belief[6:10])[2]
-            self.compensator.disturbance = kept
-            self.compensator.believe(self.vehicle, scale((self.health.believed - before) * promised, b3))
-            m.events.append(f"thrust / mass is {100.0 * self.health.believed:.0f} % of the file's")
-
-    def _believe_rotors(self) -> None:
-        m, vehicle = self.maneuvers, self._nominal
-        if self.health.weak and not m.weak:
-            m.events.append(f"weak rotors: {100.0 * self.health.ratio:.0f} % of the thrust that was commanded is felt")
-        m.weak = self.health.weak
-        self.vehicle = m.vehicle = replace(vehicle, thrust_coefficient=self.health.believed * vehicle.thrust_coefficient)
-        self._constants = packed_vehicle(self.vehicle)
-        self.law.believe(self.vehicle)
-        if self.compensator is not None:
-            self.compensator.believe(self.vehicle)
-
     def _compensation(self, contact: float) -> tuple[float, ...]:
         """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
         m = self.maneuvers
         if self.compensator is None:
             return NO_COMPENSATION
-        if m.belief[2] - m.ground < _AIRBORNE:
+        if m.belief[2] - m.ground < AIRBORNE:
             self.compensator.reset()
             return NO_COMPENSATION
         if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0:

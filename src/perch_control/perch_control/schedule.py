@@ -1,0 +1,73 @@
+"""Trajectories that wait for their start: the next one, and the ways out of the running one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from perch_control.admission import Order, check_joints
+from perch_control.guidance import blended
+from perch_control.maneuvers import Maneuvers
+from perch_control.modes import State
+
+
+class Schedule:
+    """Owns what is pending; starts it on the manoeuvres when its time has come."""
+
+    def __init__(self, maneuvers: Maneuvers) -> None:
+        self._maneuvers = maneuvers
+        self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
+        self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
+
+    def put(self, order: Order, source: Any) -> None:
+        """The next trajectory, by the reference made from it."""
+        self._pending = order, source
+
+    def drop(self) -> None:
+        """Nothing is to follow."""
+        self._pending = None
+
+    def keep_ready(self, order: Order) -> None:
+        """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
+
+        Raises:
+            TrajectoryRefused: it may not be flown.
+        """
+        m = self._maneuvers
+        check_joints(order.source.trajectory, m.settings.joint_gap)
+        self._ways_out = [o for o in self._ways_out if o.id == order.id and o.start >= m.now] + [order]
+
+    def leave(self, reason: str, law: Any) -> bool:
+        """Leave a trajectory by the next recovery that was planned for it; False where none is near.
+
+        Until that recovery starts the trajectory is flown on, for `leave_time` at most: braking out of a tilted attitude at
+        speed needs more room than a planned way out.
+        """
+        m, order = self._maneuvers, self._maneuvers.order
+        if m.state is not State.TRACKING or order.recovery_start < 0.0:
+            return False
+        own = order.start + order.recovery_start
+        if m.now >= own:
+            m.message = f"{reason}; the recovery is under way"
+            return True
+        ways = [o for o in self._ways_out if o.id == order.id and o.start >= m.now]
+        start = min([o.start for o in ways] + [own])
+        if start - m.now > m.settings.leave_time:
+            return False
+        self._pending = next(((o, law.prepare(o.source, False)) for o in ways if o.start == start), None)
+        m.message = f"{reason}; planned recovery in {start - m.now:.2f} s"
+        return True
+
+    def activate(self) -> None:
+        """Start the pending trajectory when its time has come."""
+        m = self._maneuvers
+        if self._pending is None:
+            return
+        order, source = self._pending
+        if m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
+            self._pending = None
+        elif m.now >= order.start:
+            self._pending = None
+            # On the ground there is nothing to continue; in the air the new reference is reached without a jump.
+            begin = m.now - order.start
+            end = order.recovery_start if order.recovery_start > begin else source.duration  # the wire is met there
+            m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, begin, end))
