@@ -118,7 +118,7 @@ def test_a_running_plan_is_replaced_in_flight():
 
 
 @pytest.mark.parametrize("inclination, velocity", [
-    (0.0, (3.0, 0.0, 0.0)), (0.0, (8.0, 0.0, 0.0)), (60.0, (3.5, 0.0, 0.0)), (60.0, (1.5, 0.5, 0.0)), (60.0, (-0.5, 0.0, 0.2))])
+    (0.0, (3.0, 0.0, 0.0)), (0.0, (8.0, 0.0, 0.0)), (0.0, (0.0, 8.0, 0.0)), (0.0, (-8.0, 0.0, 0.0)), (60.0, (3.5, 0.0, 0.0)), (60.0, (1.5, 0.5, 0.0)), (60.0, (-0.5, 0.0, 0.2))])
 def test_moving_pads_are_met_where_they_are(inclination, velocity):
     target = surface(inclination)
     problem = PerchProblem(StartState(HOVER.p, v=(0.5, 0.0, 0.0)), target, target_velocity=np.array(velocity))
@@ -129,7 +129,8 @@ def test_moving_pads_are_met_where_they_are(inclination, velocity):
 
 @pytest.mark.parametrize("options", [
     {"objective": "jerk"}, {"bubbles": "everywhere"}, {"solver": "osqp"}, {"solver": "piqp"}, {"decider": "sturm"},
-    {"stretching": "whole"}, {"cuts": False, "thrust_reserve": 1.0}, {"formulation": "full"}, {"formulation": "full", "solver": "piqp"}])
+    {"stretching": "whole"}, {"cuts": False, "thrust_reserve": 1.0}, {"formulation": "full"}, {"formulation": "full", "solver": "piqp"},
+    {"formulation": "full", "solver": "osqp"}])
 def test_every_option_gives_plans_that_verify(options):
     points = (Waypoint((0.5, 0.1, 1.5)), Waypoint((0.9, 0.0, 1.5)))
     planned = checked(PerchProblem(HOVER, surface(60.0), points), PerchSettings(**options))
