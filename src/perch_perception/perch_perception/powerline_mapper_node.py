@@ -29,7 +29,7 @@ class PowerlineMapperConfig:
 
     vehicle: str = config.text("rpg", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
     camera: str = config.text("front", doc="camera of the vehicle, colour for red wires; its images are on camera_<name>/image_raw")
-    rate: float = config.quantity(15.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
+    rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
     max_pose_sigma: float = config.quantity(2.0, unit="m", above=0.0, high=10.0,
                                             doc="odometry less certain than this maps nothing")
     detection: LineDetectionConfig = config.part(LineDetectionConfig)
