@@ -81,7 +81,8 @@ def condense_loops(A, B, c, Q, q, r, R, dx0, H, h, xi, G):
                 tmp[i] = s
             for i in range(n):
                 lam[i] = tmp[i]
-    # The innermost loops run along rows of G, W and H, so that the compiler can vectorise them.
+    # The innermost loops run along rows of G, W and H, so that the compiler can vectorise them. Half of A and five sixths of Q
+    # are zeros, which are passed over: up to half of the time.
     for k in range(N):
         m = 4 * k
         for i in range(n):
@@ -89,6 +90,8 @@ def condense_loops(A, B, c, Q, q, r, R, dx0, H, h, xi, G):
                 G[k + 1, i, j] = 0.0
             for l in range(n):
                 x = A[k, i, l]
+                if x == 0.0:
+                    continue
                 for j in range(m):
                     G[k + 1, i, j] += x * G[k, l, j]
             for a in range(4):
@@ -101,11 +104,15 @@ def condense_loops(A, B, c, Q, q, r, R, dx0, H, h, xi, G):
                 W2[i, j] = 0.0
             for l in range(n):
                 x = Q[k, i, l]
+                if x == 0.0:
+                    continue
                 for j in range(m):
                     W2[i, j] += x * G[k, l, j]
             if k < N:
                 for l in range(n):
                     x = A[k, l, i]
+                    if x == 0.0:
+                        continue
                     for j in range(m):
                         W2[i, j] += x * W[l, j]
         for i in range(n):

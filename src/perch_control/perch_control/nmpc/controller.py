@@ -49,6 +49,7 @@ class NmpcController:
         self._H, self._h = np.zeros((INPUTS * N,) * 2), np.zeros(INPUTS * N)
         self._xi, self._G = np.zeros((N + 1, n)), np.zeros((N + 1, n, INPUTS * N))
         self._sums = self._dt * np.kron(np.tril(np.ones((N, N))), np.eye(INPUTS))  # inputs -> thrust states
+        self._no_rows = np.zeros((0, INPUTS * N)), np.zeros(0), np.zeros(0), np.zeros(0, bool)
         self._warm = False
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
@@ -190,6 +191,8 @@ class NmpcController:
         N, n = self.settings.nodes, self._layout.states
         free = self.X + self._xi
         near = np.argwhere(np.abs(free[1:, 10:13]) > _NEAR_LIMIT * self._rate_max)
+        if n == 13 and not len(near):
+            return self._no_rows
         rows = [np.zeros((0, INPUTS * N))]
         low, high = [np.zeros(0)], [np.zeros(0)]
         if n == 17:
