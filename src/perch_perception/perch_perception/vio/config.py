@@ -20,7 +20,7 @@ class TrackerConfig:
                                doc="features nearer to an older one than this share of the spacing are let go; 0: none")
     quality: float = quantity(0.01, above=0.0, high=1.0, doc="least corner strength, share of the strongest")
     smoothing: float = quantity(1.5, unit="px", above=0.1, high=5.0, doc="sigma of the smoothing before detection")
-    noise_factor: float = quantity(2.0, low=0.0, high=100.0, doc="least corner strength, in those that noise alone makes")
+    noise_factor: float = quantity(4.0, low=0.0, high=100.0, doc="least corner strength, in those that noise alone makes")
     window: int = quantity(21, unit="px", low=5, high=61, doc="side of the tracked patch")
     levels: int = quantity(3, low=0, high=6, doc="pyramid levels above the image")
     reference_reach: float = quantity(1.5, unit="px", above=0.0, doc="largest correction by the reference frame's patch")
