@@ -27,7 +27,7 @@ from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
 from perch_eval.in_process.estimation import Odometry
 from perch_eval.in_process.parameters import NodeParameters
-from perch_eval.in_process.sensing import Sensing
+from perch_eval.in_process.sensed_vehicle import SensedVehicle
 from perch_perception.ukf import Health, ImuSample
 from perch_planner.perching_planner_node import PerchingPlannerParameters
 from perch_planner.planner import plan
@@ -58,7 +58,7 @@ class ControlFlight:
             ConfigError: the scenario or a node's parameter is refused.
         """
         params = NodeParameters(scenario, seed)
-        self.scenario, self.sensing = scenario, Sensing(scenario, params, seed)
+        self.scenario, self.sensing = scenario, SensedVehicle(scenario, params, seed)
         self.simulation = self.sensing.simulation
         vehicle = self.vehicle = self.simulation.vehicle
         self.params = params.of("controller", ControllerParameters)

@@ -17,7 +17,7 @@ from perch_core.trajectory import rest_to_rest
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.piloting import FlownTrajectory, Piloting
-from perch_eval.in_process.sensing import Sensing
+from perch_eval.in_process.sensed_vehicle import SensedVehicle
 from perch_eval.inspection.measures import Inspected, inspected, reference_of, segments
 from perch_perception.ukf import Health
 from perch_sim import seeding
@@ -38,7 +38,7 @@ def mapped(lines: list[Segment], rng: np.random.Generator) -> list[Segment]:
 class _Flight:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         params = NodeParameters(scenario, seed)
-        self.sensing = Sensing(scenario, params, seed)
+        self.sensing = SensedVehicle(scenario, params, seed)
         controller = params.of("controller", ControllerParameters)
         self.piloting = Piloting(controller, self.sensing.simulation.vehicle)
         self.ramp = controller.nmpc.lines.ramp_time

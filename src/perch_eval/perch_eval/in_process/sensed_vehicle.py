@@ -16,7 +16,7 @@ from perch_sim.simulation import Output, Simulation
 from perch_sim.vio_model import VioModelParameters
 
 
-class Sensing:
+class SensedVehicle:
     """Owns the simulation and what is known of it; `step` is one control period.
 
     Attributes:
