@@ -74,25 +74,26 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
 
 
 def _warm_up(wanted: Platform, done: dict[str, str]) -> None:
-    """Compile the numerics of a flight into their caches, once for an environment.
+    """Compile the numerics of a flight into their caches, whenever their sources have changed.
 
     Nothing depends on it: what is not cached is compiled when a node first needs it. So a failure is only mentioned.
     """
-    if done.get("warmed") == done["environment"]:
+    stamp = stamps.kernel_stamp(done["environment"])
+    if done.get("warmed") == stamp:
         return
     with Step("compiling the numerics of a flight") as step:
         try:
             step.run((VENV_PYTHON, "-m", "perch_eval.warm_up"), "warm_up", variables(wanted))
         except SetupError as error:
             print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
-    done["warmed"] = done["environment"]
+    done["warmed"] = stamp
     stamps.save(done)
 
 
 def _nothing_to_do(wanted: Platform, done: dict[str, str]) -> bool:
     """Whether every stamp is up to date and the folders are still there."""
     environment = stamps.environment_stamp(wanted)
-    if done.get("environment") != environment or done.get("warmed") != environment or not VENV_PYTHON.exists():
+    if done.get("environment") != environment or not VENV_PYTHON.exists() or done.get("warmed") != stamps.kernel_stamp(environment):
         return False
     return (INSTALL / "setup.bash").exists() and all(
         _is_built(folder, stamps.package_stamp(folder, environment), done)

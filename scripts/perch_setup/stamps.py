@@ -38,6 +38,12 @@ def package_stamp(package: Path, environment: str) -> str:
     return _digest((file for file in files if file.exists()), environment, *linked)
 
 
+def kernel_stamp(environment: str) -> str:
+    """Changes whenever there is something to compile: with every file that holds compiled kernels."""
+    files = (file for file in sorted(SOURCES.rglob("*.py")) if b"@compiled" in file.read_bytes())
+    return _digest(files, environment)
+
+
 def packages() -> list[Path]:
     """The folders of all packages in the workspace."""
     return sorted(file.parent for file in SOURCES.glob("*/package.xml"))
