@@ -18,7 +18,7 @@ from perch_core.ros.conversions import nanoseconds, odometry_arrays, pose_arrays
 from perch_core.ros.lockstep import TICK_STEPS, Participant
 from perch_core.scenario import load_scenario
 from perch_core.vehicle import load_vehicle
-from perch_msgs.msg import Contact, MotorCommand, RotorState, Step, StepReport
+from perch_msgs.msg import Contact, MotorCommand, RotorState, Step
 from perch_sim import vehicle_node, vio_model_node
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter

@@ -55,7 +55,6 @@ def fuse(target: FusedTarget, pose: MapPose) -> FusedTarget:
     estimate is taken to be the wrong one (the pad was moved, the odometry jumped) and starts anew.
     """
     joint = _drifted(target.joint, pose.shared)
-    P, cross = joint[:6, :6], joint[:6, 6:]
     innovation = np.concatenate([pose.p_WS - target.p_WS, so3.log(pose.R_WS @ target.R_WS.T)])
     # With e = estimate - truth and measurement = truth + G c + v: innovation = -(e - G c) + v.
     H = np.concatenate([np.eye(6), -pose.by_shared], axis=1)
