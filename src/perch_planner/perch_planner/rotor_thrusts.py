@@ -21,14 +21,17 @@ from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.bounds import time_derivative
 
-_PLACES = np.linspace(0.0, 1.0, 49)
-_BASES = tuple(bernstein.basis(n, _PLACES) for n in range(10, 15))
+_FINER = 4          # samples from one bound to the next
+_SAMPLES = 0.5 - 0.5 * np.cos(np.pi * np.arange(48 * _FINER + 1) / (48 * _FINER))  # dense at the ends, where polynomials turn fastest
+_PLACES = _SAMPLES[::_FINER].copy()  # where a rotor is bounded
+_SAMPLE_BASES = tuple(bernstein.basis(n, _SAMPLES) for n in range(10, 15))
+_PLACE_BASES = tuple(bernstein.basis(n, _PLACES) for n in range(10, 15))
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
 _ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
 _NEAR = 0.1         # rotors this near to a limit are bounded; share of the range
 _KEEP = 2e-3        # bounds are set inside by this share of the range,
-_BETWEEN = 1.5      # and by this multiple of what was seen between the samples
+_BETWEEN = 1.5      # and by this multiple of what was seen between the places
 
 
 def rotor_model(vehicle: Vehicle) -> tuple[float, tuple[float, float, float], np.ndarray]:
@@ -53,21 +56,22 @@ def thrusts_of(f, j, s, heading, mass, J, mixing):
 
 
 @compiled
-def _motion(coefficients, yaw, duration):
-    """Specific force, jerk and snap, yaw and its first two derivatives at the places of a segment, shape (49, 12)."""
-    out = np.zeros((len(_PLACES), 12))
+def _motion(coefficients, yaw, duration, bases):
+    """Specific force, jerk and snap, yaw and its first two derivatives where bases of degree 10 to 14 are given, shape (n, 12)."""
+    count = len(bases[0])
+    out = np.zeros((count, 12))
     for order in range(2, 5):
-        rows, basis = time_derivative(coefficients, order, duration), _BASES[4 - order]
-        for k in range(len(_PLACES)):
+        rows, basis = time_derivative(coefficients, order, duration), bases[4 - order]
+        for k in range(count):
             for d in range(3):
                 for i in range(rows.shape[1]):
                     out[k, 3 * (order - 2) + d] += basis[k, i] * rows[d, i]
     for order in range(3):
-        rows, basis = time_derivative(yaw.reshape((1, 15)), order, duration), _BASES[4 - order]
-        for k in range(len(_PLACES)):
+        rows, basis = time_derivative(yaw.reshape((1, 15)), order, duration), bases[4 - order]
+        for k in range(count):
             for i in range(rows.shape[1]):
                 out[k, 9 + order] += basis[k, i] * rows[0, i]
-    for k in range(len(_PLACES)):
+    for k in range(count):
         out[k, 2] += GRAVITY
     return out
 
@@ -80,22 +84,25 @@ def _thrusts_at(x, mass, J, mixing):
 
 @compiled
 def _vertex(values, k, sign):
-    """Place near sample k where the parabola through it and its neighbours is extreme, and that value."""
+    """Place near sample k where the parabola through it and its neighbours is extreme, and that value.
+
+    The parabola runs over the samples' numbers, in which their places are smooth.
+    """
     last = len(values) - 1
     middle = min(max(k, 1), last - 1)
     before, here, after = values[middle - 1], values[middle], values[middle + 1]
     bend = before - 2.0 * here + after
     if sign * bend >= 0.0:
-        return k / last, values[k]
+        return _SAMPLES[k], values[k]
     shift = 0.5 * (before - after) / bend
     if abs(shift) > 1.0:
-        return k / last, values[k]
-    return (middle + shift) / last, here - 0.25 * (before - after) * shift
+        return _SAMPLES[k], values[k]
+    return 0.5 - 0.5 * np.cos(np.pi * (middle + shift) / last), here - 0.25 * (before - after) * shift
 
 
 @compiled
 def sampled(coefficients, yaw, durations, mass, J, mixing):
-    """Rotor thrusts of a plan on 49 places of each segment.
+    """Rotor thrusts of a plan: on the 49 places of each segment that may be bounded, and the extrema among all samples.
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
@@ -108,19 +115,20 @@ def sampled(coefficients, yaw, durations, mass, J, mixing):
         the samples, shape (4,) [N, s].
     """
     f = len(durations)
-    out = np.empty((f, len(_PLACES), 4))
+    out, fine = np.empty((f, len(_PLACES), 4)), np.empty((4, len(_SAMPLES)))
     row = np.array([np.inf, 0.0, -np.inf, 0.0])
     begin = 0.0
     for i in range(f):
         T = durations[i]
-        motion = _motion(coefficients[i], yaw[i], T)
-        for k in range(len(_PLACES)):
-            out[i, k, 0], out[i, k, 1], out[i, k, 2], out[i, k, 3] = _thrusts_at(motion[k], mass, J, mixing)
+        motion = _motion(coefficients[i], yaw[i], T, _SAMPLE_BASES)
+        for k in range(len(_SAMPLES)):
+            fine[0, k], fine[1, k], fine[2, k], fine[3, k] = _thrusts_at(motion[k], mass, J, mixing)
         for q in range(4):
-            place, found = _vertex(out[i, :, q], out[i, :, q].argmin(), -1.0)
+            out[i, :, q] = fine[q, ::_FINER]
+            place, found = _vertex(fine[q], fine[q].argmin(), -1.0)
             if found < row[0]:
                 row[0], row[1] = found, begin + place * T
-            place, found = _vertex(out[i, :, q], out[i, :, q].argmax(), 1.0)
+            place, found = _vertex(fine[q], fine[q].argmax(), 1.0)
             if found > row[2]:
                 row[2], row[3] = found, begin + place * T
         begin += T
@@ -132,7 +140,7 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
     """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:
-        thrusts, row: of `sampled`; what lies beyond the limits between the samples is made up for at the samples.
+        thrusts, row: of `sampled`; what lies beyond the limits between the places is made up for at the places.
         coefficients, yaw, durations, mass, J, mixing: as for `sampled`.
         low, high: limits of a rotor's thrust [N].
 
@@ -162,7 +170,7 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
             if chosen == 0:
                 continue
             if not ready:
-                motion, ready = _motion(coefficients[i], yaw[i], durations[i]), True
+                motion, ready = _motion(coefficients[i], yaw[i], durations[i], _PLACE_BASES), True
             x = motion[k]
             for q in range(4):
                 known[q] = -thrusts[i, k, q]
