@@ -29,3 +29,24 @@ def test_the_loop_is_raised_and_python_threads_are_not():
 def test_a_process_with_other_work_is_left_alone():
     assert Priority().ask() == ""
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+GIVE_WAY = """
+import os, threading
+from perch_core.ros.priority import NICE, Priority, thread_gives_way
+nice = lambda task: os.getpriority(os.PRIO_PROCESS, task)
+before = nice(os.getpid())
+Priority().give_way()
+assert nice(os.getpid()) == before, 'a process with other work is left alone'
+drawing = threading.Thread(target=lambda: (thread_gives_way(), found.append(nice(threading.get_native_id()))))
+found = []
+drawing.start(); drawing.join()
+assert (found, nice(os.getpid())) == ([NICE], before)
+own = Priority(); own.own_process = True
+own.give_way()
+assert nice(os.getpid()) == NICE
+"""
+
+
+def test_work_that_has_time_gives_way():
+    subprocess.run([sys.executable, "-c", GIVE_WAY], check=True, timeout=20)

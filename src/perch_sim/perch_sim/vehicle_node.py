@@ -18,7 +18,7 @@ from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds
 from perch_core.ros.lockstep import TICK_STEPS
 from perch_core.ros.node import PerchNode, spin_main
-from perch_core.ros.priority import priority
+from perch_core.ros.priority import priority, thread_gives_way
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
 from perch_core.scenario import load_scenario
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
@@ -50,7 +50,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             scenario = load_scenario(params.scenario)
             names = tuple(name for name in params.participants if name)
             slow = triggers(names, scenario.latency)
-            self._pool = ThreadPoolExecutor(params.render_threads, thread_name_prefix="render")
+            self._pool = ThreadPoolExecutor(params.render_threads, "render", thread_gives_way)
             self._simulation = Simulation(
                 scenario, params.seed, CAMERAS[params.cameras], self._pool,
                 MOTOR_TIMEOUT if params.lockstep else REAL_TIME_MOTOR_TIMEOUT)

@@ -169,6 +169,8 @@ class Participant:
             self.lockstep = step.lockstep
             if not step.lockstep:
                 self._begin_real_time()
+            elif self._every == TICK_STEPS:
+                priority.give_way()
         if step.lockstep:
             self._steps.append(step)
             self._advance()

@@ -1,11 +1,13 @@
-"""Real-time scheduling of the nodes that have deadlines."""
+"""Who goes first where processors are short: nodes with deadlines, then everyone, then work that has time."""
 
 from __future__ import annotations
 
 import os
 import threading
+from contextlib import suppress
 
 PRIORITY = 10  # of SCHED_FIFO: above everything ordinary, below the kernel's own threads
+NICE = 10      # of work that has time
 
 
 class Priority:
@@ -32,6 +34,18 @@ class Priority:
         except ProcessLookupError:
             pass  # a thread has just ended
         return ""
+
+    def give_way(self) -> None:
+        """Let others go first: in lockstep everyone waits for the chain of a step, and a slow participant has its latency."""
+        if self.own_process:
+            for task in os.listdir("/proc/self/task"):
+                with suppress(ProcessLookupError):
+                    os.setpriority(os.PRIO_PROCESS, int(task), NICE)
+
+
+def thread_gives_way() -> None:
+    """The same for the calling thread alone: one that draws while the flight goes on."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
 
 
 priority = Priority()
