@@ -217,7 +217,7 @@ def test_the_mission_refuses_goals_that_are_none(asker):
 def airborne(tmp_path):
     """A demo with one process per node that has just taken off, and its nodes by name."""
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "perch_eval.demo", "--out", str(tmp_path)], env=dict(os.environ),
+        [sys.executable, "-u", "-m", "perch_eval.demo", "--separate", "--out", str(tmp_path)], env=dict(os.environ),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         for line in process.stdout:
