@@ -37,7 +37,7 @@ def test_published_starts_within_our_limits(name: str) -> None:
         assert part.states[:, 2].min() >= 0.8
     assert np.linalg.norm(perch.states[-1, :3] - planned.request.perch.p_WB) <= 1e-3
     assert np.linalg.norm(recovery.states[-1, 7:10]) <= 0.02
-    np.testing.assert_array_equal(perch.states[-1, :13], recovery.states[0, :13])  # appended without a jump
+    np.testing.assert_allclose(perch.states[-1, :13], recovery.states[0, :13], rtol=0.0, atol=1e-15)  # appended without a jump
 
 
 def test_perception_keeps_the_line_in_front() -> None:
