@@ -11,9 +11,9 @@ from rclpy.node import Node
 
 from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds, to_stamp
-from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.lockstep import Participant
 from perch_core.ros.wire import stamp_of
-from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
+from perch_core.timing import CONTROL_PERIOD_NS as PERIOD, TICK_STEPS
 
 
 class Graph:

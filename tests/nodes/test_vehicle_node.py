@@ -15,8 +15,9 @@ from nav_msgs.msg import Odometry
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds, odometry_arrays, pose_arrays
-from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.lockstep import Participant
 from perch_core.scenario import load_scenario
+from perch_core.timing import TICK_STEPS
 from perch_core.vehicle import load_vehicle
 from perch_msgs.msg import Contact, MotorCommand, RotorState, Step
 from perch_sim import vehicle_node, vio_model_node

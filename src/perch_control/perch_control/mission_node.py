@@ -16,11 +16,11 @@ from sensor_msgs.msg import Imu
 
 from perch_core import so3
 from perch_core.ros.conversions import pose_arrays, seconds, to_array, to_pose, to_seconds, to_stamp
-from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import flat_message
 from perch_core.ros.wire import OdometryReading, read_imu, read_odometry, stamp_of
-from perch_core.timing import CONTROL_PERIOD_NS
+from perch_core.timing import CONTROL_PERIOD_NS, TICK_STEPS
 from perch_control.mission import (
     ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
 from perch_control.mission.parameters import MissionParameters

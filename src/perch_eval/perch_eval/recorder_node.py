@@ -22,9 +22,10 @@ from sensor_msgs.msg import CompressedImage, Image, Imu
 
 from perch_core.config import quantity, text
 from perch_core.ros.backlog import Backlog
-from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import StepReading, stamp_of
+from perch_core.timing import TICK_STEPS
 from perch_eval.mcap_log import McapLog, type_name
 
 TOPICS = {

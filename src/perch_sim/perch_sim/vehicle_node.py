@@ -16,12 +16,11 @@ from rclpy.clock import Clock, ClockType
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds
-from perch_core.ros.lockstep import TICK_STEPS
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.priority import priority, thread_gives_way
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
 from perch_core.scenario import load_scenario
-from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
+from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS, TICK_STEPS
 from perch_sim.camera_stream import Delivery
 from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.motors import MotorCommandError

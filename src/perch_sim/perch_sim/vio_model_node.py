@@ -12,9 +12,10 @@ from sensor_msgs.msg import CameraInfo
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.conversions import fill_odometry, nanoseconds, to_stamp
-from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import read_odometry
+from perch_core.timing import TICK_STEPS
 from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
 from perch_sim.state_history import StateHistory, TrueState

@@ -31,9 +31,9 @@ from perch_core.ros.backlog import Backlog
 from perch_core.ros.conversions import to_stamp
 from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_step, stamp_of
+from perch_core.timing import TICK_STEPS
 
-RETRY = 0.005    # [s] wall clock
-TICK_STEPS = 10  # `tick` repeats every tenth step, for nodes that need no more
+RETRY = 0.005  # [s] wall clock
 
 
 class GatedPublisher:

@@ -27,20 +27,24 @@ class Priority:
             return ""
         ordinary = {thread.native_id for thread in threading.enumerate() if thread is not threading.main_thread()}
         try:
-            for task in {int(name) for name in os.listdir("/proc/self/task")} - ordinary:
-                os.sched_setscheduler(task, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+            for task in _tasks() - ordinary:
+                with suppress(ProcessLookupError):
+                    os.sched_setscheduler(task, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
         except PermissionError:
             return "no permission for real-time scheduling (ulimit -r): deadlines depend on what else runs here"
-        except ProcessLookupError:
-            pass  # a thread has just ended
         return ""
 
     def give_way(self) -> None:
         """Let others go first: in lockstep everyone waits for the chain of a step, and a slow participant has its latency."""
         if self.own_process:
-            for task in os.listdir("/proc/self/task"):
+            for task in _tasks():
                 with suppress(ProcessLookupError):
-                    os.setpriority(os.PRIO_PROCESS, int(task), NICE)
+                    os.setpriority(os.PRIO_PROCESS, task, NICE)
+
+
+def _tasks() -> set[int]:
+    """Threads of this process by number; one of them may have ended when its number is used."""
+    return {int(name) for name in os.listdir("/proc/self/task")}
 
 
 def thread_gives_way() -> None:

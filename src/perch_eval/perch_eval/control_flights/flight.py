@@ -23,6 +23,7 @@ from perch_core import so3
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 from perch_core.surface import PerchSurface
+from perch_core.timing import TICK_STEPS
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
 from perch_eval.in_process.estimation import Odometry
@@ -35,7 +36,6 @@ from perch_planner.problem import PerchProblem, StartState
 from perch_sim.contact_event import ContactEvent
 
 LEAD = 0.04     # from an order to its start [s]
-TICK_STEPS = 10  # the mission decides at 50 Hz
 TAKE_OFF_SPEED = 0.8  # mean [m/s]
 
 

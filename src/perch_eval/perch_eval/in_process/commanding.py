@@ -21,8 +21,6 @@ from perch_eval.in_process.planning import Planning, PowerlinePlanning
 from perch_eval.in_process.stamps import published, seconds
 from perch_perception.ukf import Health, ImuSample, Status
 
-TICK_STEPS = 10
-
 
 def goal_of(scenario: Scenario) -> Goal:
     """The goal that a scenario's mission part describes; as `perch_eval.pilot.goal_of` sends it."""

@@ -19,8 +19,8 @@ from perch_core.camera import CameraMount
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 from perch_core.tag_board import load_board
-from perch_core.timing import CONTROL_PERIOD_NS
-from perch_eval.in_process.commanding import TICK_STEPS, Commanding, goal_of
+from perch_core.timing import CONTROL_PERIOD_NS, TICK_STEPS
+from perch_eval.in_process.commanding import Commanding, goal_of
 from perch_eval.in_process.estimation import STATUS_STEPS as HEALTH_STEPS
 from perch_eval.in_process.estimation import Estimation, Odometry
 from perch_eval.in_process.line_source import LineSource

@@ -9,8 +9,9 @@ from nav_msgs.msg import Odometry
 from perch_core.camera import CameraMount
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.lockstep import TICK_STEPS, Participant
+from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode
+from perch_core.timing import TICK_STEPS
 from perch_core.vehicle import load_vehicle
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
