@@ -17,12 +17,13 @@ from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.l1 import L1Augmentation, L1Settings
 from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings
-from perch_control.nmpc.condensing import condense_loops, condense_matrices, expand_loops, expand_matrices
+from perch_control.nmpc.condensing import condense, solve_condensed
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import StageLayout, stage
 from perch_control.nmpc.qp import solve, solve_osqp
-from perch_control.nmpc.reference_rows import reference_row
-from perch_control.reference import SampledReference
+from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
+from perch_control.nmpc.riccati import Workspace, solve_stages
+from perch_control.reference import FlatReference, SampledReference
 from perch_control.settings import GeometricGains
 from perch_core import rigid_body, so3
 from perch_core.lines import Segment, scaled_clearance
@@ -63,7 +64,7 @@ def test_dynamics_of_a_stage_are_the_rigid_bodys(states):
     layout, step, rng = StageLayout(states, False), 0.05, np.random.default_rng(1)
     z = argument(layout, rng)
     z[states + 4 + 17:states + 4 + 23] = rng.normal(size=6) * 0.5
-    following = np.array(stage(SNAPDRAGON, step, layout)(z)).ravel()[:states]
+    following = np.array(stage(SNAPDRAGON, step, layout)(z)[0]).ravel()
     p, R, v, w = z[0:3], Rotation.from_quat(z[3:7]), z[7:10], z[10:13]
     u, d = z[states:states + 4], z[states + 21:states + 27]
     n = 4000
@@ -88,15 +89,15 @@ def test_compiled_linearisation_and_finite_differences_agree(states, with_lines)
     stages = Linearisation(RPG, 0.05, layout, 3)
     for k in range(3):
         stages.arguments[k] = argument(layout, rng)
-    results = stages.evaluate().copy()
+    results = stages.evaluate()
     n, h = states, 1e-6
-    for z, out in zip(stages.arguments, results):
-        np.testing.assert_allclose(out, np.array(function(z)).ravel(), rtol=1e-9, atol=1e-9)
-        J = np.column_stack([(np.array(function(z + h * e)).ravel()[:n] - np.array(function(z - h * e)).ravel()[:n]) / (2 * h)
+    for z, following, At, Bt, Q, q in zip(stages.arguments, *results):
+        for out, expected in zip((following, At.T, Bt.T, Q, q), function(z)):
+            np.testing.assert_allclose(out, np.array(expected).reshape(out.shape), rtol=1e-9, atol=1e-9)
+        J = np.column_stack([(np.array(function(z + h * e)[0]).ravel() - np.array(function(z - h * e)[0]).ravel()) / (2 * h)
                              for e in np.eye(layout.arguments)[:n + 4]])
-        np.testing.assert_allclose(out[n:n + n * n].reshape(n, n).T, J[:, :n], atol=1e-5)
-        np.testing.assert_allclose(out[n + n * n:n + n * n + 4 * n].reshape(4, n).T, J[:, n:], atol=1e-5)
-        Q = out[-n - n * n:-n].reshape(n, n)
+        np.testing.assert_allclose(At.T, J[:, :n], atol=1e-5)
+        np.testing.assert_allclose(Bt.T, J[:, n:], atol=1e-5)
         np.testing.assert_allclose(Q, Q.T, atol=1e-9)
         assert np.linalg.eigvalsh(Q).min() > -1e-9
 
@@ -111,10 +112,9 @@ def random_stages(rng, N=6, n=13):
 def test_condensed_cost_is_the_stage_costs_sum():
     """Against the definition: simulate the linear system for a given du and add the stage costs up."""
     rng = np.random.default_rng(0)
-    A, B, c, Q, q, r, R, dx0 = random_stages(rng)
+    A, B, c, Q, q, r, R, dx0 = random = random_stages(rng)
     N, n = c.shape
-    H, h = np.zeros((4 * N, 4 * N)), np.zeros(4 * N)
-    condense_loops(A, B, c, Q, q, r, R, dx0, H, h, np.zeros((N + 1, n)), np.zeros((N + 1, n, 4 * N)))
+    H, h, xi, G = condense(*random)
 
     def cost(du):
         x, total = dx0, 0.0
@@ -129,21 +129,52 @@ def test_condensed_cost_is_the_stage_costs_sum():
     for _ in range(5):
         du = rng.normal(size=4 * N)
         assert cost(du) - base == pytest.approx(0.5 * du @ H @ du + h @ du, rel=1e-9)
+        x = dx0
+        for k in range(N):
+            x = A[k] @ x + B[k] @ du[4 * k:4 * k + 4] + c[k]
+        np.testing.assert_allclose(xi[-1] + G[-1] @ du, x, rtol=1e-9, atol=1e-9)
 
 
-def test_loops_and_matrices_condense_and_expand_alike():
-    rng = np.random.default_rng(1)
-    stages = random_stages(rng)
-    N, n = stages[2].shape
-    out = []
-    for condense, expand in ((condense_loops, expand_loops), (condense_matrices, expand_matrices)):
-        H, h, xi, G = np.zeros((4 * N,) * 2), np.zeros(4 * N), np.zeros((N + 1, n)), np.zeros((N + 1, n, 4 * N))
-        condense(*stages, H, h, xi, G)
-        X, U = np.ones((N + 1, n)), np.ones((N, 4))
-        expand(*stages[:3], stages[-1], np.linspace(-1, 1, 4 * N), X, U)
-        out.append((H, h, xi, G, X, U))
-    for a, b in zip(*out):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+def both_solutions(law):
+    """The law's last QP anew from nothing, by Riccati recursions and by condensing and DAQP: du of both, active inputs and states."""
+    N, n, s = len(law.U), law.X.shape[1], law.settings
+    stages, dx, du, work = law._stages.stages, np.zeros_like(law.X), np.zeros_like(law.U), Workspace(N, n)
+    X, U = law._stages.arguments[:, :n].copy(), law._stages.arguments[:N, n:n + 4].copy()
+    weight = s.thrust_rate if s.thrust_states else s.thrust
+    args = stages, X, U, law._start - X[0], weight, law._target, s.terminal, law._low, law._high, law._x_low, law._x_high
+    assert solve_stages(*args, law._price, 30, work.arrays, dx, du) > 0
+    other_x, other_u = solve_condensed(*args)
+    np.testing.assert_allclose(dx[:, :10], other_x[:, :10], atol=1e-5)
+    return du, other_u, np.count_nonzero(work.fixed), np.count_nonzero(work.soft)
+
+
+@pytest.mark.parametrize("thrust_states, rate_max, off", [(False, 0.0, 1e-9), (True, 0.0, 1e-4), (False, 2.0, 1e-4)])
+def test_riccati_and_condensing_solve_the_same_qp(thrust_states, rate_max, off):
+    """Along a perch, where bounds are active. A soft bound is not as stiff for both: DAQP prices it by its own scaling."""
+    law, active = controller(thrust_states=thrust_states, rate_max=rate_max), [0, 0]
+    loop = make_loop(law=law)
+    loop.begin_in_hover()
+    loop.plant.floor = -10.0
+    loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=2)
+    for _ in range(40):
+        loop.run(0.036)
+        du, other, fixed, soft = both_solutions(law)
+        if not soft:
+            np.testing.assert_allclose(du, other, atol=1e-9)
+        np.testing.assert_allclose(du, other, atol=off)
+        active[0] += bool(fixed)
+        active[1] += bool(soft)
+    assert active[0] > 3 if not (thrust_states or rate_max) else active[1] > 3, active
+
+
+def test_reference_rows_are_those_of_their_times():
+    source, vehicle, out = FlatReference(perch("surface_90_1.7m").trajectory), packed_vehicle(SNAPDRAGON), np.zeros((21, 17))
+    rows = ReferenceRows(vehicle, 0.5, 500)
+    for elapsed in (0.0, 0.002, 0.05, 0.052, 0.3, 1.9):
+        rows.fill(source, elapsed, 25, out)
+        for k in range(21):
+            expected = reference_row(source.setpoint(elapsed + 0.05 * k).packed, 0.5, vehicle)
+            np.testing.assert_allclose(out[k], expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("with_rows", [False, True])

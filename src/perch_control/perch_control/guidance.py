@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_control.reference import Setpoint
+from perch_control.reference import Setpoint, flat_setpoints, packed_many, unpacked
 from perch_core.trajectory import FlatTrajectory
 
 BRAKE_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
@@ -52,23 +52,19 @@ class Polynomial:
         self._trajectory = FlatTrajectory(np.array([duration]), np.concatenate([coefficients, yaw])[None])
         self.duration, self._h = float(duration), h
 
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """Setpoints at many times [s], packed, shape (n, 33); the end velocity goes on past the end."""
+        out = np.empty((len(times), 33))
+        flat_setpoints(*self._trajectory.arrays, np.minimum(times, self.duration), out)
+        over = np.maximum(times - self.duration, 0.0)
+        out[:, 0:3] += over[:, None] * out[:, 3:6]
+        out[over > 0.0, 6:15] = 0.0
+        out[:, 15:18] = self._h
+        return out
+
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]."""
-        x = self._trajectory.sample(t)
-        p, v = tuple(x.p.tolist()), tuple(x.v.tolist())
-        over = t - self.duration
-        if over > 0.0:
-            return Setpoint((p[0] + over * v[0], p[1] + over * v[1], p[2] + over * v[2]), v, h=self._h)
-        return Setpoint(p, v, tuple(x.a.tolist()), tuple(x.j.tolist()), tuple(x.s.tolist()), h=self._h)
-
-    def many(self, times: np.ndarray) -> np.ndarray:
-        """p, v, a, j, s at many times [s], shape (n, 15); the end velocity goes on past the end."""
-        x = self._trajectory.sample_many(times)
-        out = np.concatenate([x.p, x.v, x.a, x.j, x.s], axis=-1)
-        over = np.maximum(times - self.duration, 0.0)
-        out[:, 0:3] += over[:, None] * x.v
-        out[over > 0.0, 6:] = 0.0
-        return out
+        return unpacked(self.many(np.array([t]))[0])
 
 
 def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polynomial:
@@ -121,14 +117,16 @@ class Blend:
         """[s]"""
         return self.source.duration
 
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """Setpoints at many times [s] of the reference, packed, shape (n, 33)."""
+        out, since = packed_many(self.source, times), times - self.start
+        acting = since >= 0.0 if self.lasting else (since >= 0.0) & (since < self.offset.duration)
+        out[acting, :15] += self.offset.many(since[acting])[:, :15]
+        return out
+
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s] of the reference."""
-        x = self.source.setpoint(t)
-        if t < self.start or (t - self.start >= self.offset.duration and not self.lasting):
-            return x
-        d = self.offset.setpoint(t - self.start)
-        return Setpoint(*(tuple(m + n for m, n in zip(getattr(x, k), getattr(d, k))) for k in ("p", "v", "a", "j", "s")),
-                        x.h, x.dh, x.ddh, x.b3, x.db3, x.ddb3)
+        return unpacked(self.many(np.array([t]))[0])
 
 
 def blended(old: Setpoint, source, start: float, end: float, duration: float = 0.5):

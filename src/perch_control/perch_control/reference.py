@@ -11,7 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from perch_core import so3
+from perch_core import bernstein, so3
+from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import GRAVITY
 
@@ -49,11 +50,18 @@ class Setpoint:
         return (*self.p, *self.v, *self.a, *self.j, *self.s, *self.h, *self.dh, *self.ddh, *self.b3, *self.db3, *self.ddb3)
 
 
+def unpacked(row: np.ndarray) -> Setpoint:
+    """The setpoint of which `row` has the fields, shape (33,)."""
+    x = row.tolist()
+    return Setpoint(*(tuple(x[k:k + 3]) for k in range(0, 33, 3)))
+
+
 def _floats(v) -> Vector:
     return (float(v[0]), float(v[1]), float(v[2]))
 
 
-def heading(yaw: float, rate: float = 0.0, acceleration: float = 0.0) -> tuple[Vector, Vector, Vector]:
+@compiled
+def heading(yaw: float, rate: float, acceleration: float) -> tuple[Vector, Vector, Vector]:
     """b2_des of a yaw angle and its first two derivatives. [M:eq12]"""
     c, s = cos(yaw), sin(yaw)
     return ((-s, c, 0.0), (-c * rate, -s * rate, 0.0),
@@ -86,6 +94,36 @@ class Resting:
         return Setpoint((0.0, 0.0, 0.0))
 
 
+@compiled
+def flat_setpoints(tables, edges, durations, choose, times, out):
+    """Setpoints of a flat trajectory (`FlatTrajectory.arrays`) at times [s], shape (n,): packed, in `out`, shape (n, 33).
+
+    Past the end the last acceleration holds: a contact is being awaited there.
+    """
+    last = len(durations) - 1
+    for k in range(len(times)):
+        t, index = times[k], 0
+        while index < last and edges[index + 1] <= t:
+            index += 1
+        s = min(max((t - edges[index]) / durations[index], 0.0), 1.0)
+        x, row = bernstein.values_at(tables[index], choose, s), out[k]
+        row[:] = 0.0
+        yaw, rate, acc, over = x[0, 3], x[1, 3], x[2, 3], t - edges[last + 1]
+        if over > 0.0:
+            rate, acc = 0.0, 0.0
+            for i in range(3):
+                row[i] = x[0, i] + over * (x[1, i] + 0.5 * over * x[2, i])
+                row[3 + i] = x[1, i] + over * x[2, i]
+                row[6 + i] = x[2, i]
+        else:
+            for order in range(5):
+                for i in range(3):
+                    row[3 * order + i] = x[order, i]
+        h, dh, ddh = heading(yaw, rate, acc)
+        for i in range(3):
+            row[15 + i], row[18 + i], row[21 + i] = h[i], dh[i], ddh[i]
+
+
 @dataclass(frozen=True)
 class FlatReference:
     """A polynomial in the flat outputs."""
@@ -97,15 +135,15 @@ class FlatReference:
         """[s]"""
         return self.trajectory.duration
 
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """Setpoints at many times [s], packed, shape (n, 33)."""
+        out = np.empty((len(times), 33))
+        flat_setpoints(*self.trajectory.arrays, times, out)
+        return out
+
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]. Past the end the last acceleration holds: a contact is being awaited there."""
-        (*p, yaw), (*v, yaw_rate), (*a, yaw_acc), (*j, _), (*s, _) = self.trajectory.values(t).tolist()
-        over = t - self.trajectory.duration
-        if over > 0.0:
-            p = [p[i] + over * (v[i] + 0.5 * over * a[i]) for i in range(3)]
-            v = [v[i] + over * a[i] for i in range(3)]
-            return Setpoint(tuple(p), tuple(v), tuple(a), _ZERO, _ZERO, *heading(yaw))
-        return Setpoint(tuple(p), tuple(v), tuple(a), tuple(j), tuple(s), *heading(yaw, yaw_rate, yaw_acc))
+        return unpacked(self.many(np.array([t]))[0])
 
 
 @dataclass(frozen=True)
@@ -156,17 +194,7 @@ def peak_thrust(source, begin: float) -> float:
 
 
 def packed_many(source, times: np.ndarray) -> np.ndarray:
-    """Setpoints of a source at many times [s], packed, shape (n, 33); a flat trajectory is evaluated in one go."""
-    if not isinstance(source, FlatReference):
-        return np.array([source.setpoint(float(t)).packed for t in times])
-    end = source.trajectory.duration
-    inside = times <= end
-    x = source.trajectory.sample_many(times[inside])
-    c, s, r, q = np.cos(x.yaw), np.sin(x.yaw), x.yaw_rate, x.yaw_acc
-    zero = np.zeros_like(c)
-    h = np.stack([-s, c, zero, -c * r, -s * r, zero, s * r * r - c * q, -c * r * r - s * q, zero], axis=-1)
-    out = np.zeros((len(times), 33))
-    out[inside, :24] = np.concatenate([x.p, x.v, x.a, x.j, x.s, h], axis=-1)
-    for k in np.flatnonzero(~inside):
-        out[k] = source.setpoint(float(times[k])).packed
-    return out
+    """Setpoints of a source at many times [s], packed, shape (n, 33); sources that have `many` are evaluated in one go."""
+    if hasattr(source, "many"):
+        return source.many(times)
+    return np.array([source.setpoint(float(t)).packed for t in times])

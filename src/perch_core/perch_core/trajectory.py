@@ -84,6 +84,11 @@ class FlatTrajectory:
             tables[:, order] = raised / self.durations[:, None, None] ** order
         return tables
 
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """As kernels take it: derivatives (n, 5, 4, degree + 1), segment ends (n + 1,) and durations (n,) [s], binomials."""
+        return self._tables, np.array(self._edges), np.array(self.durations), bernstein.binomials(self.degree)
+
     @property
     def duration(self) -> float:
         """Duration of the whole trajectory [s]."""

@@ -88,7 +88,7 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
     delta, best, least = np.zeros((2, 3)), None, np.inf
     for _ in range(_ROUNDS):
         shifted = table.copy()
-        shifted[:, :15] += _offset(delta, growth).many(times)
+        shifted[:, :15] += _offset(delta, growth).many(times)[:, :15]
         final = controller.rehearse(start, rotors, shifted, CONTROL_PERIOD, n * CONTROL_PERIOD)
         miss = np.array([final[0:3], final[3:6]]) - wanted
         error = float(np.linalg.norm(miss[0]) / _POSITION_SCALE + np.linalg.norm(miss[1]) / _SPEED_SCALE)

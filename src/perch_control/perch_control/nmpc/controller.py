@@ -8,22 +8,25 @@ import numpy as np
 
 from perch_control.geometric import ControlOutput, GeometricController, packed_vehicle
 from perch_control.geometric.controller import NO_COMPENSATION
-from perch_control.geometric.step import drag_compensation, predicted, rotors_for, wrench_of
-from perch_control.nmpc.condensing import condense, expand, unpack
+from perch_control.nmpc.condensing import solve_condensed
+from perch_control.nmpc.iteration import answer, apply, begin, finish, input_bounds
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import DISTURBANCE, INPUTS, LINE, LINES, REFERENCE, WEIGHTS, StageLayout
-from perch_control.nmpc.qp import QpFailure, solve
+from perch_control.nmpc.qp import QpFailure
 from perch_control.nmpc.reference_rows import ReferenceRows
+from perch_control.nmpc.riccati import Workspace
 from perch_control.nmpc.settings import NmpcSettings
 from perch_control.reference import Following, Resting
-from perch_control.rotor_lag import RotorEstimate, approached, reachable, thrusts
+from perch_control.rotor_lag import RotorEstimate
 from perch_core.errors import ConfigError
+from perch_core.jit import COMPILED
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
 
 _REFERENCE_FLOOR = 0.5   # specific thrust below which the reference's attitude is noise [m/s^2]
-_NEAR_LIMIT = 0.75       # rate limits enter the QP where the last iterate is beyond this share of them
 _RATE_RESERVE = 1.2
+_RATE_PRICE, _THRUST_PRICE = 1e5, 1e6  # of half the squared excess over a state's bound [s^2/rad^2, 1/N^2]: far above all weights
+_ACTIVE_SETS = 12        # tried in one period before the dense QP is solved
 _FAR_LINE = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 1.0, 0.01)
 
 
@@ -41,15 +44,13 @@ class NmpcController:
         self._layout = StageLayout(n, settings.lines.any)
         self._stages = Linearisation(vehicle, self._dt, self._layout, N + 1)
         self._constants = packed_vehicle(vehicle)
-        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR)
+        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR, self.settings.nodes * self._spacing)
         self._R = np.zeros((N + 1, REFERENCE))
         self.X, self.U = np.zeros((N + 1, n)), np.zeros((N, INPUTS))
-        self._A, self._B, self._c = np.zeros((N, n, n)), np.zeros((N, n, INPUTS)), np.zeros((N, n))
-        self._Q, self._q = np.zeros((N + 1, n, n)), np.zeros((N + 1, n))
-        self._H, self._h = np.zeros((INPUTS * N,) * 2), np.zeros(INPUTS * N)
-        self._xi, self._G = np.zeros((N + 1, n)), np.zeros((N + 1, n, INPUTS * N))
-        self._sums = self._dt * np.kron(np.tril(np.ones((N, N))), np.eye(INPUTS))  # inputs -> thrust states
-        self._no_rows = np.zeros((0, INPUTS * N)), np.zeros(0), np.zeros(0), np.zeros(0, bool)
+        self._start, self._target = np.zeros(n), np.zeros((N, INPUTS))
+        self._low, self._high = np.zeros((N, INPUTS)), np.zeros((N, INPUTS))
+        self._x_low, self._x_high, self._price = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n)
+        self._dx, self._du, self._work = np.zeros((N + 1, n)), np.zeros((N, INPUTS)), Workspace(N, n)
         self._warm = False
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
@@ -76,6 +77,8 @@ class NmpcController:
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
+        self._x_low[10:13], self._x_high[10:13], self._price[10:13] = -self._rate_max, self._rate_max, _RATE_PRICE
+        self._x_low[13:], self._x_high[13:], self._price[13:] = self.vehicle.thrust_min, self.vehicle.thrust_max, _THRUST_PRICE
 
     def retune(self, settings: NmpcSettings, fallback: GeometricController) -> None:
         """New weights and limits from the next period on.
@@ -99,7 +102,8 @@ class NmpcController:
     def believe(self, vehicle: Vehicle) -> None:
         """Fly a vehicle that differs from the one at the start in its thrust: what is compiled in knows thrusts alone."""
         self.vehicle, self._constants = vehicle, packed_vehicle(vehicle)
-        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR)
+        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR, self.settings.nodes * self._spacing)
+        self._weights()
         self.fallback.believe(vehicle)
 
     def prepare(self, source: Any, contact: bool) -> Any:
@@ -118,96 +122,46 @@ class NmpcController:
         if getattr(reference.source, "by_state", False):
             self._warm = False
             return self.fallback.control(state, reference, rotors, compensation, time_to_contact)
-        start = self._start(state, rotors, compensation)
         ahead = 0.0 if self.settings.thrust_states else self.settings.lead
         self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
         try:
-            u = self._iterate(start, rotors, compensation)
+            speed, wrench, reached = self._iterate(state, rotors, compensation)
         except QpFailure:
             self.failures += 1
             self._warm = False
             return self.fallback.control(state, reference, rotors, compensation, time_to_contact)
-        return self._answer(u, rotors)
+        r, (now, later) = self._R[0].tolist(), self.X[:2, 10:13].tolist()
+        dw_C = ((later[0] - now[0]) / self._dt, (later[1] - now[1]) / self._dt, (later[2] - now[2]) / self._dt)
+        return ControlOutput(speed, wrench, reached, tuple(r[3:7]), tuple(r[10:13]), dw_C)
 
-    def _start(self, state: tuple[float, ...], rotors: RotorEstimate, compensation: tuple[float, ...]) -> np.ndarray:
-        """Initial state of the horizon: predicted to where the rotors have answered; with thrust states, the present one."""
-        mass, J, coefficient = self._constants[0][0], self._constants[0][1:4], self._constants[1][0]
-        if not self.settings.thrust_states:
-            half = 1.0 - np.exp(-0.5 * self.settings.lead / max(self._constants[1][3], 1e-9))
-            f = thrusts(approached(rotors.speed, rotors.command, half), coefficient)
-            felt = drag_compensation(state[6:10], state[3:6], self._constants[4], compensation)
-            state = predicted(state, f, felt, self.settings.lead, mass, J, self._constants[2])
-        x = np.empty(self._layout.states)
-        x[0:3], x[3:7], x[7:10], x[10:13] = state[0:3], state[6:10], state[3:6], state[10:13]
-        if self.settings.thrust_states:
-            x[13:] = np.clip(thrusts(rotors.speed, coefficient), self.vehicle.thrust_min, self.vehicle.thrust_max)
-        return x
-
-    def _iterate(self, start: np.ndarray, rotors: RotorEstimate, compensation: tuple[float, ...]) -> np.ndarray:
-        """One real-time iteration; returns the first input."""
-        s, n, N = self.settings, self._layout.states, self.settings.nodes
-        X, U = self.X, self.U
+    def _iterate(self, state: tuple[float, ...], rotors: RotorEstimate, compensation: tuple[float, ...]) -> tuple:
+        """One real-time iteration; returns rotor commands, wrench and the thrusts that will be reached."""
+        s, X, U, n = self.settings, self.X, self.U, self._layout.states
         if not self._warm:
             X[:, :13] = self._R[:, :13]
             if s.thrust_states:
                 X[:, 13:], U[:] = self._R[:, 13:], 0.0
             else:
-                U[:] = self._R[:N, 13:]
+                U[:] = self._R[:-1, 13:]
+            self._work.clear()
             self._warm = True
-        if np.dot(X[0, 3:7], start[3:7]) < 0.0:
-            X[:, 3:7] *= -1.0  # the other sign of the same rotations
         z = self._stages.arguments
-        z[:, :n], z[:N, n:n + INPUTS] = X, U
-        z[:, n + INPUTS:n + INPUTS + REFERENCE] = self._R
-        z[:, n + INPUTS + REFERENCE:n + INPUTS + REFERENCE + DISTURBANCE] = np.negative(compensation)
+        begin(state, rotors.speed, rotors.command, compensation, s.lead, self._constants, self._R, X, U, self._start, self._target, z)
         if self._layout.with_lines:
             self._fill_lines(z)
-        unpack(self._stages.evaluate(), X, self._A, self._B, self._c, self._Q, self._q)
-        self._Q[N] *= s.terminal
-        self._q[N] *= s.terminal
+        stages = self._stages.evaluate()
         weight = s.thrust_rate if s.thrust_states else s.thrust
-        gradient = weight * (U if s.thrust_states else U - self._R[:N, 13:])
-        dx0 = start - X[0]
-        condense(self._A, self._B, self._c, self._Q, self._q, gradient, weight, dx0, self._H, self._h, self._xi, self._G)
-        du = solve(self._H, self._h, *self._box(rotors), *self._limits())
-        expand(self._A, self._B, self._c, dx0, du, X, U)
-        X[:, 3:7] /= np.sqrt(np.einsum("ki,ki->k", X[:, 3:7], X[:, 3:7]))[:, None]
-        return U[0]
-
-    def _box(self, rotors: RotorEstimate) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the inputs' changes."""
-        U = self.U.ravel()
-        if self.settings.thrust_states:
-            return -self._thrust_rate_max - U, self._thrust_rate_max - U
-        low, high = np.full(len(U), self.vehicle.thrust_min), np.full(len(U), self.vehicle.thrust_max)
-        coefficient, speed_min, speed_max, tau = self._constants[1]
-        share = 1.0 - np.exp(-self.settings.lead / max(tau, 1e-9))
-        slow, fast = reachable(rotors.speed, share, speed_min, speed_max)
-        low[:INPUTS], high[:INPUTS] = thrusts(slow, coefficient), thrusts(fast, coefficient)
-        return low - U, high - U
-
-    def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Rows: thrusts at the nodes (17 states), body rates where they are near their limit."""
-        N, n = self.settings.nodes, self._layout.states
-        free = self.X + self._xi
-        near = np.argwhere(np.abs(free[1:, 10:13]) > _NEAR_LIMIT * self._rate_max)
-        if n == 13 and not len(near):
-            return self._no_rows
-        rows = [np.zeros((0, INPUTS * N))]
-        low, high = [np.zeros(0)], [np.zeros(0)]
-        if n == 17:
-            thrust = free[1:, 13:].ravel()
-            rows.append(self._sums)
-            low.append(self.vehicle.thrust_min - thrust)
-            high.append(self.vehicle.thrust_max - thrust)
-        if len(near):
-            k, axis = near[:, 0] + 1, near[:, 1]
-            rows.append(self._G[k, 10 + axis])
-            now = free[k, 10 + axis]
-            low.append(-self._rate_max - now)
-            high.append(self._rate_max - now)
-        soft = np.ones(sum(map(len, low)), bool)
-        return np.concatenate(rows), np.concatenate(low), np.concatenate(high), soft
+        input_bounds(rotors.speed, s.lead, self._constants, self._thrust_rate_max, n, self._low, self._high)
+        if COMPILED:
+            tried, out = finish(stages, X, U, self._start, weight, self._target, s.terminal, self._low, self._high, self._x_low,
+                                self._x_high, self._price, _ACTIVE_SETS, self._work.arrays, self._dx, self._du, rotors.speed, s.lead,
+                                self._constants)
+            if tried:
+                return out
+            self._work.clear()
+        apply(*solve_condensed(stages, X, U, self._start - X[0], weight, self._target, s.terminal, self._low, self._high, self._x_low,
+                               self._x_high), X, U)
+        return answer(U, n, rotors.speed, s.lead, self._constants)
 
     def _fill_lines(self, z: np.ndarray) -> None:
         weights = self.settings.lines
@@ -217,18 +171,6 @@ class NmpcController:
         watched = ramp if self._lines else 0.0
         z[:, -(LINES * LINE + 4):] = (*flat, watched * weights.perception, watched * weights.visibility,
                                       ramp * weights.collision, weights.margin)
-
-    def _answer(self, u: np.ndarray, rotors: RotorEstimate) -> ControlOutput:
-        s, top = self.settings, self.vehicle.thrust_max
-        f = u.tolist()
-        if s.thrust_states:
-            now = thrusts(rotors.speed, self._constants[1][0])
-            f = [min(max(a + s.lead * b, self.vehicle.thrust_min), top) for a, b in zip(now, f)]
-        wrench = wrench_of(tuple(f), self._constants[2])
-        speed, reached = rotors_for(wrench, rotors.speed, self._constants, s.lead)
-        r = self._R[0].tolist()
-        return ControlOutput(speed, wrench, reached, tuple(r[3:7]), tuple(r[10:13]),
-                             tuple(((self.X[1, 10:13] - self.X[0, 10:13]) / self._dt).tolist()))
 
 
 def _thrust_rate(vehicle: Vehicle) -> float:

@@ -29,11 +29,7 @@ _SMOOTH = 1e-3      # rounding of the hinges
 
 @dataclass(frozen=True)
 class StageLayout:
-    """Sizes of a stage function's arguments and results.
-
-    The argument is (x, u, reference, disturbance, weights[, lines]); the result (next state, A, B, Q, q), matrices by
-    columns.
-    """
+    """Size of a stage function's argument (x, u, reference, disturbance, weights[, lines])."""
 
     states: int
     with_lines: bool
@@ -42,12 +38,6 @@ class StageLayout:
     def arguments(self) -> int:
         """Length of the argument vector."""
         return self.states + INPUTS + REFERENCE + DISTURBANCE + WEIGHTS + (LINE_PARAMETERS if self.with_lines else 0)
-
-    @property
-    def results(self) -> int:
-        """Length of the result vector."""
-        n = self.states
-        return n + n * n + n * INPUTS + n * n + n
 
 
 def _rate(model: RotorModel, drag: Vector, x: Vector, u: Vector, disturbance: Vector, thrust_states: bool) -> Vector:
@@ -122,7 +112,8 @@ def _line_residuals(vehicle: Vehicle, x: Vector, parameters: Vector) -> list:
 
 
 def stage(vehicle: Vehicle, step: float, layout: StageLayout) -> ca.Function:
-    """The stage function of a vehicle: one vector in, one vector out (see `StageLayout`).
+    """The stage function of a vehicle: of one vector (see `StageLayout`) the next state, its Jacobians A and B, and the Hessian Q and
+    gradient q of the Gauss-Newton cost.
 
     Args:
         vehicle: its numbers become constants of the code.
@@ -154,5 +145,5 @@ def stage(vehicle: Vehicle, step: float, layout: StageLayout) -> ca.Function:
     J = ca.jacobian(r, state)
     A, B = ca.densify(ca.jacobian(following, state)), ca.densify(ca.jacobian(following, control))
     Q_gn = ca.densify(ca.mtimes(J.T, J))
-    out = ca.vertcat(following, ca.vec(A), ca.vec(B), ca.vec(Q_gn), ca.densify(ca.mtimes(J.T, r)))
-    return ca.Function(f"stage{n}{'l' if layout.with_lines else ''}", [z], [ca.densify(out)])
+    out = [ca.densify(e) for e in (following, A, B, Q_gn, ca.mtimes(J.T, r))]
+    return ca.Function(f"stage{n}{'l' if layout.with_lines else ''}", [z], out)

@@ -10,13 +10,20 @@ from typing import Any
 
 import numpy as np
 
+from perch_control.reference import packed_many
 from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, times
 from perch_core.vehicle import GRAVITY
 
-_KEPT = 4096
+_NEVER = -(1 << 62)
+
+
+@compiled
+def _three(x, k):
+    """Components k to k + 2 as a tuple."""
+    return (x[k], x[k + 1], x[k + 2])
 
 
 @compiled
@@ -27,20 +34,20 @@ def reference_row(x, floor, vehicle):
     where there is hardly any thrust, a small acceleration would be a large turn. The thrust is the force's part along it.
 
     Args:
-        x: packed setpoint, 33 floats.
+        x: packed setpoint, 33 floats (a tuple or an array).
         floor: specific thrust below which the attitude is taken as level [m/s^2].
         vehicle: packed constants (see `packed_vehicle`).
     """
     f = (x[6], x[7], x[8] + GRAVITY)
-    j, s = x[9:12], x[12:15]
+    j, s = _three(x, 9), _three(x, 12)
     thrust = norm(f)
-    if dot(x[24:27], x[24:27]) > 0.5:
-        thrust = max(dot(f, x[24:27]), 0.0)
-        f, j, s = x[24:27], x[27:30], x[30:33]
+    if dot(_three(x, 24), _three(x, 24)) > 0.5:
+        thrust = max(dot(f, _three(x, 24)), 0.0)
+        f, j, s = _three(x, 24), _three(x, 27), _three(x, 30)
     elif thrust < floor:
         thrust = floor
         f, j, s = (0.0, 0.0, floor), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    h, dh, ddh = x[15:18], x[18:21], x[21:24]
+    h, dh, ddh = _three(x, 15), _three(x, 18), _three(x, 21)
     n = cross(h, f)
     if norm(n) < 1e-2 * norm(f):
         h, dh, ddh = cross(f, (1.0, 0.0, 0.0)), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -60,13 +67,50 @@ def reference_row(x, floor, vehicle):
             min(max(a[3] * T + mx[3] * M[0] + my[3] * M[1] + d[3] * M[2], low), high))
 
 
-class ReferenceRows:
-    """Rows of the running reference, kept by control period."""
+@compiled
+def missing(stamps, first, spacing, nodes):
+    """Periods of the nodes whose rows are not in the ring."""
+    out = np.empty(nodes, np.int64)
+    n = 0
+    for k in range(nodes):
+        index = first + k * spacing
+        if stamps[index % len(stamps)] != index:
+            out[n] = index
+            n += 1
+    return out[:n]
 
-    def __init__(self, vehicle: tuple, floor: float) -> None:
+
+@compiled
+def keep(setpoints, periods, floor, vehicle, rows, stamps):
+    """Put the rows of packed setpoints (n, 33) into the ring, at their periods (n,)."""
+    for k in range(len(periods)):
+        slot = periods[k] % len(stamps)
+        row = reference_row(setpoints[k], floor, vehicle)
+        for i in range(17):
+            rows[slot, i] = row[i]
+        stamps[slot] = periods[k]
+
+
+@compiled
+def take(rows, stamps, first, spacing, out):
+    """Copy the rows of all nodes out of the ring."""
+    for k in range(len(out)):
+        out[k] = rows[(first + k * spacing) % len(stamps)]
+
+
+class ReferenceRows:
+    """Rows of the running reference, kept by control period in a ring as long as the horizon."""
+
+    def __init__(self, vehicle: tuple, floor: float, periods: int) -> None:
+        """
+        Args:
+            vehicle: packed constants.
+            floor: see `reference_row`.
+            periods: length of the horizon in control periods.
+        """
         self._vehicle, self._floor = vehicle, floor
         self._source: Any = None
-        self._rows: dict[int, tuple[float, ...]] = {}
+        self._rows, self._stamps = np.zeros((periods + 1, 17)), np.full(periods + 1, _NEVER)
 
     def fill(self, source: Any, elapsed: float, spacing: int, out: np.ndarray) -> None:
         """Write the rows of all nodes.
@@ -77,13 +121,11 @@ class ReferenceRows:
             spacing: control periods between nodes.
             out: shape (nodes, 17).
         """
-        if source is not self._source or len(self._rows) > _KEPT:
-            self._source, self._rows = source, {}
-        rows, first = self._rows, round(elapsed / CONTROL_PERIOD)
-        for k in range(len(out)):
-            index = first + k * spacing
-            row = rows.get(index)
-            if row is None:
-                row = reference_row(source.setpoint(index * CONTROL_PERIOD).packed, self._floor, self._vehicle)
-                rows[index] = row
-            out[k] = row
+        if source is not self._source:
+            self._source = source
+            self._stamps[:] = _NEVER
+        first = round(elapsed / CONTROL_PERIOD)
+        periods = missing(self._stamps, first, spacing, len(out))
+        if len(periods):
+            keep(packed_many(source, periods * CONTROL_PERIOD), periods, self._floor, self._vehicle, self._rows, self._stamps)
+        take(self._rows, self._stamps, first, spacing, out)
