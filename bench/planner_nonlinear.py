@@ -6,11 +6,14 @@ import time
 
 import numpy as np
 
+from perch_core import bernstein
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner import reduced_qp
 from perch_planner.contact_constraints import Contact
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
+from perch_planner.reduced_qp import ReducedProgram
+from perch_planner.reduced_rows import rows_of
 from perch_planner.solvers import least_norm
 
 SAMPLE = 0.01  # [s], the paper's dt
@@ -24,6 +27,20 @@ def plan_time(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) 
         plan(problem, settings, vehicle)
         times.append(time.process_time() - begin)
     return float(np.median(times))
+
+
+def _accelerations(program: ReducedProgram, segments: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """a + g e3 at places as constant + columns @ w of each dimension: shapes (places, 3), (places, size)."""
+    size = len(program.spread)
+    slopes = bernstein.basis(12, places)
+
+    def at(w):
+        second = bernstein.derivative(reduced_qp.coefficients(program, w), 2) / program.durations[:, None, None] ** 2
+        return np.einsum("kdi,ki->kd", second[segments], slopes)
+
+    constant = at(np.zeros(3 * size))
+    columns = np.stack([(at(unit) - constant)[:, 0] for unit in np.eye(size, 3 * size)], axis=1)
+    return constant + (0.0, 0.0, GRAVITY), columns
 
 
 def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, durations: np.ndarray,
@@ -47,13 +64,10 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
     edges = np.concatenate([[0.0], np.cumsum(durations)])
     segments = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(durations) - 1)
     places = (times - edges[segments]) / durations[segments]
-    begin = time.process_time()
-    program = reduced_qp.assemble(durations, *contact.knots(durations), bubbles, np.append(linear.segments, segments),
-                                  np.append(linear.places, places), np.append(linear.orders, np.full(len(times), 2)), 4)
-    rows, low, high = reduced_qp.constraint_rows(program, linear.functional, linear.direction, linear.lower, linear.upper)
-    count = len(linear.segments)
-    columns, constant = program.whitened[count:], program.constant[count:] + (0.0, 0.0, GRAVITY)
-    size = program.whitened.shape[1]
+    program = reduced_qp.assemble(durations, *contact.knots(durations), bubbles, 4)
+    rows, low, high = rows_of(program, linear)
+    size = len(program.spread)
+    constant, columns = _accelerations(program, segments, places)
     limit = Limits.of(settings, vehicle).thrust[1] / vehicle.mass
 
     def cost(w, gradient):
@@ -74,6 +88,7 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
             for d in range(3):
                 gradient[:, d * size:(d + 1) * size] = 2.0 * force[:, d:d + 1] * columns / limit**2
 
+    begin = time.process_time()
     solver = nlopt.opt(nlopt.LD_SLSQP, 3 * size)
     solver.set_min_objective(cost)
     solver.add_inequality_mconstraint(within_rows, np.full(2 * len(low), 1e-8))

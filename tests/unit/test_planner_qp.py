@@ -9,8 +9,9 @@ from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_planner import full_qp, reference_element, solvers
 from perch_planner.contact_constraints import Contact, tube_bounds, tube_times
-from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint, contact_acceleration
-from perch_planner.segment_program import Bounds, FullSegments, ReducedSegments
+from perch_planner.linear_bounds import Bounds
+from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
+from perch_planner.segment_program import FullSegments, ReducedSegments
 from perch_planner.yaw_profile import yaw_coefficients
 
 VEHICLE = load_vehicle("snapdragon")
@@ -156,7 +157,7 @@ def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
 
 def test_tube_bounds_are_sorted_and_leave_room_on_every_axis():
     surface = PerchSurface.from_inclination(np.zeros(3), np.pi / 2)
-    end = contact_acceleration(surface, 3.3)
+    end = 3.3 * surface.normal - (0.0, 0.0, 9.81)
     lower, upper = tube_bounds(end, PerchSettings())
     # At 90 degrees the paper's inequality [M:eq15] reads -8.829 <= z <= -10.791, which nothing satisfies, and y = 0.
     assert (lower[2], upper[2]) == pytest.approx((-10.791, -8.829))

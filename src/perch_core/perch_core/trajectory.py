@@ -9,6 +9,8 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import accumulate
+from math import inf, isfinite
 
 import numpy as np
 
@@ -65,12 +67,15 @@ class FlatTrajectory:
         coefficients = np.array(self.coefficients, float)
         if durations.ndim != 1 or not len(durations) or coefficients.shape[:2] != (len(durations), 4) or coefficients.ndim != 3:
             raise ValueError(f"durations {durations.shape} and coefficients {coefficients.shape}: need (n,) and (n, 4, degree + 1)")
-        if not (np.isfinite(coefficients).all() and np.isfinite(durations).all() and (durations > 0.0).all()):
+        times = durations.tolist()
+        # A sum is finite only if every term is; the other way round it may overflow.
+        finite = isfinite(coefficients.sum()) or np.isfinite(coefficients).all()
+        if not (finite and all(0.0 < t < inf for t in times)):
             raise ValueError("coefficients must be finite and durations finite and > 0 s")
         for name, value in (("durations", durations), ("coefficients", coefficients)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "_edges", [0.0, *np.cumsum(durations).tolist()])
+        object.__setattr__(self, "_edges", list(accumulate(times, initial=0.0)))
 
     @cached_property
     def _tables(self) -> np.ndarray:

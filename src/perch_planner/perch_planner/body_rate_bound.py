@@ -20,12 +20,11 @@ from perch_core.jit import compiled
 from perch_planner.bounds import (
     cross,
     derivative,
-    dot,
     largest,
     magnitude,
-    product,
     smallest,
     split,
+    squared,
     value,
 )
 
@@ -68,12 +67,12 @@ def rate_parts(force, jerk, yaw, duration):
     """
     parts = np.zeros((_PARTS, _TILT))
     x = cross(force, jerk)
-    squared = dot(force, force)
-    fourth, tilt, turn = product(squared, squared), _elevate(dot(x, x), _TILT), derivative(yaw, 1)
+    force2 = squared(force)
+    fourth, tilt, turn = squared(force2.reshape((1, 25))), _elevate(squared(x), _TILT), derivative(yaw, 1)
     for k in range(_TILT):
         parts[0, k], parts[1, k] = fourth[k], tilt[k]
     for k in range(25):
-        parts[2, k] = squared[k]
+        parts[2, k] = force2[k]
     for d in range(3):
         for k in range(13):
             parts[3 + d, k] = force[d, k]
@@ -93,8 +92,8 @@ def rate_coarse_bound(force, jerk, yaw, duration):
     Args:
         force, jerk, yaw, duration: as for `rate_parts`.
     """
-    squared = dot(force, force)
-    least, most = smallest(squared), largest(squared)
+    force2 = squared(force)
+    least, most = smallest(force2), largest(force2)
     if least <= 0.0:
         return np.inf
     low, high = smallest(yaw), largest(yaw)
@@ -106,7 +105,7 @@ def rate_coarse_bound(force, jerk, yaw, duration):
     across = least - lean * lean
     if across <= 0.0:
         return np.inf
-    j = sqrt(max(largest(dot(jerk, jerk)), 0.0))
+    j = sqrt(max(largest(squared(jerk)), 0.0))
     turn = magnitude(derivative(yaw, 1)) / duration
     spin = (turn * magnitude(force[2]) * sqrt(most) + lean * j) / across
     return sqrt(j * j / least + spin * spin)

@@ -244,6 +244,23 @@ def dot(a, b):
 
 
 @compiled
+def squared(a):
+    """Bernstein coefficients of |a|^2 for a polynomial vector, shape (3, n + 1) -> (2 n + 1,): half the products of `dot`."""
+    n = a.shape[1]
+    out, scaled = np.zeros(2 * n - 1), np.empty(n)
+    for d in range(a.shape[0]):
+        for i in range(n):
+            scaled[i] = a[d, i] * _BINOMIALS[n - 1, i]
+        for i in range(n):
+            out[2 * i] += scaled[i] * scaled[i]
+            twice = 2.0 * scaled[i]
+            for k in range(i + 1, n):
+                out[i + k] += twice * scaled[k]
+    _divide_binomials(out)
+    return out
+
+
+@compiled
 def cross(a, b):
     """Bernstein coefficients of a x b for polynomial vectors, shapes (3, n + 1), (3, m + 1) -> (3, n + m + 1)."""
     out = np.zeros((3, a.shape[1] + b.shape[1] - 1))

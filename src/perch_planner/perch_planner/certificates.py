@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +10,7 @@ from perch_planner import plan_checks
 from perch_planner.problem import Limits
 
 
-@dataclass(frozen=True, slots=True)
-class Certificate:
+class Certificate(NamedTuple):
     """A proved bound on one quantity of a plan; fields as in `perch_msgs/Certificate`.
 
     Attributes:
@@ -55,18 +54,17 @@ def certificates(results: np.ndarray, limits: Limits, mass: float, thrust_method
         thrust_method: who decided the thrust bound.
     """
     inf = float("inf")
-    table = (("thrust", "N", limits.thrust[0], limits.thrust[1], mass, thrust_method),
-             ("speed", "m/s", -inf, limits.speed, 1.0, "bernstein"),
-             ("height", "m", limits.height[0], limits.height[1], 1.0, "bernstein"),
-             ("clearance", "m", limits.clearance, inf, 1.0, "bernstein"),
-             ("body_rate", "rad/s", -inf, limits.body_rate, 1.0, "bernstein"),
-             ("rotor_thrust", "N", *limits.rotor_thrust, 1.0, "dense"))
+    table = (("N", limits.thrust[0], limits.thrust[1], mass, thrust_method),
+             ("m/s", -inf, limits.speed, 1.0, "bernstein"),
+             ("m", limits.height[0], limits.height[1], 1.0, "bernstein"),
+             ("m", limits.clearance, inf, 1.0, "bernstein"),
+             ("rad/s", -inf, limits.body_rate, 1.0, "bernstein"),
+             ("N", *limits.rotor_thrust, 1.0, "dense"))
     out = []
-    for row, (quantity, unit, low, high, scale, method) in zip(results.tolist(), table):
+    for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, results.tolist(), table):
         minimum, at_minimum, maximum, at_maximum, holds = row
         if quantity == "rotor_thrust":  # preferred limits are searched without them
             holds = low <= minimum and maximum <= high
         out.append(Certificate(quantity, unit, low, high, scale * minimum, scale * maximum, at_minimum, at_maximum,
                                method, bool(holds)))
-    assert tuple(c.quantity for c in out) == plan_checks.NAMES[:len(out)]
     return tuple(out)

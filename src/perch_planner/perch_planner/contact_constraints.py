@@ -3,67 +3,55 @@
 from __future__ import annotations
 
 from math import cos, pi, sin
-from typing import NamedTuple
 
 import numpy as np
 
 from perch_core.jit import compiled
-from perch_planner.problem import PerchProblem, PerchSettings, contact_acceleration
+from perch_core.vehicle import GRAVITY
+from perch_planner.linear_bounds import Bounds
+from perch_planner.problem import PerchProblem, PerchSettings
 
 INSET = 1e-7
 """Bounds are tightened by this [SI], so that a solver's residual (1e-9 of a row) cannot leave the true ones."""
 
 _FACETS = 4  # the tangential speed stays inside a regular octagon
+_INSCRIBED = cos(pi / (2 * _FACETS))
 _OCTAGON = np.array([[cos(k * pi / _FACETS), sin(k * pi / _FACETS)] for k in range(_FACETS)])
 
 
-class LinearConstraints(NamedTuple):
-    """Bounds on directions of functionals: `lower <= direction . d^order p/dt^order (segment, place) <= upper`.
-
-    Attributes:
-        segments, places, orders: functionals, each shape (q,).
-        functional: index of the functional of each row, shape (r,).
-        direction: shape (r, 3).
-        lower, upper: shape (r,).
-    """
-
-    segments: np.ndarray
-    places: np.ndarray
-    orders: np.ndarray
-    functional: np.ndarray
-    direction: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-
-
 @compiled
-def _rows(durations, times, tube_lower, tube_upper, window, window_lower, window_upper):
-    """Tube rows for each instant and axis, then the window's rows; instants before the start are dropped."""
-    last = len(durations) - 1
+def bounds_kernel(durations, before_end, tube_lower, tube_upper, window, window_lower, window_upper):
+    """Tube rows for each instant and axis, then the window's rows: fields of `Bounds`. Instants before the start are dropped.
+
+    Args:
+        durations: of the segments [s], shape (f,).
+        before_end: instants of the tube, counted from the end [s], ascending, shape (k,).
+        tube_lower, tube_upper: of `tube_bounds`, shape (3,).
+        window, window_lower, window_upper: directions and bounds of the velocity at contact, shapes (w, 3), (w,), (w,).
+    """
+    last, end = len(durations) - 1, durations.sum()
     first = 0
-    while first < len(times) and times[first] < -1e-12:
+    while first < len(before_end) and end + before_end[first] < -1e-12:
         first += 1
-    count = len(times) - first
+    count = len(before_end) - first
     total = 3 * count + len(window)
-    segments, places, orders = np.empty(count + 1, np.int64), np.empty(count + 1), np.empty(count + 1, np.int64)
-    functional, direction = np.empty(total, np.int64), np.zeros((total, 3))
-    lower, upper = np.empty(total), np.empty(total)
+    owner = np.arange(total)
+    segments, places, orders = np.empty(total, np.int64), np.empty(total), np.empty(total, np.int64)
+    direction, lower, upper = np.zeros((total, 3)), np.empty(total), np.empty(total)
     for q in range(count):
-        t, begin, i = times[first + q], 0.0, 0
+        t, begin, i = end + before_end[first + q], 0.0, 0
         while i < last and t + 1e-12 >= begin + durations[i]:
             begin += durations[i]
             i += 1
-        segments[q], places[q], orders[q] = i, min(max((t - begin) / durations[i], 0.0), 1.0), 2
         for d in range(3):
             r = 3 * q + d
-            functional[r], direction[r, d], lower[r], upper[r] = q, 1.0, tube_lower[d], tube_upper[d]
-    segments[count], places[count], orders[count] = last, 1.0, 1
+            segments[r], places[r], orders[r] = i, min(max((t - begin) / durations[i], 0.0), 1.0), 2
+            direction[r, d], lower[r], upper[r] = 1.0, tube_lower[d], tube_upper[d]
     for k in range(len(window)):
         r = 3 * count + k
-        functional[r], lower[r], upper[r] = count, window_lower[k], window_upper[k]
-        for d in range(3):
-            direction[r, d] = window[k, d]
-    return segments, places, orders, functional, direction, lower, upper
+        segments[r], places[r], orders[r] = last, 1.0, 1
+        direction[r], lower[r], upper[r] = window[k], window_lower[k], window_upper[k]
+    return owner, segments, places, orders, direction, lower, upper
 
 
 @compiled
@@ -104,7 +92,7 @@ def _window(R_WS, velocity, least, most, tangential):
 
 
 @compiled
-def _knots(durations, given, values, p_contact, velocity):
+def knots_kernel(durations, given, values, p_contact, velocity):
     """What is given at the knots; those between the last waypoint and contact are free."""
     f, last = len(durations), len(given) - 1
     out, at = np.zeros((f + 1, 4), np.bool_), np.zeros((f + 1, 4, 3))
@@ -120,44 +108,83 @@ def _knots(durations, given, values, p_contact, velocity):
     return out, at
 
 
+@compiled
+def bubbles_kernel(count, first_in_tube, complete, everywhere):
+    """Which segments have bubbles: those of the tube, and those after a knot at which everything is given, or all."""
+    out = np.zeros(count, np.bool_)
+    for i in range(count):
+        out[i] = everywhere or i >= first_in_tube
+    for k in complete:
+        out[k] = True
+    return out
+
+
+@compiled
+def _instants(duration, tube_time, tube_step):
+    count = int(np.ceil(tube_time / tube_step - 1e-9))
+    out = np.empty(count)
+    for j in range(count):
+        out[j] = duration - tube_time + tube_step * j
+    return out
+
+
+@compiled
+def _contact(points, v, a, j, R_WS, offset, velocity, alpha, share, floor, tube_time, tube_step, least, most, tangential):
+    """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] of a problem; the last of `points` moves to the contact.
+
+    Returns:
+        (acceleration, given, values, before_contact): see `Contact`; waypoints have their positions only.
+    """
+    acceleration, last = np.empty(3), len(points) - 1
+    for d in range(3):
+        points[last, d] += offset * R_WS[d, 2]
+        acceleration[d] = alpha * R_WS[d, 2]
+    acceleration[2] -= GRAVITY
+    given, values = np.zeros((last + 1, 4), np.bool_), np.zeros((last + 1, 4, 3))
+    given[:, 0], given[0], given[last, 2] = True, True, True
+    values[:last, 0] = points[:last]
+    values[0, 1], values[0, 2], values[0, 3], values[last, 2] = v, a, j, acceleration
+    lower, upper = _tube(acceleration, share, floor)
+    directions, window_lower, window_upper = _window(R_WS, velocity, least, most, tangential)
+    return acceleration, given, values, (_instants(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions,
+                                         window_lower, window_upper)
+
+
 def tube_times(duration: float, settings: PerchSettings) -> np.ndarray:
     """The instants t_f - t_k + j dt, 0 <= j < t_k / dt, of the tube [s]. [M:eq15]"""
-    count = int(np.ceil(settings.tube_time / settings.tube_step - 1e-9))
-    return duration - settings.tube_time + settings.tube_step * np.arange(count)
+    return _instants(duration, settings.tube_time, settings.tube_step)
 
 
 class Contact:
-    """What does not change while durations are stretched; made once per plan."""
+    """What does not change while durations are stretched; made once per plan.
+
+    Attributes:
+        velocity: of the target in W [m/s], shape (3,).
+        points: start, waypoints, and the contact if the target stood still [m], shape (waypoints + 2, 3).
+        acceleration: at contact [m/s^2], shape (3,). [M:eq11]
+        at_knots, before_contact, complete: arguments of `knots_kernel`, `bounds_kernel`, `bubbles_kernel`.
+    """
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float) -> None:
-        surface = problem.surface
-        self.velocity = problem.target_velocity
-        self.p_contact = surface.p_WS + perch_offset * surface.normal
-        self.acceleration = contact_acceleration(surface, settings.impact_acceleration)
-        knots = len(problem.waypoints) + 2
-        self._given = np.zeros((knots, 4), bool)
-        self._values = np.zeros((knots, 4, 3))
-        start = problem.start
-        self._given[0], self._values[0] = True, (start.p, start.v, start.a, start.j)
-        self._complete = []  # waypoints at which everything is given
-        for k, waypoint in enumerate(problem.waypoints, start=1):
-            at = (waypoint.p, waypoint.v, waypoint.a, waypoint.j)
-            for order, value in enumerate(at):
-                if value is not None:
-                    self._given[k, order], self._values[k, order] = True, value
-            if all(value is not None for value in at):
-                self._complete.append(k)
-        self._given[-1] = (True, False, True, False)
-        self._values[-1, 2] = self.acceleration
-
-        lower, upper = tube_bounds(self.acceleration, settings)
-        self._tube_lower, self._tube_upper = lower + INSET, upper - INSET
-        self._tube_times = tube_times(0.0, settings)
-        tangential = settings.tangential_speed_max * cos(pi / (2 * _FACETS)) - INSET
+        start, surface = problem.start, problem.surface
         least, most = settings.impact_speed_min + INSET, settings.impact_speed_max - INSET
         if least > most:
             least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
-        self._window = _window(surface.R_WS, self.velocity, least, most, tangential)
+        self.velocity = problem.target_velocity
+        self.points = problem.points()
+        self.acceleration, given, values, self.before_contact = _contact(
+            self.points, start.v, start.a, start.j, surface.R_WS, perch_offset, self.velocity, settings.impact_acceleration,
+            settings.tube_tolerance, settings.tube_floor, settings.tube_time, settings.tube_step, least, most,
+            settings.tangential_speed_max * _INSCRIBED - INSET)
+        complete = []  # knots at which everything is given
+        for k, waypoint in enumerate(problem.waypoints, start=1):
+            for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)):
+                if value is not None:
+                    given[k, order], values[k, order] = True, value
+            if waypoint.j is not None and given[k].all():
+                complete.append(k)
+        self.at_knots = given, values, self.points[-1], self.velocity
+        self.complete = np.array(complete, np.int64)
 
     def knots(self, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]
@@ -168,24 +195,16 @@ class Contact:
         Returns:
             given, bool, shape (f + 1, 4), and values, shape (f + 1, 4, 3).
         """
-        return _knots(durations, self._given, self._values, self.p_contact, self.velocity)
+        return knots_kernel(durations, *self.at_knots)
 
-    def constraints(self, durations: np.ndarray) -> LinearConstraints:
+    def constraints(self, durations: np.ndarray) -> Bounds:
         """Tube and impact window for these durations. [M:eq14, M:eq15]
 
         The approach runs along -s3, the *outward* normal, so [M:eq14] reads v_min <= -v(t_f) . s3 <= v_max; all
         velocities are relative to the surface.
         """
-        times = float(durations.sum()) + self._tube_times
-        return LinearConstraints(*_rows(durations, times, self._tube_lower, self._tube_upper, *self._window))
+        return Bounds(*bounds_kernel(durations, *self.before_contact))
 
-    def bubbles(self, durations: np.ndarray, constraints: LinearConstraints, everywhere: bool) -> np.ndarray:
+    def bubbles(self, durations: np.ndarray, constraints: Bounds, everywhere: bool) -> np.ndarray:
         """Segments with bubbles: those of the tube, and those after a knot whose derivatives are all given."""
-        if everywhere:
-            return np.ones(len(durations), bool)
-        out = np.zeros(len(durations), bool)
-        out[constraints.segments[0]:] = True
-        for k in self._complete:
-            out[k] = True
-        return out
-
+        return bubbles_kernel(len(durations), constraints.segments[0], self.complete, everywhere)

@@ -15,10 +15,10 @@ from perch_core.jit import compiled
 from perch_core.vector3 import dot
 from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import derivatives_at
+from perch_planner.linear_bounds import Bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 from perch_planner.problem import Limits, PerchProblem
 from perch_planner.rotor_thrusts import linear_bounds
-from perch_planner.segment_program import Bounds
 
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
 _KEEP_AHEAD = 0.985  # of the limit, for cuts that are set ahead

@@ -13,11 +13,11 @@ from perch_planner.body_rate_bound import RATE_SLACK, rate_coarse_bound, rate_ma
 from perch_planner.bounds import (
     BELOW,
     cross,
-    dot,
     magnitude,
     maximum,
     product,
     smallest,
+    squared,
     stays_below,
     time_derivative,
 )
@@ -31,7 +31,7 @@ MINIMUM, MINIMUM_AT, MAXIMUM, MAXIMUM_AT, HOLDS = range(5)
 """Columns of the results: proved bounds, the times of the samples nearest to them, and whether the limits hold."""
 
 _PLACES = np.linspace(0.0, 1.0, 13)  # where clearance and rate are sampled
-_AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES) for n in (11, 12, 13, 14))
+_AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES).T.copy() for n in (11, 12, 13, 14))
 
 _RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
 _FINE = 1e-10      # where a limit falls inside the enclosure
@@ -78,20 +78,19 @@ def thrust_extrema(coefficients, durations, low, high):
     """
     f = len(durations)
     out = np.empty((f, 6))
-    squared, negative = np.empty((f, 25)), np.empty((f, 25))
+    upper, lower = np.empty((f, 25)), np.empty((f, 25))  # |f|^2, -|f|^2
     least, most = -np.inf, -np.inf  # attained, of -|f|^2 and |f|^2
     for i in range(f):
-        force = specific_force(coefficients[i], durations[i])
-        row = dot(force, force)
+        row = squared(specific_force(coefficients[i], durations[i]))
         for k in range(25):
-            squared[i, k], negative[i, k] = row[k], -row[k]
+            upper[i, k], lower[i, k] = row[k], -row[k]
         least, most = max(least, max(-row[0], -row[24])), max(most, max(row[0], row[24]))
     proved_least, proved_most = np.inf, -np.inf
     for i in range(f):
-        attained, proved, place = _enclose(negative[i], -low * low, least)
+        attained, proved, place = _enclose(lower[i], -low * low, least)
         least = max(least, attained)
         out[i, 0], out[i, 1], out[i, 2] = sqrt(max(-attained, 0.0)), sqrt(max(-proved, 0.0)), place
-        attained, proved, place = _enclose(squared[i], high * high, most)
+        attained, proved, place = _enclose(upper[i], high * high, most)
         most = max(most, attained)
         out[i, 3], out[i, 4], out[i, 5] = sqrt(attained), sqrt(proved), place
         proved_least, proved_most = min(proved_least, out[i, 1]), max(proved_most, out[i, 4])
@@ -121,8 +120,8 @@ def _rim_clears(distance, force, s3, extension, gap):
     if verdict != BELOW:
         return False, place
     tilt = cross(force, s3.reshape((3, 1)))
-    far = product(product(reduced, reduced), dot(force, force))
-    near = product(dot(tilt, tilt), np.ones(len(far) - 24))
+    far = product(squared(reduced.reshape((1, len(reduced)))), squared(force))
+    near = product(squared(tilt), np.ones(len(far) - 24))
     for k in range(len(far)):
         near[k] = extension * extension * near[k] - far[k]
     verdict, place = stays_below(near, _CLEARANCE_SLACK)
@@ -131,12 +130,12 @@ def _rim_clears(distance, force, s3, extension, gap):
 
 @compiled
 def _values(coefficients, basis):
-    """Values of several polynomials at the places of a table, shapes (r, n + 1), (places, n + 1) -> (places, r)."""
-    out = np.zeros((basis.shape[0], coefficients.shape[0]))
-    for k in range(basis.shape[0]):
-        for d in range(coefficients.shape[0]):
-            for i in range(coefficients.shape[1]):
-                out[k, d] += basis[k, i] * coefficients[d, i]
+    """Values of several polynomials at the places of a table, shapes (r, n + 1), (n + 1, places) -> (r, places)."""
+    out = np.zeros((coefficients.shape[0], basis.shape[1]))
+    for d in range(coefficients.shape[0]):
+        for i in range(coefficients.shape[1]):
+            for k in range(basis.shape[1]):
+                out[d, k] += coefficients[d, i] * basis[i, k]
     return out
 
 
@@ -149,19 +148,19 @@ def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
     gap, gap_at, rate, rate_at_ = np.inf, 0.0, 0.0, 0.0
     f, j = _values(force, _AT12), _values(jerk, _AT11)
     dist, heading, turn = _values(distance, _AT14), _values(yaw, _AT14), _values(yaw_rate, _AT13)
-    count = len(_AT14)
+    count = len(_PLACES)
     for k in range(count):
-        f_x, f_y, f_z, j_x, j_y, j_z = f[k, 0], f[k, 1], f[k, 2], j[k, 0], j[k, 1], j[k, 2]
+        f_x, f_y, f_z, j_x, j_y, j_z = f[0, k], f[1, k], f[2, k], j[0, k], j[1, k], j[2, k]
         f2 = max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12)
         along = f_x * s3[0] + f_y * s3[1] + f_z * s3[2]
-        here = dist[k, 0] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
+        here = dist[0, k] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
         if here < gap:
             gap, gap_at = here, k / (count - 1)
         x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
-        d_x, d_y = -sin(heading[k, 0]), cos(heading[k, 0])
+        d_x, d_y = -sin(heading[0, k]), cos(heading[0, k])
         lean = d_x * f_x + d_y * f_y
         across = max(f2 - lean * lean, 1e-12)
-        spin = (turn[k, 0] * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
+        spin = (turn[0, k] * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
         here = (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
         if here > rate:
             rate, rate_at_ = here, k / (count - 1)
@@ -176,6 +175,15 @@ def _widen(out, attained, row, column, value, proved, time):
         out[row, column] = proved
     if sign * value > sign * attained[row, column]:
         attained[row, column], out[row, column + 1] = value, time
+
+
+@compiled
+def _within(vector, limit):
+    """Whether a polynomial vector is shorter than a limit because its Bernstein coefficients are."""
+    for k in range(vector.shape[1]):
+        if vector[0, k] ** 2 + vector[1, k] ** 2 + vector[2, k] ** 2 > limit * limit:
+            return False
+    return True
 
 
 @compiled
@@ -213,12 +221,12 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
         out[row, 0], out[row, 1], out[row, 2], out[row, 3], out[row, 4] = np.inf, 0.0, -np.inf, 0.0, 1.0
         where[row, 0], where[row, 1] = -1.0, -1.0
     attained = out.copy()
-    gap_wanted, rate_wanted = np.inf, 1e-3
     begin = 0.0
-    coarse = np.empty(f)
+    begins = np.empty(f)
     down = np.empty((1, 15))
     for i in range(f):
         T, c = durations[i], coefficients[i]
+        begins[i] = begin
         _widen(out, attained, THRUST, MINIMUM, thrust[i, 0], thrust[i, 1], begin + T * thrust[i, 2])
         _widen(out, attained, THRUST, MAXIMUM, thrust[i, 3], thrust[i, 4], begin + T * thrust[i, 5])
         if thrust[i, 1] < low_thrust:
@@ -228,10 +236,11 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
 
         velocity = time_derivative(c, 1, T)
         reached = max(attained[SPEED, MAXIMUM], 0.0)
-        here, proved, place = _enclose(dot(velocity, velocity), speed * speed, reached * reached)
-        _widen(out, attained, SPEED, MAXIMUM, sqrt(max(here, 0.0)), sqrt(max(proved, 0.0)), begin + T * place)
-        if proved > speed * speed:
-            _doubt(where, SPEED, i, place)
+        if not _within(velocity, min(reached, speed)):
+            here, proved, place = _enclose(squared(velocity), speed * speed, reached * reached)
+            _widen(out, attained, SPEED, MAXIMUM, sqrt(max(here, 0.0)), sqrt(max(proved, 0.0)), begin + T * place)
+            if proved > speed * speed:
+                _doubt(where, SPEED, i, place)
 
         for k in range(15):
             down[0, k] = -c[2, k]
@@ -243,19 +252,25 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
         _widen(out, attained, HEIGHT, MAXIMUM, here, proved, begin + T * place)
         if proved > high_height:
             _doubt(where, HEIGHT, i, place)
+        begin += T
 
-        force, jerk = specific_force(c, T), time_derivative(c, 3, T)
-        distance, heading = surface_distance(c, T, begin, p_S, v_S, s3), yaw[i:i + 1]
+    # Backwards, as the vehicle turns and comes near at the end: most segments before need no samples then.
+    gap_wanted, rate_wanted = np.inf, 1e-3
+    coarse = np.empty(f)
+    for i in range(f - 1, -1, -1):
+        T, c, heading = durations[i], coefficients[i], yaw[i:i + 1]
+        force, jerk, distance = specific_force(c, T), time_derivative(c, 3, T), surface_distance(c, T, begins[i], p_S, v_S, s3)
+        coarse[i] = rate_coarse_bound(force, jerk, yaw[i], T)
+        if smallest(distance) - extension >= gap_wanted and coarse[i] <= min(rate_wanted, 0.999 * rate):
+            continue
         gap, gap_at, rate_here, rate_at_ = _sample(distance.reshape((1, 15)), force, jerk, heading,
                                                    time_derivative(heading, 1, T), s3, extension)
         if gap < gap_wanted:
-            gap_wanted, out[CLEARANCE, MINIMUM_AT] = gap, begin + T * gap_at
-        coarse[i] = rate_coarse_bound(force, jerk, yaw[i], T)
+            gap_wanted, out[CLEARANCE, MINIMUM_AT] = gap, begins[i] + T * gap_at
         if rate_here > rate_wanted:
-            rate_wanted, out[BODY_RATE, MAXIMUM_AT] = rate_here, begin + T * rate_at_
+            rate_wanted, out[BODY_RATE, MAXIMUM_AT] = rate_here, begins[i] + T * rate_at_
         if rate_here >= rate:
-            _doubt(where, BODY_RATE, i, rate_at_)
-        begin += T
+            where[BODY_RATE, 0], where[BODY_RATE, 1] = i, rate_at_  # in the end the first segment that is too fast
     out[SPEED, MINIMUM] = 0.0
     _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, clearance, gap_wanted)
     _prove_rate(out, where, coefficients, yaw, durations, coarse, rate, rate_wanted)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import atan2, hypot
+from typing import NamedTuple
 
 import numpy as np
 
@@ -122,6 +123,10 @@ class PerchProblem:
                 raise ConfigError("problem", "segment_times", f"{list(times)} are not durations in (0.001, 1000) s")
             object.__setattr__(self, "segment_times", times)
 
+    def points(self) -> np.ndarray:
+        """Start, waypoints and the surface's centre at time 0, in W [m], shape (waypoints + 2, 3)."""
+        return np.concatenate([self.start.p, *[w.p for w in self.waypoints], self.surface.p_WS]).reshape(-1, 3)
+
 
 @dataclass(frozen=True)
 class PerchSettings:
@@ -172,8 +177,7 @@ class PerchSettings:
             raise ConfigError("", "height_max", f"{self.height_max:g} is not above height_min {self.height_min:g} m")
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(NamedTuple):
     """Limits that hold over the whole plan.
 
     Attributes:
@@ -197,27 +201,22 @@ class Limits:
     def without(self, name: str) -> Limits:
         """The limits with one of them taken away: thrust, body_rate, speed, height, clearance or rotor_thrust."""
         none = {"thrust": (1e-3, 1e3), "height": (-1e3, 1e3), "clearance": -1e3, "rotor_thrust": (-1e3, 1e3)}
-        return replace(self, **{name: none.get(name, 1e3)})
+        return self._replace(**{name: none.get(name, 1e3)})
 
     @classmethod
     def of(cls, settings: PerchSettings, vehicle: Vehicle) -> Limits:
         """The limits of a vehicle, where the settings do not replace them."""
-        free = settings.rotor_margin * (vehicle.thrust_max - vehicle.thrust_min)
+        least, most = vehicle.thrust_min, vehicle.thrust_max
+        free = settings.rotor_margin * (most - least)
         return cls(
-            thrust=(settings.thrust_min or 4.0 * vehicle.thrust_min,
-                    settings.thrust_max or settings.thrust_reserve * 4.0 * vehicle.thrust_max),
+            thrust=(settings.thrust_min or 4.0 * least, settings.thrust_max or settings.thrust_reserve * 4.0 * most),
             body_rate=settings.body_rate_max or vehicle.body_rate_max,
             speed=settings.speed_max,
             height=(settings.height_min, settings.height_max),
             extension=settings.extension if settings.extension >= 0.0 else max(vehicle.body_radii[:2]),
             clearance=settings.clearance_min,
-            rotor_thrust=(vehicle.thrust_min + free, vehicle.thrust_max - free),
+            rotor_thrust=(least + free, most - free),
         )
-
-
-def contact_acceleration(surface: PerchSurface, impact_acceleration: float) -> np.ndarray:
-    """Acceleration at contact, alpha s3 - g e3, which puts b3 on s3 [m/s^2], shape (3,). [M:eq11]"""
-    return impact_acceleration * surface.normal - np.array([0.0, 0.0, GRAVITY])
 
 
 def contact_heading(surface: PerchSurface) -> float:

@@ -28,18 +28,18 @@ class ReducedProgram(NamedTuple):
     """Coordinates w in which every equality holds and the cost is |w|^2: unknowns = centre + spread' w.
 
     Attributes:
+        durations: of the segments [s], shape (f,).
+        first: index of the first bubble of each segment among all unknowns, -1 where it has none, shape (f,).
+        time_unit: mean segment duration, in which unknowns are measured [s].
         spread: shape (size, n).
         centre: all unknowns at the unconstrained optimum, shape (n, 3).
-        whitened: functionals of w, shape (functionals, size).
-        constant: values of the functionals at the unconstrained optimum, shape (functionals, 3).
-        time_unit: mean segment duration, in which unknowns are measured [s].
     """
 
+    durations: np.ndarray
+    first: np.ndarray
+    time_unit: float
     spread: np.ndarray
     centre: np.ndarray
-    whitened: np.ndarray
-    constant: np.ndarray
-    time_unit: float
 
 
 @compiled
@@ -56,7 +56,7 @@ def _first_bubbles(bubbles):
 
 
 @compiled
-def _index(segment, k, first):
+def index(segment, k, first):
     """Index of function k of a segment among all unknowns; `first` is that of its first bubble."""
     return 4 * segment + k if k < HERMITE else first + k - HERMITE
 
@@ -71,7 +71,7 @@ def _scales(ratio):
 
 
 @compiled
-def _functional(duration, unit, s, order):
+def functional(duration, unit, s, order):
     """Factors of the segment's functions in the order-th time derivative at place s, shape (15,)."""
     row, scale = bernstein_row(DEGREE - order, s), _scales(duration / unit)
     out = np.zeros(FUNCTIONS)
@@ -82,22 +82,6 @@ def _functional(duration, unit, s, order):
     for k in range(FUNCTIONS):
         out[k] *= scale[k] / duration**order
     return out
-
-
-@compiled
-def _place(local, segment, first, spread, centre, column, constant):
-    """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum."""
-    count = FUNCTIONS if first >= 0 else HERMITE
-    for d in range(3):
-        constant[d] = 0.0
-    for i in range(len(column)):
-        column[i] = 0.0
-    for k in range(count):
-        n = _index(segment, k, first)
-        for d in range(3):
-            constant[d] += local[k] * centre[n, d]
-        for i in range(len(column)):
-            column[i] += local[k] * spread[i, n]
 
 
 @compiled
@@ -146,9 +130,9 @@ def _eliminate(durations, unit, first, role, dependent, particular):
     for i in range(f - 1):
         for side in range(2):
             segment = i + side
-            local = _functional(durations[segment], unit, 1.0 - side, 4)
+            local = functional(durations[segment], unit, 1.0 - side, 4)
             for k in range(FUNCTIONS if first[segment] >= 0 else HERMITE):
-                q = _index(segment, k, first[segment])
+                q = index(segment, k, first[segment])
                 change = (1.0 - 2.0 * side) * unit**4 * local[k]
                 if role[q] > 0:
                     jump[i, column[q]] += change
@@ -165,21 +149,51 @@ def _eliminate(durations, unit, first, role, dependent, particular):
 
 
 @compiled
-def _cost(durations, unit, first, n, gram, cost_order):
-    """Cost of all unknowns, shape (n, n). [M:eq5]"""
-    out = np.zeros((n, n))
+def _weigh(durations, unit, first, role, basis, gram, cost_order):
+    """Cost matrix of all unknowns times the basis, segment by segment, shape (n, m). [M:eq5]"""
+    n, m = basis.shape
+    column = np.cumsum(role == 1) - 1
+    out = np.zeros((n, m))
     for i in range(len(durations)):
         ratio = durations[i] / unit
         scale, weight = _scales(ratio), ratio ** (1 - 2 * cost_order)
         count = FUNCTIONS if first[i] >= 0 else HERMITE
-        for a in range(count):
-            for b in range(count):
-                out[_index(i, a, first[i]), _index(i, b, first[i])] += gram[a, b] * scale[a] * scale[b] * weight
+        for b in range(count):
+            q = index(i, b, first[i])
+            for a in range(count):
+                share, r = gram[a, b] * scale[a] * scale[b] * weight, index(i, a, first[i])
+                if share == 0.0:
+                    continue
+                if role[q] == 1:
+                    out[r, column[q]] += share
+                elif role[q] == 2:
+                    for c in range(m):
+                        out[r, c] += share * basis[q, c]
     return out
 
 
 @compiled
-def _assemble(durations, given, values, bubbles, segments, places, orders, gram, cost_order):
+def _reduced_cost(weighted, basis, role):
+    """Z' C Z: of the free unknowns themselves, and of those that depend on them, shape (m, m)."""
+    m = basis.shape[1]
+    out = np.empty((m, m))
+    i = 0
+    for q in range(len(role)):
+        if role[q] == 1:
+            out[i] = weighted[q]
+            i += 1
+    for q in range(len(role)):
+        if role[q] == 2:
+            for i in range(m):
+                if basis[q, i] != 0.0:
+                    for c in range(m):
+                        out[i, c] += basis[q, i] * weighted[q, c]
+    return out
+
+
+@compiled
+def assemble_kernel(durations, given, values, bubbles, gram, cost_order):
+    """`assemble` on plain arrays; the fields of `ReducedProgram`."""
     f = len(durations)
     unit = durations.sum() / f
     first, n = _first_bubbles(bubbles)
@@ -192,17 +206,16 @@ def _assemble(durations, given, values, bubbles, segments, places, orders, gram,
     role, dependent = _roles(given, first)
     basis = _eliminate(durations, unit, first, role, dependent, particular)
     m = basis.shape[1]
-    weighted = _cost(durations, unit, first, n, gram, cost_order) @ basis
-    factor = np.linalg.cholesky(basis.T @ weighted)
+    weighted = _weigh(durations, unit, first, role, basis, gram, cost_order)
+    factor = np.linalg.cholesky(_reduced_cost(weighted, basis, role))
 
     # L^-1 applied to [Z' | g] row by row: the inner loop runs over contiguous entries.
-    gradient = weighted.T @ particular
-    work = np.empty((m, n + 3))
-    for i in range(m):
-        for q in range(n):
+    work = np.zeros((m, n + 3))
+    for q in range(n):
+        for i in range(m):
             work[i, q] = basis[q, i]
-        for d in range(3):
-            work[i, n + d] = gradient[i, d]
+            for d in range(3):
+                work[i, n + d] += weighted[q, i] * particular[q, d]
     for i in range(m):
         for k in range(i):
             if factor[i, k] != 0.0:
@@ -216,69 +229,11 @@ def _assemble(durations, given, values, bubbles, segments, places, orders, gram,
         for q in range(n):
             for d in range(3):
                 centre[q, d] -= spread[i, q] * work[i, n + d]
-    whitened, constant = np.empty((len(segments), m)), np.empty((len(segments), 3))
-    for q in range(len(segments)):
-        i = segments[q]
-        _place(_functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, whitened[q], constant[q])
-    return spread, centre, whitened, constant, unit
+    return durations, first, unit, spread, centre
 
 
 @compiled
-def _normalise(rows, lower, upper):
-    """Scale rows and their bounds to unit length."""
-    for r in range(len(rows)):
-        squared = 0.0
-        for k in range(rows.shape[1]):
-            squared += rows[r, k] ** 2
-        norm = np.sqrt(squared)
-        if norm < 1e-300:
-            norm = 1.0
-        for k in range(rows.shape[1]):
-            rows[r, k] /= norm
-        lower[r] /= norm
-        upper[r] /= norm
-
-
-@compiled
-def _further(durations, bubbles, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
-    """Rows of further bounds; term q adds to row owner[q]."""
-    m = len(spread)
-    first, _ = _first_bubbles(bubbles)
-    rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
-    column, constant = np.empty(m), np.empty(3)
-    for q in range(len(owner)):
-        i, r = segments[q], owner[q]
-        # Terms of one functional often follow each other.
-        if q == 0 or i != segments[q - 1] or places[q] != places[q - 1] or orders[q] != orders[q - 1]:
-            _place(_functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, column, constant)
-        for d in range(3):
-            for k in range(m):
-                rows[r, d * m + k] += direction[q, d] * column[k]
-            low[r] -= direction[q, d] * constant[d]
-            high[r] -= direction[q, d] * constant[d]
-    _normalise(rows, low, high)
-    return rows, low, high
-
-
-@compiled
-def _constrain(whitened, constant, functional, direction, lower, upper):
-    """Rows of unit length: bounds on direction . (functional of x, y, z)."""
-    m = whitened.shape[1]
-    rows, low, high = np.zeros((len(functional), 3 * m)), lower.copy(), upper.copy()
-    for r in range(len(functional)):
-        q = functional[r]
-        for d in range(3):
-            if direction[r, d] != 0.0:
-                for k in range(m):
-                    rows[r, d * m + k] = direction[r, d] * whitened[q, k]
-                low[r] -= direction[r, d] * constant[q, d]
-                high[r] -= direction[r, d] * constant[q, d]
-    _normalise(rows, low, high)
-    return rows, low, high
-
-
-@compiled
-def _coefficients(durations, bubbles, unit, spread, centre, w):
+def _coefficients(durations, first, unit, spread, centre, w):
     m, n = spread.shape
     unknowns = np.empty((3, n))
     for d in range(3):
@@ -288,20 +243,19 @@ def _coefficients(durations, bubbles, unit, spread, centre, w):
             if w[d * m + i] != 0.0:
                 for q in range(n):
                     unknowns[d, q] += w[d * m + i] * spread[i, q]
-    first, _ = _first_bubbles(bubbles)
     out = np.zeros((len(durations), 3, DEGREE + 1))
     for i in range(len(durations)):
         scale = _scales(durations[i] / unit)
         for d in range(3):
             for k in range(FUNCTIONS if first[i] >= 0 else HERMITE):
-                share = scale[k] * unknowns[d, _index(i, k, first[i])]
+                share = scale[k] * unknowns[d, index(i, k, first[i])]
                 for c in range(DEGREE + 1):
                     out[i, d, c] += share * _POSITIONS[k, c]
     return out
 
 
-def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbles: np.ndarray, segments: np.ndarray,
-             places: np.ndarray, orders: np.ndarray, cost_order: int) -> ReducedProgram:
+def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbles: np.ndarray,
+             cost_order: int) -> ReducedProgram:
     """Eliminate the equalities and whiten the cost. [M:eq4-8]
 
     Args:
@@ -310,50 +264,14 @@ def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbl
         values: their values in W [m, m/s, ...], shape (f + 1, 4, 3); ignored where not given.
         bubbles: which segments have bubbles, bool, shape (f,). A segment that starts at a knot with everything given
             must have them: a bubble then serves the continuity of the fourth derivative.
-        segments, places, orders: functionals that constraints use: segment index, s in [0, 1], time derivative.
         cost_order: 4 minimises snap, 3 jerk.
 
     Raises:
         numpy.linalg.LinAlgError: the cost is not positive definite on what is left free.
     """
-    return ReducedProgram(*_assemble(durations, given, values, bubbles, segments, places, orders, GRAMS[cost_order],
-                                     cost_order))
+    return ReducedProgram(*assemble_kernel(durations, given, values, bubbles, GRAMS[cost_order], cost_order))
 
 
-def further_rows(program: ReducedProgram, durations: np.ndarray, bubbles: np.ndarray, owner: np.ndarray,
-                 segments: np.ndarray, places: np.ndarray, orders: np.ndarray, direction: np.ndarray, lower: np.ndarray,
-                 upper: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of bounds on sums of derivatives, for a program that is assembled already.
-
-    Args:
-        program, durations, bubbles: as assembled.
-        owner: row to which each term adds, shape (t,).
-        segments, places, orders, direction: the terms, direction of shape (t, 3).
-        lower, upper: bounds, shape (r,).
-
-    Returns:
-        rows (r, 3 size), lower (r,), upper (r,), scaled to unit length.
-    """
-    return _further(durations, bubbles, program.time_unit, program.spread, program.centre, owner, segments, places, orders,
-                    direction, lower, upper)
-
-
-def constraint_rows(program: ReducedProgram, functional: np.ndarray, direction: np.ndarray, lower: np.ndarray,
-                    upper: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows `lower <= direction . functional <= upper` in whitened coordinates, scaled to unit length.
-
-    Args:
-        program: the program whose functionals are meant.
-        functional: index of the functional of each row, shape (r,).
-        direction: direction in W of each row, shape (r, 3).
-        lower, upper: bounds in the functional's unit, infinite where there is none, shape (r,).
-
-    Returns:
-        rows (r, 3 size), lower (r,), upper (r,).
-    """
-    return _constrain(program.whitened, program.constant, functional, direction, lower, upper)
-
-
-def coefficients(program: ReducedProgram, durations: np.ndarray, bubbles: np.ndarray, w: np.ndarray) -> np.ndarray:
+def coefficients(program: ReducedProgram, w: np.ndarray) -> np.ndarray:
     """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]."""
-    return _coefficients(durations, bubbles, program.time_unit, program.spread, program.centre, w)
+    return _coefficients(*program, w)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from math import hypot
+from math import hypot, sqrt
+
+import numpy as np
 
 from perch_core.errors import PlanningRefusal
+from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.certificates import Certificate
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
@@ -34,9 +37,33 @@ class PerchRefusal(PlanningRefusal):
         super().__init__(code, constraint, margin, message)
 
 
-def _dot(a: list[float], b: list[float]) -> float:
-    """Scalar product; on three plain numbers numpy's costs ten times as much."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+@compiled
+def _figures(points, a, s3, extension, offset, moving):
+    """What is known of a plan from its start and its points.
+
+    Args:
+        points: start, waypoints and the surface's centre in W [m], shape (k, 3).
+        a: acceleration of the start [m/s^2].
+        s3: the surface's outward normal.
+        extension, offset: radius of the vehicle's disc, and distance of its centre from the surface at contact [m].
+        moving: the contact's place is not known.
+
+    Returns:
+        (specific thrust of the start [m/s^2], reach of the rim towards the surface at the start [m], heights [m] and
+        distances from the surface's plane [m], each of shape (k,) or, without the contact, (k - 1,)).
+    """
+    x, y, z = a[0], a[1], a[2] + GRAVITY
+    specific = sqrt(x * x + y * y + z * z)
+    lean = min(abs(x * s3[0] + y * s3[1] + z * s3[2]) / max(specific, 1e-9), 1.0)
+    last = len(points) - 1
+    heights, distances = np.empty(last + 1), np.zeros(last + 1)
+    for k in range(last + 1):
+        heights[k] = points[k, 2]
+        for d in range(3):
+            distances[k] += s3[d] * (points[k, d] - points[last, d])
+    heights[last] += offset * s3[2]
+    count = last if moving else last + 1
+    return specific, extension * sqrt(1.0 - lean * lean), heights[:count], distances
 
 
 def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
@@ -63,21 +90,18 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
                            f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N", limits=("thrust",))
     start, surface = problem.start, problem.surface
-    f = start.a.tolist()
-    f[2] += GRAVITY
-    specific = vehicle.mass * hypot(*f)
+    specific, rim, heights, distances = _figures(problem.points(), start.a, surface.normal, limits.extension,
+                                                 vehicle.perch_offset, bool(problem.target_velocity[2]))
+    specific *= vehicle.mass
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
                            f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N",
                            limits=("thrust",))
-    heights = {f"waypoint {k}": float(w.p[2]) for k, w in enumerate(problem.waypoints)}
-    heights["start"] = float(start.p[2])
-    if not problem.target_velocity[2]:
-        heights["contact"] = float(surface.p_WS[2] + vehicle.perch_offset * surface.R_WS[2, 2])
-    for name, height in heights.items():
+    for k, height in enumerate(heights.tolist()):
         margin = min(height - limits.height[0], limits.height[1] - height)
         if margin < 0.0:
+            name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[k]
             raise PerchRefusal(BOX, f"height of the {name}", margin,
                                f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m",
                                limits=("height",))
@@ -86,19 +110,14 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s",
                            limits=("speed",))
-    s3 = surface.normal.tolist()
-    plane = _dot(surface.p_WS.tolist(), s3)
-    lean = abs(_dot(f, s3)) * vehicle.mass / max(specific, 1e-9)
-    rim = limits.extension * max(1.0 - min(lean, 1.0) ** 2, 0.0) ** 0.5
-    distance = _dot(start.p.tolist(), s3) - plane
+    distance, *at_waypoints = distances[:-1].tolist()
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
                            f"the start is {distance:.3f} m in front of the surface's plane; the rim needs {rim:.3f} m",
                            limits=("clearance",))
-    if problem.target_velocity.any():
+    if any(problem.target_velocity.tolist()):
         return
-    for k, waypoint in enumerate(problem.waypoints):
-        distance = _dot(waypoint.p.tolist(), s3) - plane
+    for k, distance in enumerate(at_waypoints):
         if distance <= limits.clearance:
             raise PerchRefusal(BOX, f"clearance of waypoint {k} from the surface's plane", distance,
                                f"waypoint {k} is {-distance:.3f} m behind the surface's plane", limits=("clearance",))

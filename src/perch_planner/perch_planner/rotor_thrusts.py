@@ -145,7 +145,7 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        Fields of `segment_program.Bounds`: for each rotor and place one bound on a sum of acceleration, jerk and snap. Terms
+        Fields of `linear_bounds.Bounds`: for each rotor and place one bound on a sum of acceleration, jerk and snap. Terms
         of one derivative at one place stand together.
     """
     near, keep = _NEAR * (high - low), _KEEP * (high - low)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks
 from perch_planner.contact_constraints import Contact
 from perch_planner.cutting import limit_cuts, preventive_cuts, rotor_bounds, thrust_cuts, turning_side
+from perch_planner.linear_bounds import NONE
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.rotor_thrusts import rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, FORMULATIONS
@@ -26,8 +27,7 @@ _SEGMENT_STRETCH = 1.1  # of the paper's per-segment stretching
 _BISECTIONS = 12
 
 
-@dataclass(frozen=True, slots=True)
-class Attempt:
+class Attempt(NamedTuple):
     """One quadratic program on the way to a plan.
 
     Attributes:
@@ -42,8 +42,7 @@ class Attempt:
     cuts: int
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What a set of durations gave: a plan (`failure` empty) or why not, and how much longer to try."""
 
     coefficients: np.ndarray | None
@@ -65,9 +64,9 @@ class Search:
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, limits: Limits) -> None:
         self.problem, self.settings, self.vehicle, self.limits = problem, settings, vehicle, limits
-        self.low, self.high = (x / vehicle.mass for x in limits.thrust)
+        self.low, self.high = limits.thrust[0] / vehicle.mass, limits.thrust[1] / vehicle.mass
         self.contact = Contact(problem, settings, vehicle.perch_offset)
-        self.first = allocate(problem, settings, self.contact.p_contact)
+        self.first = allocate(problem, settings, self.contact.points)
         self.end_yaw = contact_heading(problem.surface)
         self.side, self.normal = turning_side(self.end_yaw), problem.surface.normal.copy()
         self.rotors = rotor_model(vehicle) if settings.rotors != "free" else None
@@ -86,24 +85,23 @@ class Search:
             patient: give up early where longer durations promise more than cuts.
         """
         settings, start = self.settings, self.problem.start
+        ahead = preventive_cuts(len(durations), self.high, self.side) if settings.cuts and len(durations) > 1 else NONE
         try:
-            program = FORMULATIONS[settings.formulation](self.contact, durations, settings)
+            program = FORMULATIONS[settings.formulation](self.contact, durations, settings, ahead)
         except np.linalg.LinAlgError:
             return Outcome(None, None, None, "solver")
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
-        best, count, turning = None, 0, False
-        if settings.cuts and len(durations) > 1:
-            program.add(preventive_cuts(len(durations), self.high, self.side))
+        best, count, turning, duration = None, 0, False, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= settings.iterations_max:
                 break
             coefficients, solution = program.solve()
             if not solution.solved:
-                self._note(durations, np.nan, np.nan, count)
+                self._note(duration, np.nan, np.nan, count)
                 break
             extrema, least, most = plan_checks.thrust_extrema(coefficients, durations, self.low, self.high)
-            self._note(durations, least, most, count)
+            self._note(duration, least, most, count)
             outcome = self._thrust(coefficients, extrema, least, most)
             if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
                 return outcome
@@ -129,7 +127,7 @@ class Search:
                 program.add(bounds)
                 count += len(bounds.lower)
         # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
-        return replace(best, stretch=_PLAIN_STRETCH) if best and count else best or Outcome(None, None, None)
+        return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or Outcome(None, None, None)
 
     def _thrust(self, coefficients: np.ndarray, extrema: np.ndarray, least: float, most: float) -> Outcome | None:
         """The failure of the thrust range, or None."""
@@ -174,9 +172,9 @@ class Search:
             return min(row[plan_checks.MINIMUM] - limits.height[0], limits.height[1] - row[plan_checks.MAXIMUM])
         return -float("inf")
 
-    def _note(self, durations: np.ndarray, least: float, most: float, cuts: int) -> None:
+    def _note(self, duration: float, least: float, most: float, cuts: int) -> None:
         mass = self.vehicle.mass
-        self.attempts.append(Attempt(float(durations.sum()), mass * least, mass * most, cuts))
+        self.attempts.append(Attempt(duration, mass * least, mass * most, cuts))
 
     def run(self) -> tuple[np.ndarray, Outcome]:
         """Lengthen until every limit is proved, or the time or the number of programs is used up."""

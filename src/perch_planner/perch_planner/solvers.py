@@ -8,7 +8,7 @@ violated rows when they were not scaled, hence the check.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ FEASIBILITY = 1e-6
 """Largest violation of a row of unit length that counts as solved."""
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
+class Solution(NamedTuple):
     """Answer of a solver.
 
     Attributes:
@@ -59,9 +58,8 @@ def _contains_zero(lower, upper):
 def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
     import daqp
 
-    n = rows.shape[1]
-    w, _, flag, _ = daqp.solve(_unit(n), np.zeros(n), rows, upper, lower, np.zeros(len(lower), np.int32),
-                               primal_tol=1e-9)
+    # Without a cost matrix and vector DAQP takes the unit matrix and zero.
+    w, _, flag, _ = daqp.solve(None, None, rows, upper, lower, np.zeros(len(lower), np.int32), primal_tol=1e-9)
     return np.asarray(w), "solved" if flag == 1 else f"exit flag {flag}"
 
 
@@ -92,13 +90,6 @@ _SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp, "piqp": _piqp}
 _MODULES = {"daqp": "daqp", "osqp": "osqp", "piqp": "piqp"}
 NAMES = tuple(_SOLVERS)
 _SOLVED = ("solved", "status.piqp_solved", "piqp_solved")
-_UNITS: dict[int, np.ndarray] = {}
-
-
-def _unit(n: int) -> np.ndarray:
-    if n not in _UNITS:
-        _UNITS[n] = np.eye(n)
-    return _UNITS[n]
 
 
 def available() -> tuple[str, ...]:

@@ -34,12 +34,14 @@ def _turn(points, legs, i):
 
 
 @compiled
-def _along_waypoints(points, extra, speed, acceleration, turn_acceleration):
-    """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns, `extra` longer.
+def _along_waypoints(points, v_start, v_end, speed, acceleration, turn_acceleration):
+    """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns, and longer by
+    the time that the difference of the end velocities takes.
 
     The speed at a waypoint is bounded by v^2 = A l / turn, with the shorter leg l and the change of direction there.
     """
     n = len(points) - 1
+    extra = _distance(v_end, v_start) / acceleration
     legs = np.empty(n)
     for i in range(n):
         legs[i] = max(_distance(points[i + 1], points[i]), 1e-6)
@@ -67,13 +69,13 @@ def _along_waypoints(points, extra, speed, acceleration, turn_acceleration):
     return out
 
 
-def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) -> np.ndarray:
+def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray) -> np.ndarray:
     """First durations: those of the problem, or a speed profile along the waypoints.
 
     Args:
         problem: start, waypoints, target velocity.
         settings: bounds on the last segment and the whole.
-        p_end: position at contact if the target stood still [m], shape (3,).
+        points: start, waypoints, and the contact if the target stood still [m], shape (waypoints + 2, 3).
 
     Returns:
         Durations [s], shape (len(waypoints) + 1,).
@@ -81,10 +83,8 @@ def allocate(problem: PerchProblem, settings: PerchSettings, p_end: np.ndarray) 
     if problem.segment_times is not None:
         durations = np.array(problem.segment_times)
     else:
-        points = np.array([problem.start.p, *(w.p for w in problem.waypoints), p_end])
-        closing = problem.target_velocity - problem.start.v
-        extra = sqrt(float(closing @ closing)) / CRUISE_ACCELERATION
-        durations = _along_waypoints(points, extra, CRUISE_SPEED, CRUISE_ACCELERATION, TURN_ACCELERATION)
+        durations = _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
+                                     TURN_ACCELERATION)
     return with_last_segment(durations, settings)
 
 
@@ -95,20 +95,27 @@ def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndar
     return durations
 
 
-def split_last(durations: np.ndarray) -> np.ndarray:
+@compiled
+def split_last(durations):
     """Divide a long last segment by knots at which nothing is given.
 
     One polynomial over a long way is too stiff for the rotation at its end: without the knot no plan keeps a 0.25 kg
     vehicle under 4.05 N above 105 degrees, with it every inclination is reached.
     """
-    last = durations[-1]
+    last, before = durations[-1], len(durations) - 1
     if last < 2.0 * FINAL_TIME:
-        return durations
+        return durations.copy()
     if last < 5.0 * FINAL_TIME:
-        return np.concatenate([durations[:-1], [last - FINAL_TIME, FINAL_TIME]])
-    run_up = last - 2.5 * FINAL_TIME
-    pieces = int(np.ceil(run_up / PIECE_MAX))
-    return np.concatenate([durations[:-1], pieces * [run_up / pieces], [1.5 * FINAL_TIME, FINAL_TIME]])
+        out = np.empty(before + 2)
+        out[before], out[before + 1] = last - FINAL_TIME, FINAL_TIME
+    else:
+        run_up = last - 2.5 * FINAL_TIME
+        pieces = int(np.ceil(run_up / PIECE_MAX))
+        out = np.empty(before + pieces + 2)
+        out[before:] = run_up / pieces
+        out[-2], out[-1] = 1.5 * FINAL_TIME, FINAL_TIME
+    out[:before] = durations[:before]
+    return out
 
 
 def lengthen_approach(durations: np.ndarray) -> np.ndarray:

@@ -17,6 +17,8 @@ from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner import reduced_qp
 from perch_planner.contact_constraints import Contact
 from perch_planner.problem import PerchProblem, PerchSettings
+from perch_planner.reduced_qp import ReducedProgram
+from perch_planner.reduced_rows import rows_of
 from perch_planner.segment_program import COST_ORDER
 
 SAMPLE = 0.01  # the thrust is bounded at every so many seconds, as the paper's dt [s]
@@ -55,11 +57,10 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
     contact = Contact(problem, settings, vehicle.perch_offset)
     linear = contact.constraints(durations)
     bubbles = contact.bubbles(durations, linear, settings.objective == "jerk" or settings.bubbles == "everywhere")
-    program = reduced_qp.assemble(durations, *contact.knots(durations), bubbles, linear.segments, linear.places, linear.orders,
-                                  COST_ORDER[settings.objective])
-    rows, lower, upper = reduced_qp.constraint_rows(program, linear.functional, linear.direction, linear.lower, linear.upper)
+    program = reduced_qp.assemble(durations, *contact.knots(durations), bubbles, COST_ORDER[settings.objective])
+    rows, lower, upper = rows_of(program, linear)
     n = rows.shape[1]
-    base, slopes = _acceleration_map(program, durations, bubbles, n)
+    base, slopes = _acceleration_map(program, n)
     limit = (thrust_max / vehicle.mass) ** 2
     both, right = np.vstack([rows, -rows]), np.concatenate([upper, -lower])
 
@@ -92,16 +93,16 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
         w, converged = np.zeros(n), False
     peak = float(np.sqrt(((base + slopes @ w) ** 2).sum(axis=1).max()) * vehicle.mass)
     converged = converged and peak <= thrust_max * 1.001 and float((both @ w - right).max()) < 1e-3
-    return NonlinearPlan(reduced_qp.coefficients(program, durations, bubbles, w), peak, perf_counter() - begin, converged)
+    return NonlinearPlan(reduced_qp.coefficients(program, w), peak, perf_counter() - begin, converged)
 
 
-def _acceleration_map(program, durations: np.ndarray, bubbles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _acceleration_map(program: ReducedProgram, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Specific force at the samples as base + slopes @ w: shapes (samples, 3), (samples, 3, n)."""
-    origin = reduced_qp.coefficients(program, durations, bubbles, np.zeros(n))
-    columns = [reduced_qp.coefficients(program, durations, bubbles, unit) - origin for unit in np.eye(n)]
-    base = _accelerations(origin, durations)
+    origin = reduced_qp.coefficients(program, np.zeros(n))
+    columns = [reduced_qp.coefficients(program, unit) - origin for unit in np.eye(n)]
+    base = _accelerations(origin, program.durations)
     base[:, 2] += GRAVITY
-    return base, np.stack([_accelerations(c, durations) for c in columns], axis=-1)
+    return base, np.stack([_accelerations(c, program.durations) for c in columns], axis=-1)
 
 
 def _accelerations(coefficients: np.ndarray, durations: np.ndarray) -> np.ndarray:

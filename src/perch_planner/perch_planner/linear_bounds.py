@@ -1,0 +1,34 @@
+"""Linear bounds on derivatives at single places of a plan: what every formulation of the program understands."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Bounds(NamedTuple):
+    """Linear bounds at single places of the plan: lower <= sum of direction . (order-th derivative) <= upper.
+
+    Terms of one derivative at one place that follow each other are computed once.
+
+    Attributes:
+        owner: bound to which each term adds, shape (t,).
+        segments, places, orders: where a term is taken, place in [0, 1] of the segment, and its time derivative, 0
+            position to 4 snap; each shape (t,).
+        direction: vector in W of each term, shape (t, 3).
+        lower, upper: bounds of the sums, infinite where there is none, shape (r,).
+    """
+
+    owner: np.ndarray
+    segments: np.ndarray
+    places: np.ndarray
+    orders: np.ndarray
+    direction: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+NONE = Bounds(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64), np.empty((0, 3)), np.empty(0),
+              np.empty(0))
+"""No bounds."""

@@ -1,0 +1,71 @@
+"""Linear bounds as rows of the reduced program. [M:eq8 in whitened coordinates]
+
+A functional phi of one segment, taken along a direction d, is the row d (x) (L^-1 Z' phi) of w, and its value at the
+unconstrained optimum moves to the bounds. Rows have unit length: solvers otherwise called violated ones solved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.jit import compiled
+from perch_planner.linear_bounds import Bounds
+from perch_planner.reduced_qp import ReducedProgram, functional, index
+from perch_planner.reference_element import FUNCTIONS, HERMITE
+
+
+@compiled
+def _place(local, segment, first, spread, centre, column, constant):
+    """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum."""
+    count = FUNCTIONS if first >= 0 else HERMITE
+    for d in range(3):
+        constant[d] = 0.0
+    for i in range(len(column)):
+        column[i] = 0.0
+    for k in range(count):
+        n = index(segment, k, first)
+        for d in range(3):
+            constant[d] += local[k] * centre[n, d]
+        for i in range(len(column)):
+            column[i] += local[k] * spread[i, n]
+
+
+@compiled
+def _normalise(rows, lower, upper):
+    """Scale rows and their bounds to unit length."""
+    for r in range(len(rows)):
+        squared = 0.0
+        for k in range(rows.shape[1]):
+            squared += rows[r, k] ** 2
+        norm = np.sqrt(squared)
+        if norm < 1e-300:
+            norm = 1.0
+        for k in range(rows.shape[1]):
+            rows[r, k] /= norm
+        lower[r] /= norm
+        upper[r] /= norm
+
+
+@compiled
+def rows_kernel(durations, first, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
+    """`rows_of` on the fields of its arguments."""
+    m = len(spread)
+    rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
+    column, constant = np.empty(m), np.empty(3)
+    for q in range(len(owner)):
+        i, r = segments[q], owner[q]
+        if q == 0 or i != segments[q - 1] or places[q] != places[q - 1] or orders[q] != orders[q - 1]:
+            _place(functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, column, constant)
+        for d in range(3):
+            if direction[q, d] != 0.0:
+                for k in range(m):
+                    rows[r, d * m + k] += direction[q, d] * column[k]
+                low[r] -= direction[q, d] * constant[d]
+                high[r] -= direction[q, d] * constant[d]
+    _normalise(rows, low, high)
+    return rows, low, high
+
+
+def rows_of(program: ReducedProgram, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,)."""
+    return rows_kernel(*program, *bounds)
