@@ -112,19 +112,44 @@ def _extrema(square, degree: int) -> tuple[float, float]:
 class _Segment:
     def __init__(self, duration: float, rows) -> None:
         self.duration = float(duration)
-        self._powers = np.array([_powers(row) for row in rows]).T
+        self._tables = [np.array([_powers(row) for row in rows]).T]  # powers of the derivatives up to the fourth
+        for order in range(1, 5):
+            self._tables.append(power.polyder(self._tables[0], order))
 
-    def at(self, s: np.ndarray, order: int) -> np.ndarray:
-        """Derivatives of x, y, z, yaw at s, shape (len(s), 4)."""
-        table = power.polyder(self._powers, order) if order else self._powers
-        return power.polyval(np.asarray(s, float), table).T / self.duration**order
+    def at(self, s: np.ndarray, order: int, outputs: slice = slice(0, 4)) -> np.ndarray:
+        """Derivatives of x, y, z, yaw, or of some of them, at s, shape (len(s), outputs)."""
+        return power.polyval(np.asarray(s, float), self._tables[order][:, outputs]).T / self.duration**order
+
+    def force(self, s: np.ndarray) -> np.ndarray:
+        """a + g e3 at s, shape (len(s), 3)."""
+        return self.at(s, 2, slice(0, 3)) + (0.0, 0.0, _G)
+
+    def yaw(self, s: np.ndarray) -> np.ndarray:
+        """Yaw at s, shape (len(s),)."""
+        return self.at(s, 0, slice(3, 4))[:, 0]
 
 
-def _rotations(f: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    b3 = f / np.linalg.norm(f, axis=1, keepdims=True)
-    b1 = np.cross(np.stack([-np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=1), b3)
-    b1 /= np.linalg.norm(b1, axis=1, keepdims=True)
-    return np.stack([b1, np.cross(b3, b1), b3], axis=2)
+def _length(v: np.ndarray) -> np.ndarray:
+    """Lengths of vectors, shape (n, 3) -> (n, 1)."""
+    return np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2 + v[:, 2] ** 2)[:, None]
+
+
+def _rotations(f: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Body axes b1, b2, b3, each of shape (n, 3)."""
+    b3 = f / _length(f)
+    c, s = np.cos(yaw), np.sin(yaw)
+    b1 = np.stack([c * b3[:, 2], s * b3[:, 2], -s * b3[:, 1] - c * b3[:, 0]], axis=1)  # (-s, c, 0) x b3
+    b1 /= _length(b1)
+    return b1, np.cross(b3, b1), b3
+
+
+def _turn(before: tuple, after: tuple) -> np.ndarray:
+    """Axis times sine of the angle of the rotation between two attitudes, in the body frame, shape (n, 3)."""
+    def dot(i: int, k: int) -> np.ndarray:
+        a, b = before[i], after[k]
+        return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+    return 0.5 * np.stack([dot(2, 1) - dot(1, 2), dot(0, 2) - dot(2, 0), dot(1, 0) - dot(0, 1)], axis=1)
 
 
 def verify(durations, segments, need: Requirements, step: float = 1e-4, tolerance: float = 1e-9) -> list[Finding]:
@@ -199,10 +224,7 @@ def _check_tube(pieces, begins, need: Requirements, contact: np.ndarray, at_most
 
 def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most) -> None:
     """Extrema of polynomials, from roots."""
-    def force(s):
-        return np.linalg.norm(piece.at(s, 2)[:, :3] + (0.0, 0.0, _G), axis=1) ** 2
-
-    low, high = _extrema(force, 26)
+    low, high = _extrema(lambda s: np.linalg.norm(piece.force(s), axis=1) ** 2, 26)
     at_most("thrust, greatest [M:eq16]", need.mass * max(high, 0.0) ** 0.5, need.thrust[1], begin, 1e-9)
     at_most("thrust, least [M:eq16]", need.thrust[0], need.mass * max(low, 0.0) ** 0.5, begin, 1e-9)
     _, high = _extrema(lambda s: np.linalg.norm(piece.at(s, 1)[:, :3], axis=1) ** 2, 28)
@@ -217,26 +239,23 @@ def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float,
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = (np.arange(count) + 0.5) / count
     h = 0.25 / count
-    before, after = (piece.at(s + sign * h, 2)[:, :3] + (0.0, 0.0, _G) for sign in (-1.0, 1.0))
-    turn = np.einsum("nji,njk->nik", _rotations(before, piece.at(s - h, 0)[:, 3]), _rotations(after, piece.at(s + h, 0)[:, 3]))
-    sine = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
-    rate = np.arcsin(np.clip(np.linalg.norm(sine, axis=1), 0.0, 1.0)) / (2.0 * h * piece.duration)
+    before, after = (_rotations(piece.force(at), piece.yaw(at)) for at in (s - h, s + h))
+    rate = np.arcsin(np.clip(_length(_turn(before, after))[:, 0], 0.0, 1.0)) / (2.0 * h * piece.duration)
     worst = int(rate.argmax())
     at_most("body rate [M:eq13]", float(rate[worst]), need.body_rate, begin + s[worst] * piece.duration, 1e-4 * need.body_rate)
-    f = piece.at(s, 2)[:, :3] + (0.0, 0.0, _G)
+    f = piece.force(s)
     times = begin + s * piece.duration
-    distance = (piece.at(s, 0)[:, :3] - need.p_S - times[:, None] * need.v_S) @ need.s3
-    sine = np.linalg.norm(np.cross(f, need.s3), axis=1) / np.linalg.norm(f, axis=1)
+    distance = (piece.at(s, 0, slice(0, 3)) - need.p_S - times[:, None] * need.v_S) @ need.s3
+    sine = (_length(np.cross(f, need.s3)) / _length(f))[:, 0]
     gap = distance - need.extension * sine
     worst = int(gap.argmin())
     at_most("clearance", 0.0, float(gap[worst]), float(times[worst]), 1e-9)
 
 
-def _turn_rates(before: np.ndarray, after: np.ndarray, step: float) -> np.ndarray:
+def _turn_rates(before: tuple, after: tuple, step: float) -> np.ndarray:
     """Body rates between rotations `step` seconds apart, shape (n, 3)."""
-    turn = np.einsum("nji,njk->nik", before, after)
-    sine = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
-    size = np.linalg.norm(sine, axis=1, keepdims=True)
+    sine = _turn(before, after)
+    size = _length(sine)
     return sine * np.where(size < 1e-9, 1.0, np.arcsin(np.clip(size, 0.0, 1.0)) / np.maximum(size, 1e-300)) / step
 
 
@@ -245,8 +264,8 @@ def _check_rotors(piece: _Segment, begin: float, need: Requirements, step: float
     rotors, h = need.rotors, _TURN / piece.duration
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = h + (np.arange(count) + 0.5) / count * (1.0 - 2.0 * h)
-    force = [piece.at(s + k * h, 2)[:, :3] + (0.0, 0.0, _G) for k in (-1.0, 0.0, 1.0)]
-    R = [_rotations(f, piece.at(s + k * h, 0)[:, 3]) for f, k in zip(force, (-1.0, 0.0, 1.0))]
+    force = [piece.force(s + k * h) for k in (-1.0, 0.0, 1.0)]
+    R = [_rotations(f, piece.yaw(s + k * h)) for f, k in zip(force, (-1.0, 0.0, 1.0))]
     first, second = _turn_rates(R[0], R[1], _TURN), _turn_rates(R[1], R[2], _TURN)
     rate, acceleration = 0.5 * (first + second), (second - first) / _TURN
     moment = rotors.inertia * acceleration + np.cross(rate, rotors.inertia * rate)
