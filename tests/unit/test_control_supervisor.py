@@ -270,3 +270,22 @@ def test_near_the_wire_the_plans_own_recovery_is_the_way_out():
     loop.run(0.1)
     loop.controller.command(Command.HOVER, "cancelled")
     assert loop.controller.state is State.TRACKING and "planned recovery in 0.3" in loop.controller.maneuvers.message
+
+
+def test_a_recovery_from_the_present_state_takes_the_place_of_the_appended_one():
+    loop, start = leaving(recovery_start=0.5)
+    ready(loop, start, start + 0.2)
+    ready(loop, start, start + 0.5)
+    loop.run(0.35)
+    assert loop.controller.maneuvers.order.start == start, "nobody aborts: the plan is flown to the wire"
+    loop.run(0.1)
+    assert loop.controller.maneuvers.order.start == pytest.approx(start + 0.5)
+    loop.run(1.5)
+    assert loop.controller.state is State.HOVERING
+
+
+def test_without_one_the_appended_recovery_is_flown():
+    loop, start = leaving(recovery_start=0.5)
+    ready(loop, start, start + 0.2)
+    loop.run(0.6)
+    assert loop.controller.maneuvers.order.start == start

@@ -19,6 +19,7 @@ START, LENGTH = 10.0, 2.5
 GOAL = Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.array([5.0, 0.0, 4.75]), replan=True)
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 SETTINGS = MissionSettings()
+AT_REST = State(np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
 
 
 def states(duration: float) -> SampledTrajectory:
@@ -44,10 +45,10 @@ def answer(start: float, length: float, success: bool = True) -> PlanAnswer:
 
 def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near():
     plan, time, starts = running(), START - 0.03, []
-    while time < plan.end:
-        query = plan.query(time, None, GOAL)
+    while time < plan.end - SETTINGS.way_out_until:
+        query = plan.query(time, AT_REST, None, GOAL)
         if query is not None:
-            assert query.recovery and plan.query(time, None, GOAL) is None, "one query at a time"
+            assert query.recovery and plan.query(time, AT_REST, None, GOAL) is None, "one query at a time"
             np.testing.assert_allclose(query.state.p, [2.0 * (query.start_time - START), 0.0, 4.0], atol=1e-9)
             np.testing.assert_allclose(query.state.w, [0.0, 1.5, 0.0])
             np.testing.assert_allclose(query.state.rotor_thrust, [1.0, 2.0, 3.0, 4.0])
@@ -61,9 +62,30 @@ def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near
     assert len(starts) >= 4 and gaps.max() < 0.65, "an abort finds one within the time that the controller flies on"
 
 
+def test_the_last_way_out_leaves_the_wire_from_where_the_vehicle_is_beside_the_newest_map():
+    plan, newest, time, asked = running(), target(12.0, x=5.06, sigma=0.05), START + LENGTH - 0.36, []
+    beside, turn = np.array([0.03, 0.0, -0.05]), so3.quat_exp([0.0, 0.2, 0.0])
+    while time < plan.end + 0.3:
+        planned = plan.state(time)
+        present = State(planned.p + beside, so3.quat_multiply(turn, planned.q), planned.v + [0.1, 0.0, 0.0], planned.w)
+        query = plan.query(time, present, newest, GOAL)
+        if query is not None:
+            asked.append(query)
+            time += query.latency
+            assert plan.answered(answer(query.start_time, 1.0), time)[0] is not None
+        time += 0.02
+    (query,) = asked
+    assert query.recovery and query.start_time == pytest.approx(plan.end, abs=0.021) and query.target is newest
+    at_wire = plan.state(query.start_time)
+    np.testing.assert_allclose(query.state.p, at_wire.p + beside, atol=1e-9)
+    np.testing.assert_allclose(query.state.v, at_wire.v + [0.1, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(query.state.q, so3.quat_multiply(turn, at_wire.q), atol=1e-9)
+    np.testing.assert_allclose(query.state.rotor_thrust, at_wire.rotor_thrust)
+
+
 def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
     plan = running()
-    query = plan.query(START + 0.1, target(10.0, x=5.26), GOAL)
+    query = plan.query(START + 0.1, AT_REST, target(10.0, x=5.26), GOAL)
     assert not query.recovery and query.target.p_WS[0] == 5.26
     np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.end).p + [0.26, 0.0, 0.0], atol=1e-9)
     ready, better = plan.answered(answer(query.start_time, plan.end - query.start_time + 0.05), START + 0.3)
@@ -74,21 +96,21 @@ def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
 @pytest.mark.parametrize("length, success", [(4.0, True), (1.0, False)])
 def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
     plan = running()
-    query = plan.query(START + 0.1, target(10.0, x=5.26), GOAL)
+    query = plan.query(START + 0.1, AT_REST, target(10.0, x=5.26), GOAL)
     assert plan.answered(answer(query.start_time, length, success), START + 0.3) == (None, None)
-    assert plan.query(START + 0.32, None, GOAL).recovery, "the next thing is asked"
+    assert plan.query(START + 0.32, AT_REST, None, GOAL).recovery, "the next thing is asked"
 
 
 @pytest.mark.parametrize("time, x, goal", [
     (START + 0.1, 5.1, GOAL), (START + LENGTH - 0.6, 5.26, GOAL),
     (START + 0.1, 5.26, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
 def test_no_new_perch_for_centimetres_nor_at_the_end_nor_unasked(time, x, goal):
-    query = running().query(time, target(10.0, x=x), goal)
+    query = running().query(time, AT_REST, target(10.0, x=x), goal)
     assert query is None or query.recovery
 
 
 def test_a_target_known_worse_than_the_planned_one_is_not_followed():
-    query = running().query(START + 0.1, target(10.0, x=5.26, sigma=0.03), GOAL)
+    query = running().query(START + 0.1, AT_REST, target(10.0, x=5.26, sigma=0.03), GOAL)
     assert query.recovery
     assert running().moved(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL) is None
 
@@ -96,7 +118,7 @@ def test_a_target_known_worse_than_the_planned_one_is_not_followed():
 @pytest.mark.parametrize("time", [START + 0.1, START + LENGTH - 0.4])
 def test_the_plan_moves_with_the_wire(time):
     plan = running()
-    way_out = plan.query(time, None, GOAL)
+    way_out = plan.query(time, AT_REST, None, GOAL)
     following = plan.moved(time, target(10.0, x=5.03), GOAL)
     assert following.end == pytest.approx(plan.end) and following.target.p_WS[0] == 5.03
     assert time - 0.02 < following.plan.start_time <= time, "the rest of it"
@@ -125,7 +147,7 @@ def test_a_plan_that_was_moved_is_published_from_its_states():
 
 def test_an_answer_that_comes_too_late_is_not_used():
     plan = running()
-    query = plan.query(START + 0.1, None, GOAL)
+    query = plan.query(START + 0.1, AT_REST, None, GOAL)
     assert plan.answered(answer(query.start_time, 1.0), query.start_time + 0.01) == (None, None)
 
 

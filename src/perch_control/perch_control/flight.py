@@ -226,7 +226,7 @@ class FlightController:
                 m.stay(verdict.reason)
         if m.blind is not None:
             return self._descend()
-        self._schedule.activate()
+        self._schedule.activate(self.law)
         if m.flying:
             self._thrust.judge(self.law, self.compensator)
             self.supervisor.act(self.margin)

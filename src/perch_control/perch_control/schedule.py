@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from perch_control.admission import Order, check_joints
+from perch_control.admission import AtEnd, Order, check_joints
 from perch_control.guidance import blended
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import State
+
+_EARLY = 0.01  # stamps that are nearer than this are the same [s]
 
 
 class Schedule:
@@ -57,10 +59,11 @@ class Schedule:
         m.message = f"{reason}; planned recovery in {start - m.now:.2f} s"
         return True
 
-    def activate(self) -> None:
-        """Start the pending trajectory when its time has come."""
+    def activate(self, law: Any) -> None:
+        """Start the pending trajectory when its time has come, or the recovery that was planned for this vehicle at the wire."""
         m = self._maneuvers
         if self._pending is None:
+            self._leave_the_wire(law)
             return
         order, source = self._pending
         if m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
@@ -71,3 +74,16 @@ class Schedule:
             begin = m.now - order.start
             end = order.recovery_start if order.recovery_start > begin else source.duration  # the wire is met there
             m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, begin, end))
+
+    def _leave_the_wire(self, law: Any) -> None:
+        """Where the appended recovery is due, take the one that is kept ready for then: it begins where the vehicle is by now.
+
+        Nothing is blended: the reference comes to the vehicle, and the way from there is clear of the wire.
+        """
+        m, order = self._maneuvers, self._maneuvers.order
+        if m.state is not State.TRACKING or order.at_end is not AtEnd.RECOVER or order.recovery_start < 0.0:
+            return
+        own = order.start + order.recovery_start
+        way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= m.now), None)
+        if way is not None:
+            m.track(way, law.prepare(way.source, False))

@@ -170,6 +170,8 @@ class MissionMachine:
             self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
         elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"no adhesion: {inputs.controller_message}")
+        elif self._goal.mode is Mode.POWERLINE and inputs.time <= end + self.settings.contact_time:
+            self._look_ahead(inputs, outputs)
         elif inputs.time > end + self.settings.contact_time + 0.2:
             if self._goal.mode is Mode.SURFACE:  # a powerline plan goes on into its recovery by itself
                 outputs.commands.append((Command.HOVER, "no adhesion"))
@@ -287,7 +289,7 @@ class MissionMachine:
         if moved is not None and outputs.perch is None and outputs.way_out is None:
             self._running, self.target, self._perch = moved, moved.target, moved.plan
             outputs.perch, outputs.trajectory_id = moved.plan, self._perch_id
-        outputs.query = self._running.query(inputs.time, target, self._goal)
+        outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
 
     def _fly(self, plan: PlanAnswer, outputs: Outputs) -> None:
         self._perch, self._perch_id = plan, self._new_id()

@@ -4,6 +4,8 @@ A plan rests on a map that was made from metres away, by an odometry that has dr
 and the map gets better: the plan as it is moves with the wire, as long as the wire is seen. A wire that turns out to be
 somewhere else gets a new plan from the running one's own state, so that nothing jumps.
 Between these, recoveries are planned from states that lie ahead, one after the other: an abort at any time finds one ready.
+The last of them leaves the wire itself, from where the vehicle then is beside the newest map: one that missed the wire is not
+where the plan's own recovery begins.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import math
 
 import numpy as np
 
+from perch_core import so3
 from perch_core.trajectory import StateSample
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, Target
+from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, State, Target
 
+_TICK = 0.02      # the mission's period [s]
 _DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
 
 
@@ -33,6 +37,7 @@ class RunningPlan:
         self.plan, self.target, self.covered = plan, target, plan.start_time
         self._settings, self._replanned_at = settings, replanned_at
         self._asked: PlanQuery | None = None
+        self._leaving = False  # the way out from the wire has been asked for
 
     @property
     def end(self) -> float:
@@ -43,11 +48,12 @@ class RunningPlan:
         """The plan's state at a time [s]."""
         return self.plan.sampled.sample(time - self.plan.start_time)
 
-    def query(self, time: float, target: Target | None, goal: Goal) -> PlanQuery | None:
+    def query(self, time: float, present: State, target: Target | None, goal: Goal) -> PlanQuery | None:
         """What to ask now, if anything.
 
         Args:
             time: of the tick [s].
+            present: estimated state of the vehicle.
             target: as mapped now, when it is certain enough to plan on.
             goal: what was asked of the mission.
         """
@@ -56,10 +62,15 @@ class RunningPlan:
         s, start = self._settings, time + self._settings.ahead_latency + _DECISION
         if goal.replan and target is not None and self._better(target, time, start):
             self._replanned_at = time
-            return self._ask(start, target, goal, perch_pose=self._perch_pose(target))
+            return self._ask(start, self.state(start), target, goal, perch_pose=self._perch_pose(target))
         start = max(start, self.covered + s.way_out_spacing)
         if start < self.end - s.way_out_until:
-            return self._ask(start, self.target, goal, recovery=True)
+            return self._ask(start, self.state(start), self.target, goal, recovery=True)
+        soonest = time + s.ahead_latency + _DECISION
+        if not self._leaving and self.end - _TICK < soonest < self.end + s.contact_time:
+            self._leaving = True
+            start = max(soonest, self.end)
+            return self._ask(start, self._continued(time, present, start), self.target if target is None else target, goal, recovery=True)
         return None
 
     def answered(self, plan: PlanAnswer, time: float) -> tuple[PlanAnswer | None, RunningPlan | None]:
@@ -106,6 +117,7 @@ class RunningPlan:
         plan = dataclasses.replace(self.plan, trajectory=None, sampled=rest, start_time=rest.start_time, duration=self.end - rest.start_time)
         following = RunningPlan(plan, target, s, self._replanned_at)
         following.covered, following._asked = self.covered, self._asked  # ways out stay: centimetres do not matter there
+        following._leaving = self._leaving
         return following
 
     def _seen_better(self, target: Target) -> bool:
@@ -122,9 +134,15 @@ class RunningPlan:
         end = self.state(self.end)
         return end.p + target.p_WS - self.target.p_WS, end.q
 
-    def _ask(self, start: float, target: Target, goal: Goal, recovery: bool = False,
+    def _continued(self, time: float, present: State, later: float) -> StateSample:
+        """The vehicle's state at a later time [s]: the plan's, and beside it by as much as at present."""
+        now, then = self.state(time), self.state(later)
+        turned = so3.quat_multiply(present.q_WB, so3.quat_conjugate(now.q))
+        return dataclasses.replace(then, p=then.p + present.p_WB - now.p, v=then.v + present.v_WB - now.v, q=so3.quat_multiply(turned, then.q))
+
+    def _ask(self, start: float, x: StateSample, target: Target, goal: Goal, recovery: bool = False,
              perch_pose: tuple[np.ndarray, np.ndarray] | None = None) -> PlanQuery:
-        x, zero = self.state(start), np.zeros(3)
+        zero = np.zeros(3)
         self._asked = PlanQuery(start, x.p, x.v, zero, zero, 0.0, target, goal, latency=self._settings.ahead_latency,
                                 state=x, recovery=recovery, perch_pose=perch_pose)
         return self._asked
