@@ -32,16 +32,17 @@ def test_a_process_with_other_work_is_left_alone():
 
 
 GIVE_WAY = """
-import os, threading
-from perch_core.ros.priority import NICE, Priority, thread_gives_way
+import os
+from perch_core.processes import NICE, give_way
+from perch_core.ros.priority import Priority
 nice = lambda task: os.getpriority(os.PRIO_PROCESS, task)
 before = nice(os.getpid())
 Priority().give_way()
 assert nice(os.getpid()) == before, 'a process with other work is left alone'
-drawing = threading.Thread(target=lambda: (thread_gives_way(), found.append(nice(threading.get_native_id()))))
-found = []
-drawing.start(); drawing.join()
-assert (found, nice(os.getpid())) == ([NICE], before)
+if os.fork() == 0:
+    give_way()
+    os._exit(nice(os.getpid()) != NICE)
+assert os.wait()[1] == 0 and nice(os.getpid()) == before
 own = Priority(); own.own_process = True
 own.give_way()
 assert nice(os.getpid()) == NICE

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+import os
+import signal
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.scenario import Wind, load_scenario
 from perch_sim import seeding
+from perch_sim.drawing import Drawing, DrawnInProcesses, DrawnOnThreads
 from perch_sim.simulation import SECOND, Simulation
 from perch_sim.vio_model import VioModel, VioModelParameters
 
@@ -30,8 +33,8 @@ def climb(flight: Simulation) -> np.ndarray:
 def fly(seconds: float, seed: int, render: tuple[str, ...] = (), threads: int = 1) -> tuple[str, str, Simulation]:
     """Digests of all states and samples, and of all images with their times."""
     flown, seen = hashlib.sha256(), hashlib.sha256()
-    with ThreadPoolExecutor(threads) as pool:
-        flight = Simulation(SCENARIO, seed, render, pool)
+    with ThreadPoolExecutor(threads) as executor:
+        flight = Simulation(SCENARIO, seed, DrawnOnThreads(SCENARIO, seed, render, executor))
         while flight.time < (1 + seconds) * SECOND:
             flight.motors.command(flight.time, True, climb(flight))
             output = flight.advance()
@@ -108,16 +111,49 @@ def test_vio_stand_in_has_its_documented_drift_and_noise():
     np.testing.assert_allclose(np.std(tilt, axis=0)[:2], params.attitude_noise, rtol=0.15)
 
 
-class Stuck(Executor):
-    """A pool that never gets anything done."""
+def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_only():
+    drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
+    try:
+        assert images(drawing) == images(DrawnOnThreads(SCENARIO, 3, ("front",), ThreadPoolExecutor(1)))
+        (process,) = drawing.processes
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        flight = Simulation(SCENARIO, 3, drawing)
+        camera, frames = flight.cameras["front"], 0
+        while frames < 2:
+            flight.advance()
+            delivery = camera.due(flight.time)
+            if delivery is not None and (delivery.image is None or delivery.image.done()):
+                assert delivery.image is None and camera.broken
+                frames += 1
+                camera.take()
+        assert camera.dropped == 2
+    finally:
+        drawing.close()
 
-    def submit(self, *_):
+
+def images(drawing: Drawing, count: int = 3) -> list[bytes]:
+    """The first images of a vehicle on the floor."""
+    flight, out = Simulation(SCENARIO, 3, drawing), []
+    while len(out) < count:
+        flight.advance()
+        if flight.cameras["front"].due(flight.time) is not None:
+            out.append(flight.cameras["front"].take().image.result().tobytes())
+    return out
+
+
+class Stuck:
+    """Never gets an image done."""
+
+    cameras = ("front",)
+
+    def draw(self, *_):
         return Future()
 
 
 @pytest.mark.parametrize("limit, given_up", [(None, 0), (2, 3)])
 def test_a_slow_machine_gives_up_images_in_real_time_and_none_in_lockstep(limit, given_up):
-    flight = Simulation(load_scenario("surface_90"), seed=1, render=("front",), pool=Stuck())
+    flight = Simulation(load_scenario("surface_90"), seed=1, drawing=Stuck())
     camera = flight.cameras["front"]
     camera.most_waiting = limit
     while flight.time < SECOND + 5 * SECOND // 30:  # five exposures

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
 from perch_core import so3
 from perch_core.camera import CameraMount
+from perch_core.scenario import Scenario
+from perch_sim import seeding
 
 # One sigma of a careful calibration of a unit of this size.
 FOCAL_ERROR = 0.003                # of each focal length [-]
 CENTRE_ERROR = 0.5                 # of the principal point [px]
 ATTITUDE_ERROR = np.radians(0.5)   # of the mounting attitude, all axes together [rad]
 TIME_ERROR = 0.002                 # of the stamp offset [s]
+
+
+def true_mounts(scenario: Scenario, mounts: Mapping[str, CameraMount], seed: int) -> dict[str, CameraMount]:
+    """The cameras of a flight as they really are; those of an ideal scenario are as calibrated."""
+    if scenario.realism != "default":
+        return dict(mounts)
+    return {name: true_mount(mount, seeding.stream(seed, f"calibration_{name}")) for name, mount in mounts.items()}
 
 
 def true_mount(mount: CameraMount, rng: np.random.Generator) -> CameraMount:

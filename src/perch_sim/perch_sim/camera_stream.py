@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from concurrent.futures import Executor, Future
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,6 @@ import numpy as np
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_sim.camera_timing import CameraTiming, Frame
-from perch_sim.rendering import Renderer
 from perch_sim.state_history import StateHistory
 
 POSES = 5  # of the body, spread over an exposure
@@ -25,31 +25,32 @@ class Delivery(NamedTuple):
 
 
 class CameraStream:
-    """The frames of one camera in order. Drawing runs on a pool and overlaps with the flight.
+    """The frames of one camera in order. They are drawn elsewhere while the flight goes on.
 
     Attributes:
         most_waiting: a frame that begins while so many of this camera are still being drawn goes without its image; None: every
             image is drawn, however long it takes.
         dropped: images that were given up.
+        broken: whoever draws the images has ended; the frames come without them.
     """
 
-    def __init__(self, mount: CameraMount, timing: CameraTiming, renderer: Renderer | None, pool: Executor | None,
+    def __init__(self, mount: CameraMount, timing: CameraTiming, draw: Callable[..., Future[np.ndarray]] | None,
                  noise: np.random.Generator, target_velocity: np.ndarray, start: int) -> None:
         """
         Args:
             mount: the camera as calibrated, for CameraInfo.
             timing: its frames.
-            renderer: of the true camera; None: the frames keep their times, but no images are drawn.
-            pool: where images are drawn.
+            draw: begins an image, `Drawing.draw` of this camera; None: the frames keep their times, but no images are drawn.
             noise: the sensor's own stream; each frame gets a child, so that frames can be drawn in any order.
             target_velocity: of the pad in W [m/s], (3,).
             start: time at which the pad is where the scene has it [ns].
         """
         self.mount = mount
-        self._timing, self._renderer, self._pool, self._noise = timing, renderer, pool, noise
+        self._timing, self._begin, self._noise = timing, draw, noise
         self._velocity, self._start = target_velocity, start
         self.most_waiting: int | None = None
         self.dropped = 0
+        self.broken = False
         self._next = timing.next()
         self._coming: deque[Delivery] = deque()
 
@@ -58,15 +59,22 @@ class CameraStream:
         while self._next.end <= time:
             frame, self._next = self._next, self._timing.next()
             image = None
-            if self._renderer is not None and self._overloaded():
+            if self._begin is not None and self._overloaded():
                 self.dropped += 1
-            elif self._renderer is not None:
+            elif self._begin is not None:
                 image = self._draw(frame, history)
             self._coming.append(Delivery(frame, image))
 
     def due(self, time: int) -> Delivery | None:
         """The oldest frame, if it has arrived by `time` [ns]; it stays until `take`."""
-        return self._coming[0] if self._coming and self._coming[0].frame.arrival <= time else None
+        if not self._coming or self._coming[0].frame.arrival > time:
+            return None
+        frame, image = self._coming[0]
+        if image is not None and image.done() and isinstance(image.exception(), BrokenExecutor):
+            self._coming[0] = Delivery(frame, None)
+            self.dropped += 1
+            self.broken = True
+        return self._coming[0]
 
     def take(self) -> Delivery:
         """Remove the oldest frame."""
@@ -81,4 +89,4 @@ class CameraStream:
         states = [history.at(int(t)) for t in instants]
         poses = [(s.p_WB, so3.quat_to_matrix(s.q_WB)) for s in states]
         shift = self._velocity * (frame.middle - self._start) * 1e-9
-        return self._pool.submit(self._renderer.render, poses, self._noise.spawn(1)[0], shift)
+        return self._begin(poses, self._noise.spawn(1)[0], shift)

@@ -24,4 +24,3 @@ class VehicleParameters:
     start_timeout: float = quantity(60.0, unit="s", above=0.0, high=3600.0,
                                     doc="wall-clock time after which a participant that never came is dropped")
     cameras: str = choice("all", options=tuple(CAMERAS), doc="cameras that take images; none: for fast runs")
-    render_threads: int = quantity(2, low=1, high=8, doc="images drawn at once")

@@ -11,8 +11,8 @@ real time; tests and studies can drive it with any controller in a loop:
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
-from typing import Collection, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,15 +22,15 @@ from perch_core.surface import PerchSurface
 from perch_core.timing import CONTROL_PERIOD_NS
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_sim import seeding
-from perch_sim.calibration import true_mount
+from perch_sim.calibration import true_mounts
 from perch_sim.camera_stream import CameraStream
 from perch_sim.camera_timing import CameraTiming
 from perch_sim.contact_event import ContactEvent
+from perch_sim.drawing import Drawing
 from perch_sim.imu import Imu, ImuSample
 from perch_sim.motors import Motors
 from perch_sim.obstacles import pad_surface
 from perch_sim.plant import SUBSTEPS, Plant
-from perch_sim.rendering import Renderer, build_scene
 from perch_sim.rendering.sensor import control_exposure
 from perch_sim.state_history import StateHistory, TrueState
 
@@ -52,14 +52,13 @@ class Output(NamedTuple):
 class Simulation:
     """A vehicle in flight. `time` [ns] is the IMU's clock."""
 
-    def __init__(self, scenario: Scenario, seed: int, render: Collection[str] = (), pool: Executor | None = None,
+    def __init__(self, scenario: Scenario, seed: int, drawing: Drawing | None = None,
                  motor_timeout: int = MOTOR_TIMEOUT) -> None:
         """
         Args:
             scenario: what is flown.
             seed: of everything that is random.
-            render: names of the cameras that take images, by `pool`; the others keep only their times.
-            pool: where images are drawn.
+            drawing: of the cameras that take images; the others keep only their times.
             motor_timeout: armed motors stop without a command for so long [ns].
 
         Raises:
@@ -75,19 +74,15 @@ class Simulation:
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
-        self.cameras = self._make_cameras(seed, render, pool)
+        self.cameras = self._make_cameras(seed, drawing)
 
-    def _make_cameras(self, seed: int, render: Collection[str], pool: Executor | None) -> dict[str, CameraStream]:
-        scene = build_scene(self.scenario, seed) if render else None
-        cameras = {}
-        for name, mount in self.vehicle.mounts.items():
-            true = mount
-            if self.scenario.realism == "default":
-                true = true_mount(mount, seeding.stream(seed, f"calibration_{name}"))
+    def _make_cameras(self, seed: int, drawing: Drawing | None) -> dict[str, CameraStream]:
+        cameras, mounts = {}, self.vehicle.mounts
+        for name, true in true_mounts(self.scenario, mounts, seed).items():
             exposure = control_exposure(true, self.scenario.world.light).time
             timing = CameraTiming(true, exposure, START, seeding.stream(seed, f"timing_{name}"))
-            renderer = Renderer(scene, true, seed) if name in render else None
-            cameras[name] = CameraStream(mount, timing, renderer, pool, seeding.stream(seed, f"noise_{name}"),
+            draw = partial(drawing.draw, name) if drawing is not None and name in drawing.cameras else None
+            cameras[name] = CameraStream(mounts[name], timing, draw, seeding.stream(seed, f"noise_{name}"),
                                          np.array(self.scenario.target.velocity), START)
         return cameras
 

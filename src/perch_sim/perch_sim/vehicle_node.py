@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -17,11 +15,12 @@ from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds
 from perch_core.ros.node import PerchNode, spin_main
-from perch_core.ros.priority import priority, thread_gives_way
+from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
 from perch_core.scenario import load_scenario
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS, TICK_STEPS
 from perch_sim.camera_stream import Delivery
+from perch_sim.drawing import DrawnInProcesses
 from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.motors import MotorCommandError
 from perch_sim.pacing import Pacing
@@ -33,7 +32,6 @@ from perch_sim.ros.vehicle_topics import VehicleTopics
 
 MOST_WAITING = 2        # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
-SWITCH_INTERVAL = 2e-4  # the drawing threads give way to a step sooner than Python's 5 ms [s]
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
 
 
@@ -43,16 +41,14 @@ class VehicleNode(PerchNode[VehicleParameters]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("vehicle", VehicleParameters, **kwargs)
         cv2.setNumThreads(1)
-        sys.setswitchinterval(SWITCH_INTERVAL)
         params = self.params
         try:
             scenario = load_scenario(params.scenario)
             names = tuple(name for name in params.participants if name)
             slow = triggers(names, scenario.latency)
-            self._pool = ThreadPoolExecutor(params.render_threads, "render", thread_gives_way)
-            self._simulation = Simulation(
-                scenario, params.seed, CAMERAS[params.cameras], self._pool,
-                MOTOR_TIMEOUT if params.lockstep else REAL_TIME_MOTOR_TIMEOUT)
+            self._drawing = DrawnInProcesses(scenario, params.seed, CAMERAS[params.cameras])
+            self._simulation = Simulation(scenario, params.seed, self._drawing,
+                                          MOTOR_TIMEOUT if params.lockstep else REAL_TIME_MOTOR_TIMEOUT)
         except ConfigError:
             self.destroy_node()
             raise
@@ -173,6 +169,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
             delivery = camera.due(stamp)
             if delivery is None:
                 continue
+            if camera.broken:
+                self.get_logger().error(f"camera_{name}: the process that draws its images has ended: no images any more", once=True)
             if delivery.image is not None and not delivery.image.done():
                 if id(delivery.image) not in self._asked:
                     self._asked.add(id(delivery.image))
@@ -182,7 +180,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         return frames
 
     def _wake(self, image: Any) -> None:
-        """On a drawing thread: go on in the executor's."""
+        """On a thread of the drawing's: go on in the executor's."""
         self._asked.discard(id(image))
         executor = self.executor
         if executor is not None:
@@ -272,8 +270,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self.publish_diagnostics(self._simulation.time * 1e-9, values, level, message)
 
     def close(self) -> None:
-        """Stop the drawing threads."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """End the drawing processes."""
+        self._drawing.close()
 
 
 def create(**kwargs: Any) -> VehicleNode:

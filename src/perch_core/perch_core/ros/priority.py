@@ -6,8 +6,9 @@ import os
 import threading
 from contextlib import suppress
 
+from perch_core.processes import NICE
+
 PRIORITY = 10  # of SCHED_FIFO: above everything ordinary, below the kernel's own threads
-NICE = 10      # of work that has time
 
 
 class Priority:
@@ -45,11 +46,6 @@ class Priority:
 def _tasks() -> set[int]:
     """Threads of this process by number; one of them may have ended when its number is used."""
     return {int(name) for name in os.listdir("/proc/self/task")}
-
-
-def thread_gives_way() -> None:
-    """The same for the calling thread alone: one that draws while the flight goes on."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
 
 
 priority = Priority()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -13,11 +12,11 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from perch_core.errors import PerchError
+from perch_core.processes import end_with_parent
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.results import RunResult
 
 ATTEMPTS = 3  # a run whose worker died so often is given up
-_PR_SET_PDEATHSIG = 1
 
 
 def prepare_worker() -> None:
@@ -26,8 +25,7 @@ def prepare_worker() -> None:
         os.environ[f"{name}_NUM_THREADS"] = "1"
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # an exception, so that nodes are stopped on the way out
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent(signal.SIGTERM)
 
 
 def dead(task: Task, why: str) -> RunResult:

@@ -39,8 +39,9 @@ from perch_perception.vio_node import VioNodeConfig
 from perch_planner.perching_planner_node import PerchingPlannerParameters
 from perch_planner.powerline_planner_node import PowerlinePlannerParameters
 from perch_sim import seeding
-from perch_sim.calibration import true_mount
+from perch_sim.calibration import true_mounts
 from perch_sim.camera_stream import Delivery
+from perch_sim.drawing import DrawnOnThreads
 from perch_sim.participants import triggers
 from perch_sim.simulation import Output, Simulation
 from perch_sim.state_history import StateHistory
@@ -77,7 +78,7 @@ class _Flight:
             raise PerchError(f"scenario {scenario.name}: powerlines have no error model; sensing.target must be rendered")
         params = NodeParameters(scenario, seed)
         self.scenario = scenario
-        self.simulation = Simulation(scenario, seed, sensing.cameras, pool)
+        self.simulation = Simulation(scenario, seed, DrawnOnThreads(scenario, seed, sensing.cameras, pool) if pool else None)
         vehicle = self.simulation.vehicle
         self.latency = {t.node: round(t.latency * 1e9)
                         for t in triggers(("vio", "target_localizer", "powerline_mapper", "mission"), scenario.latency)}
@@ -205,7 +206,7 @@ def _target_source(scenario: Scenario, seed: int, sensing: Sensing, localizer: T
     board = load_board(localizer.board)
     if sensing.target == "rendered":
         return TargetSource(RenderedSight(board, front, localizer), front, localizer)
-    true = true_mount(front, seeding.stream(seed, "calibration_front")) if scenario.realism == "default" else front
+    true = true_mounts(scenario, {"front": front}, seed)["front"]
     return TargetSource(ModelledSight(board, front, true, localizer, seeding.stream(seed, "tag_corners")), front, localizer)
 
 

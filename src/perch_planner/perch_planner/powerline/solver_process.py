@@ -6,7 +6,6 @@ milliseconds where a new Python with CasADi takes seconds. Run by `worker.Powerl
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
 import signal
@@ -16,18 +15,10 @@ from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
 from perch_core.errors import PlanningRefusal
+from perch_core.processes import end_with_parent
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.worker import Job, Refusal, Setup
-
-_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
-
-
-def _die_with_parent() -> None:
-    try:
-        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
-    except (OSError, AttributeError):  # not Linux: the closed pipe ends the process instead
-        pass
 
 
 def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> Any:
@@ -41,7 +32,7 @@ def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> Any:
 
 def _child(planner: PowerlinePlanner, pipe: Connection) -> None:
     """Solve requests until the pipe closes."""
-    _die_with_parent()
+    end_with_parent(signal.SIGKILL)
     while True:
         try:
             request = pipe.recv()
