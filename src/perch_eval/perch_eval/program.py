@@ -62,6 +62,9 @@ class Ending:
 class RunningProgram:
     """A started program. It dies with the process (strictly: the thread) that started it.
 
+    It gets a process group of its own, so that Ctrl-C does not reach it from the terminal, but stays in the session: Linux
+    shares processors between sessions first (autogroups), and in one of its own its niceness would mean nothing to others.
+
     Args:
         program: what to start.
         log: file for everything it writes.
@@ -76,7 +79,7 @@ class RunningProgram:
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._process = subprocess.Popen(
-            [*_die_with_parent(), *program.command], env=dict(environment), start_new_session=True,
+            [*_die_with_parent(), *program.command], env=dict(environment), process_group=0,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
         self._reader = threading.Thread(target=self._read, name=f"log {program.name}", daemon=True)
         self._reader.start()

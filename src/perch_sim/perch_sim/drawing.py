@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from multiprocessing.process import BaseProcess
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from perch_core.camera import CameraMount
@@ -74,8 +75,10 @@ class DrawnInProcesses:
         scene, mounts = build_scene(scenario, seed), true_mounts(scenario, load_vehicle(scenario.vehicle).mounts, seed)
         spawn = multiprocessing.get_context("spawn")
         self._executors = {name: ProcessPoolExecutor(1, spawn, _begin, (scene, mounts[name], seed)) for name in cameras}
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: Ctrl-C is the vehicle's own matter
         for executor in self._executors.values():
             executor.submit(_ready)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> Future:
         """As `Drawing.draw`; the future fails with BrokenExecutor when the camera's process has ended."""
@@ -104,9 +107,9 @@ _renderer: Renderer  # of a drawing process
 
 def _begin(scene: Scene, mount: CameraMount, seed: int) -> None:
     global _renderer
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the vehicle's own matter
     end_with_parent(signal.SIGTERM)
     give_way()
+    cv2.setNumThreads(1)
     _renderer = Renderer(scene, mount, seed)
 
 

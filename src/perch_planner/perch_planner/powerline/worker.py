@@ -88,7 +88,7 @@ class PowerlineWorker:
         self._ready = False
         mine, theirs = Pipe()
         command = [*self._command, str(theirs.fileno())]
-        self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)
+        self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), process_group=0)
         theirs.close()
         self._pipe: Connection = mine
         self._pipe.send(self._setup)
@@ -167,7 +167,7 @@ class PowerlineWorker:
         """End the processes. A plan that another thread waits for is refused."""
         if self._process.poll() is None:
             try:
-                os.killpg(self._process.pid, signal.SIGKILL)  # its own session: supervisor and child
+                os.killpg(self._process.pid, signal.SIGKILL)  # its own group: supervisor and child
             except ProcessLookupError:
                 pass
         self._process.wait()
