@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import os
 from contextlib import suppress
 
-NICE = 10  # of work that has time
 _PR_SET_PDEATHSIG = 1
 
 
@@ -14,8 +12,3 @@ def end_with_parent(signal_number: int) -> None:
     """Have the operating system send this process a signal when the one that started it ends, however it ends (Linux)."""
     with suppress(OSError, AttributeError):  # elsewhere a process ends with its pipes
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal_number))
-
-
-def give_way() -> None:
-    """Let others go first from now on."""
-    os.setpriority(os.PRIO_PROCESS, 0, NICE)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Future
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_sim.camera_timing import CameraTiming, Frame
+from perch_sim.drawing import ImageToCome
 from perch_sim.state_history import StateHistory
 
 POSES = 5  # of the body, spread over an exposure
@@ -21,7 +21,7 @@ class Delivery(NamedTuple):
     """A frame on its way; `image` is None where the camera takes no images."""
 
     frame: Frame
-    image: Future[np.ndarray] | None
+    image: ImageToCome | None
 
 
 class CameraStream:
@@ -34,7 +34,7 @@ class CameraStream:
         broken: whoever draws the images has ended; the frames come without them.
     """
 
-    def __init__(self, mount: CameraMount, timing: CameraTiming, draw: Callable[..., Future[np.ndarray]] | None,
+    def __init__(self, mount: CameraMount, timing: CameraTiming, draw: Callable[..., ImageToCome] | None,
                  noise: np.random.Generator, target_velocity: np.ndarray, start: int) -> None:
         """
         Args:
@@ -65,12 +65,12 @@ class CameraStream:
                 image = self._draw(frame, history)
             self._coming.append(Delivery(frame, image))
 
-    def due(self, time: int) -> Delivery | None:
-        """The oldest frame, if it has arrived by `time` [ns]; it stays until `take`."""
+    def due(self, time: int, wait: float = 0.0) -> Delivery | None:
+        """The oldest frame, if it has arrived by `time` [ns]; it stays until `take`. Waits for its image up to `wait` [s]."""
         if not self._coming or self._coming[0].frame.arrival > time:
             return None
         frame, image = self._coming[0]
-        if image is not None and image.done() and isinstance(image.exception(), BrokenExecutor):
+        if image is not None and image.done(wait) and image.result() is None:
             self._coming[0] = Delivery(frame, None)
             self.dropped += 1
             self.broken = True
@@ -84,7 +84,7 @@ class CameraStream:
         waiting = sum(d.image is not None and not d.image.done() for d in self._coming)
         return self.most_waiting is not None and waiting >= self.most_waiting
 
-    def _draw(self, frame: Frame, history: StateHistory) -> Future[np.ndarray]:
+    def _draw(self, frame: Frame, history: StateHistory) -> ImageToCome:
         instants = np.linspace(frame.start, frame.end, POSES)
         states = [history.at(int(t)) for t in instants]
         poses = [(s.p_WB, so3.quat_to_matrix(s.q_WB)) for s in states]

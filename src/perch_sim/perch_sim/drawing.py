@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import fcntl
 import multiprocessing
 import signal
+from collections import deque
 from collections.abc import Collection, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from multiprocessing.process import BaseProcess
+from concurrent.futures import Executor, Future
+from concurrent.futures import wait as wait_for
+from contextlib import suppress
+from multiprocessing.connection import Connection
 from typing import Protocol
 
 import cv2
 import numpy as np
 
 from perch_core.camera import CameraMount
-from perch_core.processes import end_with_parent, give_way
+from perch_core.processes import end_with_parent
 from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
+
+PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [B]
+
+
+class ImageToCome(Protocol):
+    """An image that is being drawn."""
+
+    def done(self, timeout: float = 0.0) -> bool:
+        """Whether it is there; waits for it up to `timeout` [s]."""
+
+    def result(self) -> np.ndarray | None:
+        """The image, uint8, as `Renderer.render`; None: whoever draws has ended."""
 
 
 class Drawing(Protocol):
@@ -25,8 +41,8 @@ class Drawing(Protocol):
 
     cameras: tuple[str, ...]
 
-    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> Future:
-        """The image to come of one exposure: `Renderer.render` of that camera."""
+    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+        """Begin the image of one exposure: `Renderer.render` of that camera."""
 
 
 class DrawnOnThreads:
@@ -44,24 +60,34 @@ class DrawnOnThreads:
             ConfigError: the scenario's vehicle or board does not exist.
         """
         self.cameras = tuple(cameras)
-        scene, mounts = build_scene(scenario, seed), true_mounts(scenario, load_vehicle(scenario.vehicle).mounts, seed)
-        self._renderers = {name: Renderer(scene, mounts[name], seed) for name in cameras}
+        self._renderers = {name: Renderer(scene, mount, seed) for name, scene, mount in _seen(scenario, seed, cameras)}
         self._executor = executor
 
-    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> Future:
+    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
         """As `Drawing.draw`."""
-        return self._executor.submit(self._renderers[camera].render, poses, rng, target_shift)
+        return _Submitted(self._executor.submit(self._renderers[camera].render, poses, rng, target_shift))
+
+
+class _Submitted:
+    def __init__(self, future: Future[np.ndarray]) -> None:
+        self._future = future
+
+    def done(self, timeout: float = 0.0) -> bool:
+        return bool(wait_for((self._future,), timeout).done)
+
+    def result(self) -> np.ndarray:
+        return self._future.result()
 
 
 class DrawnInProcesses:
     """Images drawn by one process per camera.
 
-    A thread beside the loop of a node asks for the interpreter's lock some fifty times per image, and waits each time until
-    the loop lets go of it: an image took 30 ms instead of 10, and the loop lost time as well.
+    A thread beside the loop of a node asks for the interpreter's lock some fifty times per image and waits each time until the
+    loop lets go of it: an image took 30 ms instead of 10, and the loop lost time as well.
     """
 
     def __init__(self, scenario: Scenario, seed: int, cameras: Collection[str]) -> None:
-        """Start the processes; they build their scenes while the caller goes on.
+        """Start the processes; they draw their textures while the caller goes on.
 
         Args:
             scenario: what is seen.
@@ -72,50 +98,100 @@ class DrawnInProcesses:
             ConfigError: the scenario's vehicle or board does not exist.
         """
         self.cameras = tuple(cameras)
-        scene, mounts = build_scene(scenario, seed), true_mounts(scenario, load_vehicle(scenario.vehicle).mounts, seed)
-        spawn = multiprocessing.get_context("spawn")
-        self._executors = {name: ProcessPoolExecutor(1, spawn, _begin, (scene, mounts[name], seed)) for name in cameras}
+        seen = _seen(scenario, seed, cameras)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: Ctrl-C is the vehicle's own matter
-        for executor in self._executors.values():
-            executor.submit(_ready)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> Future:
-        """As `Drawing.draw`; the future fails with BrokenExecutor when the camera's process has ended."""
         try:
-            return self._executors[camera].submit(_draw, poses, rng, target_shift)
-        except BrokenExecutor as error:
-            failed: Future = Future()
-            failed.set_exception(error)
-            return failed
+            self._draftsmen = {name: _Draftsman(scene, mount, seed) for name, scene, mount in seen}
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+        """As `Drawing.draw`."""
+        return self._draftsmen[camera].draw(poses, rng, target_shift)
 
     @property
-    def processes(self) -> list[BaseProcess]:
-        """One per camera, until it has ended."""
-        return [process for executor in self._executors.values() for process in (executor._processes or {}).values()]
+    def process_ids(self) -> dict[str, int]:
+        """Of each camera's process."""
+        return {name: draftsman.process.pid for name, draftsman in self._draftsmen.items()}
 
     def close(self) -> None:
         """End the processes."""
-        for process in self.processes:
-            process.terminate()
-        for executor in self._executors.values():
-            executor.shutdown(wait=False, cancel_futures=True)
+        for draftsman in self._draftsmen.values():
+            draftsman.process.terminate()
 
 
-_renderer: Renderer  # of a drawing process
+class _Draftsman:
+    """This side of a process that draws the images of one camera, in the order in which they are asked for."""
+
+    def __init__(self, scene: Scene, mount: CameraMount, seed: int) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        orders, self._orders = spawn.Pipe(duplex=False)
+        self._images, images = spawn.Pipe(duplex=False)
+        with suppress(OSError, AttributeError):  # not Linux, or a smaller limit
+            fcntl.fcntl(images.fileno(), fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+        self.process = spawn.Process(target=_draw_until_closed, args=(orders, images, scene, mount, seed), daemon=True)
+        self.process.start()
+        orders.close(), images.close()  # so that the end of the process is the end of the pipe
+        self._shape = (mount.camera.height, mount.camera.width, 3)[:3 if mount.colour else 2]
+        self._ordered: deque[_Ordered] = deque()
+        self._ended = False
+
+    def draw(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+        image = _Ordered(self)
+        self._ordered.append(image)
+        try:
+            self._orders.send((poses, rng, target_shift))
+        except OSError:
+            self._end()
+        return image
+
+    def receive(self, timeout: float) -> bool:
+        """Take the next image, if it comes in time."""
+        try:
+            if self._ended or not self._images.poll(timeout):
+                return False
+            data = self._images.recv_bytes()
+        except (EOFError, OSError):
+            self._end()
+            return False
+        self._ordered.popleft().complete(np.frombuffer(data, np.uint8).reshape(self._shape))
+        return True
+
+    def _end(self) -> None:
+        self._ended = True
+        while self._ordered:
+            self._ordered.popleft().complete(None)
 
 
-def _begin(scene: Scene, mount: CameraMount, seed: int) -> None:
-    global _renderer
+class _Ordered:
+    def __init__(self, draftsman: _Draftsman) -> None:
+        self._draftsman, self._complete, self._image = draftsman, False, None
+
+    def complete(self, image: np.ndarray | None) -> None:
+        self._complete, self._image = True, image
+
+    def done(self, timeout: float = 0.0) -> bool:
+        while not self._complete and self._draftsman.receive(timeout):
+            pass
+        return self._complete
+
+    def result(self) -> np.ndarray | None:
+        while not self._complete:
+            self._draftsman.receive(1.0)
+        return self._image
+
+
+def _draw_until_closed(orders: Connection, images: Connection, scene: Scene, mount: CameraMount, seed: int) -> None:
     end_with_parent(signal.SIGTERM)
-    give_way()
     cv2.setNumThreads(1)
-    _renderer = Renderer(scene, mount, seed)
+    renderer = Renderer(scene, mount, seed)
+    with suppress(EOFError, BrokenPipeError):
+        while True:
+            images.send_bytes(renderer.render(*orders.recv()).ravel())
 
 
-def _ready() -> None:
-    pass
-
-
-def _draw(poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> np.ndarray:
-    return _renderer.render(poses, rng, target_shift)
+def _seen(scenario: Scenario, seed: int, cameras: Collection[str]) -> list[tuple[str, Scene, CameraMount]]:
+    """What each camera looks at, and the camera as it really is."""
+    scene = build_scene(scenario, seed)
+    mounts = true_mounts(scenario, load_vehicle(scenario.vehicle).mounts, seed)
+    return [(name, scene, mounts[name]) for name in cameras]

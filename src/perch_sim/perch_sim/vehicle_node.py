@@ -31,6 +31,7 @@ from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 from perch_sim.ros.vehicle_topics import VehicleTopics
 
 MOST_WAITING = 2        # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
+DRAWING_WAIT = 0.02      # for an image without which nobody can go on; then the next look after the flight [s]
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
 
@@ -58,7 +59,6 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._released: dict[str, int] = {}    # since the last tick
         self._output: Output | None = None     # of the step that is to be published next
         self._index = 0
-        self._asked: set[int] = set()          # images whose end of drawing will wake the node
         self._times = PhaseTimes()
         self._last_command = 0
         self._published = 0.0                  # when the present step was, wall clock [s]
@@ -166,25 +166,15 @@ class VehicleNode(PerchNode[VehicleParameters]):
         """Frames that arrive at this step; None while one of them is still being drawn."""
         frames = []
         for name, camera in self._simulation.cameras.items():
-            delivery = camera.due(stamp)
+            delivery = camera.due(stamp, DRAWING_WAIT)
             if delivery is None:
                 continue
             if camera.broken:
                 self.get_logger().error(f"camera_{name}: the process that draws its images has ended: no images any more", once=True)
             if delivery.image is not None and not delivery.image.done():
-                if id(delivery.image) not in self._asked:
-                    self._asked.add(id(delivery.image))
-                    delivery.image.add_done_callback(self._wake)
                 return None
             frames.append((name, delivery))
         return frames
-
-    def _wake(self, image: Any) -> None:
-        """On a thread of the drawing's: go on in the executor's."""
-        self._asked.discard(id(image))
-        executor = self.executor
-        if executor is not None:
-            executor.create_task(self._advance)
 
     # -- real time ---------------------------------------------------------------------------------------------------
 

@@ -6,9 +6,8 @@ import os
 import threading
 from contextlib import suppress
 
-from perch_core.processes import NICE
-
 PRIORITY = 10  # of SCHED_FIFO: above everything ordinary, below the kernel's own threads
+NICE = 10      # of work that has time
 
 
 class Priority:
