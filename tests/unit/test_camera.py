@@ -84,11 +84,11 @@ def test_points_behind_the_camera_are_never_projected(camera):
 def test_wide_lens_stops_before_its_polynomial_turns_over():
     lens = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, SNAPDRAGON.coefficients, angle_limit=math.pi)
     theta = np.linspace(0.0, math.pi, 100_001)
-    turning = theta[np.argmax(np.diff(lens.radius(theta)) < 0)]
+    turning = theta[np.argmax(np.diff([lens.radius(t) for t in theta]) < 0)]
     assert math.pi / 2 < lens.max_angle < turning
     beyond = np.array([[math.sin(turning + 0.05), 0.0, math.cos(turning + 0.05)]])
     assert not lens.project(beyond)[1].any()
-    assert np.isnan(lens.unproject([[320.0 + 275.0 * (lens.radius(np.array(turning)) + 0.01), 240.0]])).all()
+    assert np.isnan(lens.unproject([[320.0 + 275.0 * (lens.radius(turning) + 0.01), 240.0]])).all()
 
 
 def test_published_lens_sees_133_degrees_across_and_over_160_along_the_diagonal():

@@ -12,9 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from perch_core import lens as kernels
 from perch_core.errors import ConfigError
-
-NEWTON_STEPS = 8  # from theta = r the residual is below 1e-12 rad after 5 for any lens without a fold
 
 
 @dataclass(frozen=True)
@@ -145,26 +144,14 @@ class EquidistantCamera(_Camera):
         # a hair before the turning point itself, where the inverse has no slope
         return min([self.angle_limit, *(0.995 * t for t in turning)])
 
-    def radius(self, theta: np.ndarray) -> np.ndarray:
-        """theta_d, the radius in the normalised image plane of rays at the angle theta [rad]."""
-        k1, k2, k3, k4 = self.coefficients
-        t = theta * theta
-        return theta * (1.0 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
+    @cached_property
+    def lens(self) -> tuple[float, ...]:
+        """As the kernels of `perch_core.lens` take it."""
+        return tuple(float(x) for x in (self.fx, self.fy, self.cx, self.cy, *self.coefficients, self.max_angle))
 
-    def radius_slope(self, theta: np.ndarray) -> np.ndarray:
-        """d theta_d / d theta."""
-        k1, k2, k3, k4 = self.coefficients
-        t = theta * theta
-        return 1.0 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
-
-    def angle(self, radius: np.ndarray) -> np.ndarray:
-        """The inverse of `radius` by Newton's method; NaN beyond `max_angle`."""
-        radius = np.asarray(radius, dtype=float)
-        theta = np.minimum(radius, self.max_angle)
-        for _ in range(NEWTON_STEPS):
-            theta = theta - (self.radius(theta) - radius) / self.radius_slope(theta)
-            theta = np.clip(theta, 0.0, self.max_angle)
-        return np.where(radius <= self.radius(np.array(self.max_angle)) + 1e-12, theta, np.nan)
+    def radius(self, theta: float) -> float:
+        """theta_d, the radius in the normalised image plane of a ray at the angle theta [rad]."""
+        return kernels.radius(self.lens, float(theta))
 
     def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels of points in C.
@@ -176,47 +163,30 @@ class EquidistantCamera(_Camera):
             Pixels (..., 2), NaN where the point lies beyond `max_angle` (or in the optical centre), and a
             mask (...) that says so. A valid pixel may lie outside the image: see `contains`.
         """
-        points_C = np.asarray(points_C, dtype=float)
-        rho, theta, valid = self._polar(points_C)
-        on_axis = rho < 1e-12
-        scale = np.where(on_axis, 1.0 / np.where(valid & on_axis, points_C[..., 2], 1.0),
-                         self.radius(theta) / np.where(on_axis, 1.0, rho))
-        return self._to_pixels(points_C[..., :2] * scale[..., None], valid)
+        points, shape = _rows(points_C, 3)
+        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
+        kernels.project(self.lens, points, pixels, valid)
+        return pixels.reshape(*shape, 2), valid.reshape(shape)
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
         """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
-        plane = self._to_plane(pixels)
-        radius = np.linalg.norm(plane, axis=-1)
-        theta = self.angle(radius)
-        scale = np.where(radius > 1e-12, np.sin(theta) / np.maximum(radius, 1e-12), 1.0)
-        return np.concatenate([plane * scale[..., None], np.cos(theta)[..., None]], axis=-1)
+        rows, shape = _rows(pixels, 2)
+        rays_C = np.empty((len(rows), 3))
+        kernels.unproject(self.lens, rows, rays_C)
+        return rays_C.reshape(*shape, 3)
 
     def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
-        """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid.
+        """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
+        points, shape = _rows(points_C, 3)
+        jacobian = np.empty((len(points), 2, 3))
+        kernels.project_jacobian(self.lens, points, jacobian)
+        return jacobian.reshape(*shape, 2, 3)
 
-        With e = (x, y)/rho: d(theta_d e) = (theta_d/rho)(I - e e^T) d(x, y) + e theta_d' d theta, and
-        d theta = (z d rho - rho dz) / (rho^2 + z^2).
-        """
-        points_C = np.asarray(points_C, dtype=float)
-        rho, theta, valid = self._polar(points_C)
-        z = np.where(valid, points_C[..., 2], np.nan)
-        on_axis = rho < 1e-9
-        safe_rho = np.where(on_axis, 1.0, rho)
-        e = np.where(on_axis[..., None], (1.0, 0.0), points_C[..., :2] / safe_rho[..., None])
-        across = np.where(on_axis, 1.0 / np.where(on_axis, z, 1.0), self.radius(theta) / safe_rho)
-        range2 = rho**2 + z**2
-        along = self.radius_slope(theta) * z / range2
-        outer = e[..., :, None] * e[..., None, :]
-        plane = across[..., None, None] * (np.eye(2) - outer) + along[..., None, None] * outer
-        depth = -(self.radius_slope(theta) * rho / range2)[..., None] * e
-        jacobian = np.concatenate([plane, depth[..., None]], axis=-1)
-        return jacobian * np.array([[self.fx], [self.fy]])
 
-    def _polar(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rho = np.hypot(points_C[..., 0], points_C[..., 1])
-        theta = np.arctan2(rho, points_C[..., 2])
-        valid = (theta <= self.max_angle) & (rho + np.abs(points_C[..., 2]) > 1e-9)
-        return rho, theta, valid
+def _rows(array: np.ndarray, width: int) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Vectors of any leading shape one below the other, and that shape."""
+    array = np.asarray(array, dtype=float)
+    return np.ascontiguousarray(array).reshape(-1, width), array.shape[:-1]
 
 
 Camera = PinholeCamera | EquidistantCamera

@@ -18,7 +18,6 @@ from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, observe, residuals
 from perch_perception.vio.config import VioConfig
-from perch_perception.vio.lens import project
 from perch_perception.vio.msckf import FrameReport, Msckf
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.result import FrameOutcome, VioPoseEstimate, VioResult
@@ -259,7 +258,7 @@ def _compile(camera: Camera) -> None:
     rays = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -0.8]])
     centres = np.array([[0.0, 0.0, 1.0], [0.75, 0.0, 1.0]])
     X = triangulate(centres, rays, 0.1, 0.01)
-    seen = observe(camera, project(camera, np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]))[0])
+    seen = observe(camera, camera.project(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]))[0])
     linear = residuals(np.broadcast_to(np.eye(3), (2, 3, 3)), centres, np.array([X, X]), np.eye(3), np.zeros(3), seen, 0.0)
     ekf.eliminate(linear.J[:, :, :POINT.start].reshape(4, -1), linear.J[:, :, POINT].reshape(4, 3), linear.r.ravel())
 

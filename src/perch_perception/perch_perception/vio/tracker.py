@@ -17,7 +17,6 @@ from perch_core.camera import Camera
 
 from perch_perception.vio.bearing import observe
 from perch_perception.vio.config import TrackerConfig
-from perch_perception.vio.lens import project
 
 _DRAWS = 24
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
@@ -96,7 +95,7 @@ class Tracker:
 
     def _follow(self, image: np.ndarray, R_now_before: np.ndarray) -> float:
         c, rays = self.config, observe(self.camera, self._pixels).b_C @ R_now_before.T
-        guess, valid = project(self.camera, rays)
+        guess, valid = self.camera.project(rays)
         # what has left the view would be searched for longest
         kept = valid & self.camera.contains(guess, -c.window)
         before, ids, rays, guess = self._pixels[kept], self._ids[kept], rays[kept], guess[kept].astype(np.float32)
