@@ -7,6 +7,7 @@ The plan is a list of `{"name": ..., "module": ..., "arguments": [ROS arguments]
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import sys
@@ -62,6 +63,8 @@ def main() -> None:
     nodes: list[Node] = []
     try:
         nodes = create_nodes(plan)
+        gc.collect()
+        gc.freeze()  # as in spin_main
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)

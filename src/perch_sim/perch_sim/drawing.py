@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import multiprocessing
+import os
 import signal
 from collections import deque
 from collections.abc import Collection, Sequence
@@ -23,6 +24,7 @@ from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
 
+NICE = 5             # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
 PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [B]
 
 
@@ -183,6 +185,7 @@ class _Ordered:
 
 def _draw_until_closed(orders: Connection, images: Connection, scene: Scene, mount: CameraMount, seed: int) -> None:
     end_with_parent(signal.SIGTERM)
+    os.setpriority(os.PRIO_PROCESS, 0, NICE)
     cv2.setNumThreads(1)
     renderer = Renderer(scene, mount, seed)
     with suppress(EOFError, BrokenPipeError):

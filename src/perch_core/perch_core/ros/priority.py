@@ -15,7 +15,7 @@ class Priority:
 
     Without it a busy program beside the nodes takes its fair share of the cores in slices of several milliseconds, longer than
     a control period. The thread of the callbacks and those of rclpy and the middleware are raised; threads of Python, which
-    draw, compile and solve, stay ordinary, and threads and processes that come later do not inherit it.
+    compile and solve, stay ordinary, and threads and processes that come later do not inherit it.
     """
 
     def __init__(self) -> None:
