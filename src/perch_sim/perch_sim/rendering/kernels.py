@@ -1,7 +1,7 @@
 """The renderer's inner loops over cells and samples, compiled.
 
 In numpy each arithmetic operation is a pass over all samples of all cells; compiled, a sample is finished in registers, and
-without the interpreter lock, so that the drawing threads do not hold up the node's steps. The functions in numpy serve
+without the interpreter lock, so that drawing threads (in process) do not hold each other up. The functions in numpy serve
 where numba does not, and tell in tests whether the kernels are right.
 """
 
