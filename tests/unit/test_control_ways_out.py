@@ -12,10 +12,12 @@ from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
 from perch_control.settings import GeometricGains
+from perch_core.scenario import load_scenario
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.comparison import fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, FaultyFlight, fly_fault
+from perch_eval.control_flights.way_out import search
 
 
 def repeat_last(loop):
@@ -120,3 +122,14 @@ def test_l1_cuts_the_error_under_wind_and_mass():
     """Issue 6: by >= 60 %."""
     plain, adaptive = (np.linalg.norm(fly(c, "wind 5 m/s, mass +20 %", "line", 1).rmse) for c in ("geometric", "geometric + L1"))
     assert adaptive < 0.4 * plain
+
+
+@pytest.mark.parametrize("w, saved", [((9.6, 14.8, 5.8), False), ((1.0, -1.0, 0.5), True)])
+def test_the_search_for_a_way_out_knows_hopeless_from_harmless(w, saved):
+    """A blow on the floor: 18 rad/s tip a vehicle onto its rotors before they turn up, 1.4 rad/s do not."""
+    flight = FaultyFlight(load_scenario("surface_90"), 1)
+    plant, x = flight.simulation.plant, flight.simulation.state
+    plant.place(x.p_WB, x.q_WB, x.v_WB, np.array(w), np.full(4, plant.body.speed_min))
+    found = search(plant)
+    assert (found.survived > 0) is saved and (saved or found.turn_deg < 10.0)
+    assert np.allclose(flight.simulation.state.w_WB_B, w), "it looks at a copy"

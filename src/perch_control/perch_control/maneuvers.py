@@ -24,7 +24,7 @@ _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from th
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
 _LEVEL = 0.8          # cosine of the tilt up to which a brake starts from the attitude as it is
 _TURNING = 4.0        # the same for the body rate [rad/s]
-_UPRIGHT = 0.7        # cosine of the tilt up to which a recovery goes on before a landing on weak rotors begins
+_UPRIGHT = 0.7        # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -166,11 +166,14 @@ class Maneuvers:
         """Why weak rotors cannot go on with what is flown; empty: they can."""
         left, s = self.specific_thrust_max, self.settings.rotors
         said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
+        upright = axes_of(self.belief[6:10])[2][2] >= _UPRIGHT
         if self.state is State.TRACKING:
+            if upright and self.order.at_end is AtEnd.CONTACT:
+                return f"{said}, too little to recover from a missed contact"
             if self._judged is None or self._judged[0] is not self.source or self._judged[1] is not self.vehicle:
                 self._judged = self.source, self.vehicle, peak_thrust(self.source, self.elapsed) > s.reserve * left
             return f"{said}, less than the trajectory needs" if self._judged[2] else ""
-        if self.state is State.RECOVERING and axes_of(self.belief[6:10])[2][2] < _UPRIGHT:
+        if self.state is State.RECOVERING and not upright:
             return ""
         return said if left < s.hover_least * GRAVITY else ""
 

@@ -5,6 +5,7 @@ A flight takes off, hovers, and perches on a wall; one fault strikes between the
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -16,6 +17,7 @@ from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 from perch_core.vehicle import GRAVITY
 from perch_eval.control_flights.flight import LEAD, TAKE_OFF_SPEED, ControlFlight
+from perch_eval.control_flights.way_out import Search, search
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
 
@@ -176,6 +178,7 @@ class Ending:
         end: hovering, landed, perched, crashed or lost.
         touched: surfaces hit by other parts than the plate without breaking anything.
         events: of the controller from the fault on.
+        search: of a flight without a good end: what rotors at their limits could still have done when the fault struck.
     """
 
     fault: str
@@ -188,6 +191,7 @@ class Ending:
     end: str
     touched: tuple[str, ...]
     events: tuple[str, ...]
+    search: Search | None = None
 
 
 def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
@@ -219,7 +223,7 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
         if not struck and flight.time >= moment:
             struck, phase, before, first = True, flight.controller.state.name, _situation(flight), len(flight.events)
             done = fault.strike(flight, rng)
-            best = _best_impact(flight)
+            best, plant = _best_impact(flight), copy.deepcopy(flight.simulation.plant)
         flight.step()
         if flight.controller.state is not State.HOVERING:
             resting = flight.time
@@ -231,8 +235,10 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
     if flight.controller.state in (State.DISARMED, State.FAILED):
         flight.run(flight.time + 1.0)  # what has come off falls within this
     touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.contacts if c.state is ContactState.COLLISION}))
-    return Ending(fault.name, seed, moment - begin, phase, done, before, best, _end(flight), touched,
-                  tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]))
+    end = _end(flight)
+    return Ending(fault.name, seed, moment - begin, phase, done, before, best, end, touched,
+                  tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]),
+                  None if end in END_STATES else search(plant))
 
 
 def _situation(flight: FaultyFlight) -> tuple[float, float, float, float]:

@@ -24,6 +24,7 @@ QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
 WORST = 0.05                         # RMSE of each axis of a perch [m]
 CUT = 0.6                            # share of the RMSE that L1 takes away
 LOADED = "wind 5 m/s, mass +20 %"
+NO_WAY = "no way out"
 ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 
 
@@ -35,24 +36,26 @@ def fault_sections(effort: Effort) -> list[Section]:
                   f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
                   "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth. "
                   "Every flight: faults.md.")
-    table = ["| fault | " + " | ".join(ENDINGS) + " | touched the wall |", "| --- " * (len(ENDINGS) + 2) + "|"]
+    table = ["| fault | " + " | ".join(ENDINGS) + f" | of these {NO_WAY} | touched the wall |", "| --- " * (len(ENDINGS) + 3) + "|"]
     bad = []
     for fault in FAULTS:
         own = [r for r in flown if r["fault"] == fault.name]
         ends, touched = Counter(r["end"] for r in own), sum(bool(r["touched"]) and r["end"] in END_STATES for r in own)
-        table.append(f"| {fault.name}: {fault.about} | " + " | ".join(str(ends[e]) for e in ENDINGS) + f" | {touched} |")
+        table.append(f"| {fault.name}: {fault.about} | " + " | ".join(str(ends[e]) for e in ENDINGS) + f" | {sum(map(_no_way_out, own))} | {touched} |")
         safe = sum(ends[e] for e in END_STATES)
-        out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]), "", safe == len(own),
-                  "every flight ends hovering, landed or perched")
+        without = sum(_no_way_out(r) for r in own)
+        out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY}" * bool(without),
+                  "", safe + without == len(own), "every flight ends hovering, landed or perched, or had no way out")
         bad += [r for r in own if r["end"] not in END_STATES]
     text = ["# Faults in flight", "", out.about, "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
-            "it on the way, and nothing broke.", "", *table, "", "## Flights without a good end", ""]
+            f"it on the way, and nothing broke; *{NO_WAY}*: from the true state in which the fault left the vehicle, without any delay, rotors at their "
+            "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "", *table, "", "## Flights without a good end", ""]
     for r in bad or ():
         height, gap, speed, tilt = r["before"]
         text.append(f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
                     f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg; with all thrust upwards from then on it would meet the floor with {r['best_impact']:.1f} m/s. End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
-                    + " / ".join(r["events"]))
+                    + _searched(r) + " / ".join(r["events"]))
     _write(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
     out.data = {"flights": flown}
     return [out]
@@ -94,6 +97,18 @@ def comparison_sections(effort: Effort) -> list[Section]:
     _write(effort, "comparison", text, {"flights": flown})
     out.data = {"flights": flown}
     return [out]
+
+
+def _no_way_out(r: dict[str, Any]) -> bool:
+    return r["search"] is not None and r["search"]["survived"] == 0
+
+
+def _searched(r: dict[str, Any]) -> str:
+    x = r["search"]
+    if x["survived"]:
+        return f" A way out is not excluded: of the first {x['tried']} sequences of rotor commands that were tried one broke nothing at first. "
+    return (f" No way out: all {x['tried']} sequences of rotor commands that were tried broke it, the last {1000 * x['latest']:.0f} ms after the "
+            f"fault; within that time rotors of this lag turn the vehicle by no more than {x['turn_deg']:.0f} deg. ")
 
 
 def _cell(own: Sequence[dict[str, Any]]) -> str:

@@ -1,0 +1,87 @@
+"""Did physics leave a way out? All extreme rotor commands, tried on the plant itself from the moment of a fault.
+
+Rotor thrusts act on tilt and height almost linearly over the tenth of a second that a vehicle near the floor has, so that what can be
+reached is bounded by commands at the rotors' limits. The search knows the true state, has no delay and no law: it asks more than any
+controller could do.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.timing import CONTROL_PERIOD
+from perch_sim.plant import Plant
+
+SWITCHES = (0.02, 0.04, 0.06, 0.09, 0.13)  # the second command may begin so long after the fault [s]
+HORIZON = 0.4                              # a vehicle that has broken nothing so long after the fault is one that may get away [s]
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the search found.
+
+    Attributes:
+        tried: sequences of rotor commands.
+        survived: how many of them broke nothing within `HORIZON`; the search stops at the first.
+        latest: time after the fault of the latest break among the others [s].
+        turn_deg: no rotor commands turn the vehicle by more than this within `latest`, compared with rotors that stay as they are [deg].
+    """
+
+    tried: int
+    survived: int
+    latest: float
+    turn_deg: float
+
+
+def search(plant: Plant) -> Search:
+    """From the plant's present state, every combination of rotors at their limits, changed to any other once, or never.
+
+    Args:
+        plant: as the fault has left it; it is copied.
+    """
+    corners = [np.array(c) for c in itertools.product((plant.body.speed_min, plant.body.speed_max), repeat=4)]
+    steps = round(HORIZON / CONTROL_PERIOD)
+    switches = sorted(round(t / CONTROL_PERIOD) for t in SWITCHES)
+    tried, latest = 0, 0.0
+    for first in corners:
+        now, done = copy.deepcopy(plant), 0
+        for switch in (*switches, steps):
+            done += _advance(now, first, switch - done)
+            if now.crashed or switch == steps:
+                tried, latest = tried + 1, max(latest, done * CONTROL_PERIOD)
+                if not now.crashed:
+                    return Search(tried, 1, latest, _greatest_turn(plant, latest))
+                break
+            for second in corners:
+                if second is first:
+                    continue
+                then = copy.deepcopy(now)
+                more = _advance(then, second, steps - done)
+                tried, latest = tried + 1, max(latest, (done + more) * CONTROL_PERIOD)
+                if not then.crashed:
+                    return Search(tried, 1, latest, _greatest_turn(plant, latest))
+    return Search(tried, 0, latest, _greatest_turn(plant, latest))
+
+
+def _advance(plant: Plant, command: np.ndarray, steps: int) -> int:
+    """Fly on with a command until something breaks; returns the control periods flown."""
+    for k in range(steps):
+        plant.advance(command)
+        if plant.crashed:
+            return k + 1
+    return steps
+
+
+def _greatest_turn(plant: Plant, duration: float) -> float:
+    """A bound from the rotors' lag and levers: every rotor goes to the farther limit, and all moments add up [deg]."""
+    body, t = plant.body, np.linspace(0.0, duration, 200)[:, None]
+    now = body.thrust_coefficient * plant.rotor_speed**2
+    share = np.exp(-t / body.time_constant)
+    reached = [body.thrust_coefficient * (limit + (plant.rotor_speed - limit) * share) ** 2 for limit in (body.speed_min, body.speed_max)]
+    change = np.maximum(*(np.abs(thrust - now) for thrust in reached)) @ np.linalg.norm(body.rotor_xy, axis=1)
+    rate = np.cumsum(change / min(body.inertia[:2])) * duration / len(t)
+    return float(np.degrees(np.sum(rate) * duration / len(t)))
