@@ -133,7 +133,7 @@ def _contact(points, v, a, j, R_WS, offset, velocity, alpha, share, floor, tube_
     """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] of a problem; the last of `points` moves to the contact.
 
     Returns:
-        (acceleration, given, values, before_contact): see `Contact`; waypoints have their positions only.
+        (given, values, before_contact): see `Contact`; waypoints have their positions only.
     """
     acceleration, last = np.empty(3), len(points) - 1
     for d in range(3):
@@ -146,8 +146,8 @@ def _contact(points, v, a, j, R_WS, offset, velocity, alpha, share, floor, tube_
     values[0, 1], values[0, 2], values[0, 3], values[last, 2] = v, a, j, acceleration
     lower, upper = _tube(acceleration, share, floor)
     directions, window_lower, window_upper = _window(R_WS, velocity, least, most, tangential)
-    return acceleration, given, values, (_instants(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions,
-                                         window_lower, window_upper)
+    return given, values, (_instants(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
+                           window_upper)
 
 
 def tube_times(duration: float, settings: PerchSettings) -> np.ndarray:
@@ -161,7 +161,6 @@ class Contact:
     Attributes:
         velocity: of the target in W [m/s], shape (3,).
         points: start, waypoints, and the contact if the target stood still [m], shape (waypoints + 2, 3).
-        acceleration: at contact [m/s^2], shape (3,). [M:eq11]
         at_knots, before_contact, complete: arguments of `knots_kernel`, `bounds_kernel`, `bubbles_kernel`.
     """
 
@@ -172,7 +171,7 @@ class Contact:
             least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
         self.velocity = problem.target_velocity
         self.points = problem.points()
-        self.acceleration, given, values, self.before_contact = _contact(
+        given, values, self.before_contact = _contact(
             self.points, start.v, start.a, start.j, surface.R_WS, perch_offset, self.velocity, settings.impact_acceleration,
             settings.tube_tolerance, settings.tube_floor, settings.tube_time, settings.tube_step, least, most,
             settings.tangential_speed_max * _INSCRIBED - INSET)

@@ -66,6 +66,13 @@ def rows_kernel(durations, first, unit, spread, centre, owner, segments, places,
     return rows, low, high
 
 
+@compiled
+def appended(rows, lower, upper, program, bounds):
+    """The rows of further bounds below those there are; fields of `ReducedProgram` and `Bounds`."""
+    more, low, high = rows_kernel(*program, *bounds)
+    return np.concatenate((rows, more)), np.concatenate((lower, low)), np.concatenate((upper, high))
+
+
 def rows_of(program: ReducedProgram, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,)."""
     return rows_kernel(*program, *bounds)

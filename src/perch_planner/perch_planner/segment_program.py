@@ -12,7 +12,7 @@ from perch_planner.contact_constraints import Contact, bounds_kernel, bubbles_ke
 from perch_planner.linear_bounds import NONE, Bounds
 from perch_planner.problem import PerchSettings
 from perch_planner.reduced_qp import ReducedProgram, assemble_kernel
-from perch_planner.reduced_rows import rows_kernel, rows_of
+from perch_planner.reduced_rows import appended, rows_kernel, rows_of
 from perch_planner.reference_element import GRAMS
 from perch_planner.solvers import Solution
 
@@ -40,8 +40,7 @@ def _prepare(durations, knots, tube_and_window, complete, ahead, everywhere, gra
     bubbles = bubbles_kernel(len(durations), bounds[1][0], complete, everywhere)
     program = assemble_kernel(durations, given, values, bubbles, gram, cost_order)
     rows, lower, upper = rows_kernel(*program, *bounds)
-    more, low, high = rows_kernel(*program, *ahead)
-    return program, (np.concatenate((rows, more)), np.concatenate((lower, low)), np.concatenate((upper, high)))
+    return program, appended(rows, lower, upper, program, ahead)
 
 
 class ReducedSegments:
@@ -57,7 +56,7 @@ class ReducedSegments:
 
     def add(self, bounds: Bounds) -> None:
         """Add linear bounds; only their own rows are computed."""
-        self._rows = tuple(map(np.concatenate, zip(self._rows, rows_of(self._program, bounds))))
+        self._rows = appended(*self._rows, tuple(self._program), tuple(bounds))
 
     def replace(self, bounds: Bounds) -> None:
         """Set the bounds near the present plan."""
