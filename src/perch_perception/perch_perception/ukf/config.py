@@ -43,6 +43,7 @@ class VioNoise:
     attitude: float = quantity(0.002, unit="rad", above=0.0, doc="1 sigma, white from pose to pose")
     correlation_time: float = quantity(30.0, unit="s", above=0.0, doc="of VIO's drift")
     drift_position: float = quantity(0.002, unit="m/sqrt(s)", low=0.0, doc="least growth of the drift")
+    velocity_time: float = quantity(0.35, unit="s", low=0.0, doc="how long an error of VIO's velocity lasts: its window")
     drift_attitude: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="least growth of the drift")
 
 

@@ -29,19 +29,26 @@ def least_growth(noise: VioNoise, dt: float) -> np.ndarray:
     return np.diag(np.repeat([noise.drift_position**2 * dt, noise.drift_attitude**2 * dt], 3))
 
 
-def increment(noise: VioNoise, C_before: np.ndarray, C_now: np.ndarray, dt: float) -> np.ndarray:
+def increment(noise: VioNoise, C_before: np.ndarray, C_now: np.ndarray, dt: float,
+              velocity: np.ndarray | None = None) -> np.ndarray:
     """Covariance of the drift's step w between two VIO poses.
+
+    Where C does not grow, VIO has taken back as much as it has drifted, and its error has moved all the same: by its velocity's
+    error, which lasts for `velocity_time`.
 
     Args:
         noise: the drift's parameters.
         C_before, C_now: covariances reported with the poses, shape (6, 6).
         dt: time between them [s].
+        velocity: covariance of VIO's velocity in W, shape (3, 3), or None.
 
     Returns:
         Positive definite matrix, shape (6, 6).
     """
-    phi = math.exp(-dt / noise.correlation_time)
+    phi = kept(noise, dt)
     floor = least_growth(noise, dt)
+    if velocity is not None:
+        floor[:3, :3] += np.diag(np.diag(velocity)) * noise.velocity_time * dt
     scale = np.sqrt(np.diag(floor)) + 1e-9
     # eigenvalues in units of the floor, so that metres and radians are not compared
     values, vectors = np.linalg.eigh((C_now - phi * phi * C_before) / np.outer(scale, scale))
@@ -49,9 +56,14 @@ def increment(noise: VioNoise, C_before: np.ndarray, C_now: np.ndarray, dt: floa
     return W * np.outer(scale, scale)
 
 
+def kept(noise: VioNoise, dt: float) -> float:
+    """Share of the drift that is left after dt [s]."""
+    return math.exp(-dt / noise.correlation_time)
+
+
 def advance(belief: Belief, noise: VioNoise, W: np.ndarray, dt: float) -> Belief:
     """Belief with the drift moved on by dt [s]: exact, because the drift is linear."""
-    phi = math.exp(-dt / noise.correlation_time)
+    phi = kept(noise, dt)
     x, P = belief.x.copy(), belief.P.copy()
     x[at.DRIFT] *= phi
     P[at.D_DRIFT, :] *= phi
@@ -81,21 +93,45 @@ def follow(belief: Belief, pose: VioPose, velocity: bool) -> Belief:
     return dataclasses.replace(belief, x=x)
 
 
-def no_better_than(belief: Belief, pose: VioPose) -> Belief:
-    """Belief whose pose and velocity are not surer than VIO's.
+def as_sure_as(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
+    """Belief whose pose and velocity are as sure as VIO's.
 
-    VIO has used the very IMU samples that this filter integrates, and the images besides. Whatever this filter makes of
-    VIO's poses and of the same samples cannot beat it, so its covariance must not. Where it is smaller in some
-    direction, the difference is added: P + max(0, C - P), with the maximum over eigenvalues in units of VIO's sigmas.
+    VIO has used the very IMU samples that this filter integrates, and the images besides: its covariance C of the pose, and of the
+    velocity where it comes with one, is what is known of these. Where P is smaller in some direction, the difference is added, as
+    an error of its own; where it is larger, it shrinks, and correlations stay. The biases keep their covariance: that VIO is
+    surer is no news of them, and pose after pose would be counted again. For x = pose and x = velocity:
+
+        P_xx := P_xx + max(0, C - P_xx);   P' = T P T^T,   T_xx = L(C) L(P_xx)^-1,   C = L(C) L(C)^T.
+
+    VIO does not say how its velocity hangs together with its pose, and its velocity's error is not this filter's: with the rest it
+    is taken as uncorrelated, so that e^T P^-1 e of both together has the right mean, whatever the truth is.
+
+    Args:
+        belief: after the update.
+        pose: with VIO's covariances.
+        doubt: what VIO's map may be off beyond its covariance, (position, rotation in W), shape (6, 6).
     """
-    P = belief.P.copy()
-    rows = np.r_[0:3, 6:9]
     J = np.zeros((6, 6))
     J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(belief.x[at.QUATERNION]).T
-    P[np.ix_(rows, rows)] += _missing(J @ pose.covariance @ J.T, P[np.ix_(rows, rows)])
+    known = [(np.r_[0:3, 6:9], J @ (pose.covariance + doubt) @ J.T)]
     if pose.velocity_covariance is not None:
-        P[at.D_VELOCITY, at.D_VELOCITY] += _missing(pose.velocity_covariance, P[at.D_VELOCITY, at.D_VELOCITY])
-    return dataclasses.replace(belief, P=P)
+        known.append((np.r_[at.D_VELOCITY], pose.velocity_covariance))
+    P, T = belief.P.copy(), np.eye(at.ERROR_SIZE)
+    for rows, C in known:
+        block = np.ix_(rows, rows)
+        P[block] += _missing(C, P[block])
+        T[block] = _factor(C) @ np.linalg.inv(np.linalg.cholesky(P[block]))
+    P = T @ P @ T.T
+    if pose.velocity_covariance is not None:
+        rest = np.setdiff1d(np.arange(at.ERROR_SIZE), np.r_[at.D_VELOCITY])
+        P[at.D_VELOCITY, rest] = 0.0
+        P[rest, at.D_VELOCITY] = 0.0
+    return dataclasses.replace(belief, P=0.5 * (P + P.T))
+
+
+def _factor(C: np.ndarray) -> np.ndarray:
+    """Cholesky factor of a covariance (n, n) that may be singular: a part in 1e6 of its variances is added."""
+    return np.linalg.cholesky(C + np.diag(1e-6 * np.diag(C) + 1e-12))
 
 
 def _missing(C: np.ndarray, P: np.ndarray) -> np.ndarray:

@@ -34,6 +34,7 @@ class Estimator:
         self._gate = float(chi2.ppf(config.gate_probability, 6))
         self._base: Belief | None = None  # at the stamp of the last applied pose
         self._covariance: np.ndarray | None = None  # VIO's covariance at that pose
+        self._doubt = np.zeros((6, 6))  # in VIO's map beyond that covariance, after a jump
         self._live: Belief | None = None  # covariance up to a few steps ago
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
@@ -142,6 +143,7 @@ class Estimator:
 
     def _begin(self, pose: VioPose) -> VioOutcome:
         steps = self._imu.run(max(self._imu.oldest, pose.stamp - round(self.config.rest_time * 1e9)), pose.stamp)
+        self._doubt[:] = 0.0
         self._settle(start.from_vio(self.config, pose, steps), pose)
         self._broken = False
         return VioOutcome.STARTED
@@ -151,7 +153,8 @@ class Estimator:
         anchor = next(a for a in reversed(self._anchors) if a.stamp <= pose.stamp)
         prior = self._transform.predict(anchor, self._imu.run(anchor.stamp, pose.stamp), pose.stamp)
         dt = (pose.stamp - self._base.stamp) * 1e-9
-        prior = drift.advance(prior, noise, drift.increment(noise, self._covariance, pose.covariance, dt), dt)
+        prior = drift.advance(prior, noise, drift.increment(noise, self._covariance, pose.covariance, dt, pose.velocity_covariance), dt)
+        self._doubt *= drift.kept(noise, dt) ** 2
         innovation = self._innovate(prior, pose)
         self._nis = innovation.nis
         outcome = VioOutcome.APPLIED
@@ -159,16 +162,16 @@ class Estimator:
             self._refused_in_row += 1
             if self._refused_in_row < self.config.gate_patience:
                 return VioOutcome.GATED
-            prior = self._doubt(prior, innovation)
+            prior = self._jumped(prior, innovation)
             innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
         belief = drift.follow(self._transform.correct(prior, innovation), pose, self.config.use_velocity)
-        self._settle(drift.no_better_than(belief, pose), pose)
+        self._settle(drift.as_sure_as(belief, pose, self._doubt), pose)
         return outcome
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
         return self._transform.innovate(prior, pose.p_WB, pose.q_WB, drift.white(self.config.vio))
 
-    def _doubt(self, prior: Belief, innovation: Innovation) -> Belief:
+    def _jumped(self, prior: Belief, innovation: Innovation) -> Belief:
         """Belief in which the state and VIO's map may each be off by the whole disagreement.
 
         After so many refusals one of the two is wrong, and nothing tells which: both get the variance of the
@@ -177,6 +180,7 @@ class Estimator:
         elapsed = max((prior.stamp - self._base.stamp) * 1e-9, 0.1)
         p, theta = (innovation.residual[:3] ** 2).sum(), (innovation.residual[3:6] ** 2).sum()
         extra = np.repeat([p, p / elapsed**2, theta, 0.0, 0.0, p, theta], 3)
+        self._doubt += np.diag(extra[at.D_DRIFT])
         return dataclasses.replace(prior, P=prior.P + np.diag(extra))
 
     def _settle(self, belief: Belief, pose: VioPose) -> None:

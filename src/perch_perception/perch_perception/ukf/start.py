@@ -64,7 +64,7 @@ def before_vio(stamp: int, accel: np.ndarray) -> Belief:
 def from_vio(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:
     """Belief at VIO's first pose.
 
-    At rest the gyro's mean is its bias. The vehicle's pose error and VIO's drift are then opposite and fully
+    At rest the gyro's mean is its bias, and the accelerometer's is what gravity leaves. The vehicle's pose error and VIO's drift are then opposite and fully
     correlated: p = z - d - n.
 
     Args:
@@ -96,4 +96,18 @@ def from_vio(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:
         gyro_sigma = max(config.imu.gyro_noise / np.sqrt(rest.samples), 1e-4)
     P[at.D_GYRO_BIAS, at.D_GYRO_BIAS] = np.eye(3) * gyro_sigma**2
     P[at.D_ACCEL_BIAS, at.D_ACCEL_BIAS] = np.eye(3) * config.imu.accel_bias_init**2
+    if at_rest:
+        _weigh(config, x, P, rest)
     return Belief(pose.stamp, x, P)
+
+
+def _weigh(config: UkfConfig, x: np.ndarray, P: np.ndarray, rest: Rest) -> None:
+    """Tilt and accelerometer bias at rest hang together, whoever found the tilt: mean f = R^T g + b_a + n, so that
+    b_a = f - R^T g with the error -[R^T g]x theta - n."""
+    up_B = so3.quat_to_matrix(x[at.QUATERNION]).T @ np.array([0.0, 0.0, GRAVITY])
+    by_tilt = -so3.hat(up_B)
+    x[at.ACCEL_BIAS] = rest.accel - up_B
+    P[at.D_ACCEL_BIAS, :] = by_tilt @ P[at.D_ATTITUDE, :]
+    P[:, at.D_ACCEL_BIAS] = P[at.D_ACCEL_BIAS, :].T
+    P[at.D_ACCEL_BIAS, at.D_ACCEL_BIAS] = (by_tilt @ P[at.D_ATTITUDE, at.D_ATTITUDE] @ by_tilt.T
+                                           + config.imu.accel_noise**2 / rest.samples * np.eye(3))

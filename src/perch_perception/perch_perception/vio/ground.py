@@ -61,5 +61,5 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
         cross = J @ s.P[columns]
         own = J @ s.P[np.ix_(columns, columns)] @ J.T + inverse @ variance @ inverse.T
         s.P = np.block([[s.P, cross.T], [cross, own]])
-        s.landmarks[int(ids[i])] = Landmark(X[k], X[k].copy(), float(np.linalg.norm(X[k] - s.p_WB)))
+        s.landmarks[int(ids[i])] = Landmark(X[k], X[k].copy())
     return n

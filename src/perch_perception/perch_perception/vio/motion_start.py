@@ -146,7 +146,7 @@ class MotionStart:
                 seen.append(k)
         if len(rays) < _LEAST_FEATURES:
             return None
-        sigma = self._config.filter.pixel_noise / self._mount.camera.fx
+        sigma = self._config.start.motion_noise / self._mount.camera.fx
         found = solve_motion(T, dp, dR @ self._mount.p_BC, rays, seen, sigma)
         if found is None or found.residual > 4 * sigma:
             return None

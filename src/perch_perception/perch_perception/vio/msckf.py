@@ -19,6 +19,7 @@ from perch_perception.vio.bearing import POINT, Bearings, corrected, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.sliding import Sliding
 from perch_perception.vio.state import Landmark, State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
@@ -56,6 +57,7 @@ class Msckf:
         self.config, self.state = config, state
         self.tracks = Tracks()
         self.sigma = config.filter.pixel_noise / focal_length
+        self.sliding = Sliding(config.filter, focal_length)
         self._gate = ekf.Gate(config.filter.gate_probability)
         self._used: set[int] = set()  # features whose information is in the state already
         self.w_WB_B = np.zeros(3)
@@ -152,8 +154,8 @@ class Msckf:
         H[:, :, :14] = first.J[:, :, : POINT.start]
         for i in range(m):
             H[i, :, 14 + 3 * i : 17 + 3 * i] = first.J[i, :, POINT]
-        trust = self._trust(now.distance / np.array([k.distance for k in s.landmarks.values()]))
-        H, r = H * trust[:, None, None], now.r * trust[:, None]
+        r = now.r
+        self._let_slide(tracks, now.distance)
         P = s.P[np.ix_(columns, columns)]
         HP = (H.reshape(2 * m, -1) @ P).reshape(H.shape)
         S = np.einsum("kia,kja->kij", HP, H) + self.sigma**2 * np.eye(2)
@@ -217,7 +219,7 @@ class Msckf:
             cross = -inverse @ H_1 @ s.P[columns]
             own = inverse @ (H_1 @ P @ H_1.T + self.sigma**2 * np.eye(3)) @ inverse.T
             s.P = np.block([[s.P, cross.T], [cross, own]])
-            s.landmarks[i] = Landmark(X + inverse @ r_1, X, float(np.linalg.norm(X - s.p_WB)))
+            s.landmarks[i] = Landmark(X + inverse @ r_1, X)
             rows.append(H_0)
             rests.append(r_0)
             report.landmarks_new += 1
@@ -278,7 +280,7 @@ class Msckf:
             js = np.array([place[track.frames[k]] for k in seen])
             bearings = track.bearings(seen)
             rays = np.einsum("nij,nj->ni", R_WC[js], corrected(bearings, s.focal))
-            X = triangulate(centres[js], rays, np.radians(limits.least_parallax_deg), self.sigma)
+            X = triangulate(centres[js], rays, np.radians(limits.least_parallax_deg), self.sliding.spread(bearings.b_C))
             if X is not None:
                 found.append((X, js, bearings))
                 which.append(number)
@@ -293,12 +295,13 @@ class Msckf:
         begin = 0
         for number, (X_W, js, _) in zip(which, found):
             m, rows = len(js), slice(begin, begin + len(js))
-            trust = float(self._trust(now.distance[rows].max() / now.distance[rows].min()))
-            J = trust * first.J[rows]
-            H = np.zeros((m, 2, 8 + at.CLONE_SIZE * len(s.clones)))
-            H[:, :, :8] = J[:, :, :8]
-            H[:, :, 8:].reshape(m, 2, -1, 6)[np.arange(m), :, js] = J[:, :, 8:14]
-            out[number] = X_W, H.reshape(2 * m, -1), J[:, :, POINT].reshape(-1, 3), trust * now.r[rows].ravel()
+            J = first.J[rows]
+            A = np.zeros((m, 2, 8 + at.CLONE_SIZE * len(s.clones) + 4))
+            A[:, :, :8] = J[:, :, :8]
+            A[:, :, 8:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js] = J[:, :, 8:14]
+            A[:, :, -4:-1], A[:, :, -1] = J[:, :, POINT], now.r[rows]
+            A = self.sliding.whitened(bearings.b_C[rows], now.distance[rows], A.reshape(m, -1)).reshape(2 * m, -1)
+            out[number] = X_W, A[:, :-4], A[:, -4:-1], A[:, -1]
             begin += m
         return out
 
@@ -320,13 +323,17 @@ class Msckf:
         ids = list(tracks)
         return {ids[k]: tracks[ids[k]] for k in order if ends[k] < enough}
 
-    def _trust(self, zoom: np.ndarray) -> np.ndarray:
-        """Weight of observations whose patch has changed its size by a factor since it was chosen.
-
-        KLT fits a shift. What a patch grows or shrinks pulls the shift to one side, and that adds up over a track:
-        sigma = sigma_0 sqrt(1 + (zoom_noise ln zoom)^2).
-        """
-        return 1.0 / np.sqrt(1.0 + (self.config.filter.zoom_noise * np.log(zoom)) ** 2)
+    def _let_slide(self, tracks: list[Track], distance: np.ndarray) -> None:
+        """The walk of all landmarks since the last frame (`sliding`), seen now from distances [m], shape (n,)."""
+        s = self.state
+        if len(s.clones) < 2:
+            return
+        before, X = s.clones[-2], np.array([k.X_W for k in s.landmarks.values()])
+        last = np.linalg.norm(X - before.p_WB - before.R_WB @ s.p_BC, axis=1)
+        seen = np.array([t.b_C[-2] if len(t.b_C) > 1 else t.b_C[-1] for t in tracks])
+        b_C = np.array([t.b_C[-1] for t in tracks])
+        rows = s.landmark_start + np.arange(3 * len(tracks)).reshape(-1, 3)
+        s.P[rows[:, :, None], rows[:, None, :]] += self.sliding.of_points(seen, b_C, last, distance, s.clones[-1].R_WB @ s.R_BC)
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)

@@ -33,12 +33,10 @@ class Clone:
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), also as first estimated; distance from the body when it came in [m];
-    refused observations in a row."""
+    """A point in the state: position in W (3,), also as first estimated; refused observations in a row."""
 
     X_W: np.ndarray
     X_first: np.ndarray
-    distance: float
     strikes: int = 0
 
 

@@ -1,0 +1,68 @@
+"""Tracks slide: what KLT follows is not a fixed point of the scene.
+
+A patch changes as the view of it does, and KLT's fit moves with it. Measured on rendered flights (docs/estimation.md), the error
+of a track is hardly white (0.09 px); it walks, and stands still where the view does. Per frame, in each direction of the image,
+
+    q = slide_turn^2 |d beta| + slide_zoom^2 |d ln distance|,
+
+with beta the direction in which the camera sees the point. A point in the state walks over the scene by that; a track's
+observations get the covariance sigma^2 I + walk, counted back from the last one, whose point is the one that is solved for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from perch_perception.vio.config import FilterConfig
+
+
+class Sliding:
+    """The walk of tracked points, for a focal length in pixels."""
+
+    def __init__(self, config: FilterConfig, focal_length: float) -> None:
+        self._sigma = config.pixel_noise / focal_length
+        self._turn, self._zoom = (config.slide_turn / focal_length) ** 2, (config.slide_zoom / focal_length) ** 2
+
+    def steps(self, b_before: np.ndarray, b_now: np.ndarray, d_before: np.ndarray, d_now: np.ndarray) -> np.ndarray:
+        """Variance q of one frame's walk [rad^2].
+
+        Args:
+            b_before, b_now: unit bearings in C in both frames, shape (n, 3).
+            d_before, d_now: distances from the camera [m], shape (n,).
+
+        Returns:
+            Shape (n,).
+        """
+        turned = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(b_now - b_before, axis=1), 1.0))
+        return self._turn * turned + self._zoom * np.abs(np.log(d_now / d_before))
+
+    def of_points(self, b_before: np.ndarray, b_now: np.ndarray, d_before: np.ndarray, d_now: np.ndarray,
+                  R_WC: np.ndarray) -> np.ndarray:
+        """Covariance that points in W gain in a frame: across the line of sight only [m^2], shape (n, 3, 3).
+
+        Args:
+            b_before, b_now, d_before, d_now: as in `steps`.
+            R_WC: attitude of the camera now, shape (3, 3).
+        """
+        u = b_now @ R_WC.T
+        q = self.steps(b_before, b_now, d_before, d_now) * d_now**2
+        return q[:, None, None] * (np.eye(3) - u[:, :, None] * u[:, None, :])
+
+    def whitened(self, b_C: np.ndarray, distance: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Rows of one track's observations, transformed so that their noise is white with the variance sigma^2.
+
+        Args:
+            b_C: bearings of the track, shape (m, 3).
+            distance: from the camera [m], shape (m,).
+            rows: one row for each observation, shape (m, k).
+        """
+        q = self.steps(b_C[:-1], b_C[1:], distance[:-1], distance[1:]) / self._sigma**2
+        to_end = np.concatenate([np.cumsum(q[::-1])[::-1], [0.0]])
+        factor = np.linalg.cholesky(np.eye(len(b_C)) + np.minimum(to_end[:, None], to_end))
+        return solve_triangular(factor, rows, lower=True, check_finite=False)
+
+    def spread(self, b_C: np.ndarray) -> float:
+        """1 sigma of a track's bearings (m, 3) about one point [rad], as far as the bearings tell."""
+        chords = np.linalg.norm(np.diff(b_C, axis=0), axis=1)
+        return float(np.sqrt(self._sigma**2 + self._turn * chords.sum()))

@@ -1,0 +1,49 @@
+"""Sliding tracks: the covariance of a walk, against walks that are simulated."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_perception.vio.config import FilterConfig
+from perch_perception.vio.sliding import Sliding
+
+FOCAL = 275.0
+CONFIG = dataclasses.replace(FilterConfig(), pixel_noise=0.3, slide_turn=2.0, slide_zoom=3.0)
+
+
+def view(m=9):
+    """Bearings and distances of a point that a climbing, turning camera sees."""
+    angles = np.cumsum(np.linspace(0.0, 0.08, m))
+    return np.stack([np.sin(angles), np.zeros(m), np.cos(angles)], axis=1), np.linspace(0.4, 1.2, m)
+
+
+def test_whitened_observations_of_walking_points_are_white():
+    rng, (b, d) = np.random.default_rng(1), view()
+    q = (CONFIG.slide_turn / FOCAL) ** 2 * np.arccos(np.clip((b[1:] * b[:-1]).sum(axis=1), -1, 1))
+    q += (CONFIG.slide_zoom / FOCAL) ** 2 * np.log(d[1:] / d[:-1])
+    steps = rng.normal(size=(20000, len(q))) * np.sqrt(q)
+    # the point is where it is seen last: earlier observations are off by what it has walked since
+    walk = -np.concatenate([np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros((20000, 1))], axis=1)
+    seen = walk + rng.normal(size=walk.shape) * CONFIG.pixel_noise / FOCAL
+    white = Sliding(CONFIG, FOCAL).whitened(b, d, seen.T) / (CONFIG.pixel_noise / FOCAL)
+    assert np.cov(white) == pytest.approx(np.eye(len(b)), abs=0.06)
+
+
+def test_a_view_that_stands_still_makes_nothing_walk():
+    b, d = view()
+    sliding = Sliding(CONFIG, FOCAL)
+    assert sliding.steps(b, b, d, d) == pytest.approx(np.zeros(len(b)), abs=1e-12)
+    rows = np.random.default_rng(2).normal(size=(4, 3))
+    assert sliding.whitened(np.tile(b[:1], (4, 1)), np.full(4, 0.7), rows) == pytest.approx(rows)
+
+
+def test_points_walk_across_the_line_of_sight_only():
+    b, d = view()
+    R_WC = so3.exp(np.array([0.3, -2.0, 0.4]))
+    P = Sliding(CONFIG, FOCAL).of_points(b[:-1], b[1:], d[:-1], d[1:], R_WC)
+    u = b[1:] @ R_WC.T
+    assert np.einsum("ni,nij,nj->n", u, P, u) == pytest.approx(np.zeros(len(u)), abs=1e-15)
+    along = R_WC @ np.array([0.0, 1.0, 0.0])
+    angle = np.sqrt(np.einsum("i,nij,j->n", along, P, along)) / d[1:]
+    assert angle**2 == pytest.approx(Sliding(CONFIG, FOCAL).steps(b[:-1], b[1:], d[:-1], d[1:]))
