@@ -87,6 +87,7 @@ class CableMonitor:
         """
         self._lines = [CableLine(cable) for cable in cables]
         self._grip, self._offset, self._radii = grip, gripper_offset, np.array(radii, float)
+        self._reach = float(self._radii.max())
         self._before = [math.inf] * len(cables)   # distance one update ago
         self._nearest: list[ContactEvent | None] = [None] * len(cables)  # of this pass
         self._attachment: Attachment | None = None
@@ -116,7 +117,9 @@ class CableMonitor:
             self._before[k] = near.distance
             if self._attachment is not None:
                 break
-            if not self.crashed and line.enters(x[:3], R_WB, self._radii):
+            # No point of the ellipsoid is further from the gripper than its greatest radius and the gripper's offset.
+            close = near.distance < self._offset + self._reach + line.radius
+            if not self.crashed and close and line.enters(x[:3], R_WB, self._radii):
                 self.crashed = True
                 events += self._missed(k)
                 events.append(self._event(time, ContactState.COLLISION, k, x, R_WB, near, "crashed: a cable in the rotors"))
