@@ -20,6 +20,7 @@ from perch_perception.line_mapping.ridge import dark_ridges
 SAMPLES = 7          # rays that stand for a sighting
 HYPOTHESES = 64      # arcs tried per blob and round
 MAX_BEND = 0.6       # second derivative of an arc: a wire bends no more [1/rad]
+EDGE_REACH = 4       # a run's edge is sought among so many steps and one, from one outside to three inside [px]
 MAX_LINES = 6        # lines in one blob: cables that cross in the image share one
 
 
@@ -37,7 +38,9 @@ class LineDetectionConfig:
     tolerance: float = config.quantity(1.5, unit="px", above=0.0, high=20.0, doc="of ridge points from their arc")
     max_gap: float = config.quantity(25.0, unit="px", above=0.0, high=200.0, doc="hole after which an arc is another one")
     sigma: float = config.quantity(0.2, unit="px", above=0.0, high=5.0, doc="error of an arc that averaging does not remove")
-
+    width_loss: float = config.quantity(0.4, unit="px", low=0.0, high=5.0,
+                                        doc="a wire looks narrower by this: blurred, and darker at its rims")
+    min_width: float = config.quantity(4.0, unit="px", above=0.0, high=100.0, doc="the thickness of a thinner wire is not measured")
 
     @property
     def least(self) -> float:
@@ -53,7 +56,7 @@ class LineSighting:
         rays_C: unit rays to its axis in C, in order along it, shape (7, 3).
         ends_C: rays to its visible ends, shape (2, 3).
         sigma: 1-sigma of a ray across the arc [rad].
-        width: angle that the wire's thickness subtends [rad]; 0 where it was not measured.
+        width: angle between the planes through the optical centre that touch the wire [rad]; 0 where it was not measured.
         length: in the image [px].
     """
 
@@ -85,6 +88,7 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
         strength, threshold = dark_ridges(grey), settings.darkness
     mask = (strength > threshold).astype(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    padded = np.pad(strength.astype(float), EDGE_REACH, constant_values=np.nan)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     sightings = []
     for label in range(1, count):
@@ -92,22 +96,23 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
         if max(w, h) < settings.least:
             continue
         window = slice(y, y + h), slice(x, x + w)
-        blob = np.where(labels[window] == label, strength[window], 0).astype(float)
-        pixels, widths = ridge_points(blob)
+        around = padded[y:y + h + 2 * EDGE_REACH, x:x + w + 2 * EDGE_REACH]
+        pixels, edges = ridge_points(np.where(labels[window] == label, strength[window], 0).astype(float), around)
         if settings.appearance == "dark":
-            widths = np.zeros_like(widths)  # the filter's width, not the wire's
-        sightings += _arcs(pixels + (x, y), widths, camera, settings)
+            edges[:] = np.nan  # the filter's edges, not the wire's
+        sightings += _arcs(pixels + (x, y), edges + (x, y), camera, settings)
     return sorted(sightings, key=lambda sighting: -sighting.length)
 
 
-def ridge_points(blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle of every run of pixels across a blob.
+def ridge_points(blob: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and edges of every run of pixels across a blob.
 
     Args:
         blob: weights, 0 outside the blob, shape (h, w).
+        around: weights of the blob and what is around it, nan beyond the image, shape (h + 2 EDGE_REACH, w + 2 EDGE_REACH).
 
     Returns:
-        Pixels (n, 2) and the width of the runs, along the scanning direction, as weight over the peak weight [px] (n,).
+        Pixels (n, 2), and where the runs begin and end (n, 2, 2), nan where that is beyond the image.
     """
     upright = blob.shape[0] > blob.shape[1]  # scan across the longer side
     across = blob.T if upright else blob
@@ -116,20 +121,34 @@ def ridge_points(blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     edge = np.diff(inside, axis=0).T
     column, first = np.nonzero(edge == 1)  # row-major in the transposed array: runs in order, column by column
     _, last = np.nonzero(edge == -1)
-    sums = np.zeros((3, across.shape[0] + 1, across.shape[1]))
+    sums = np.zeros((2, across.shape[0] + 1, across.shape[1]))
     sums[0, 1:] = np.cumsum(across, axis=0)
     sums[1, 1:] = np.cumsum(across * np.arange(across.shape[0])[:, None], axis=0)
     weight, moment = (sums[k, last, column] - sums[k, first, column] for k in (0, 1))
-    middle = moment / weight
-    pixels = np.stack([middle, column] if upright else [column, middle], axis=-1).astype(float)
-    return pixels, weight / np.percentile(across[across > 0], 95)
+    at = [moment / weight, *_edges((around.T if upright else around)[:, EDGE_REACH:-EDGE_REACH], column, first, last)]
+    pixels, begin, end = (np.stack([k, column] if upright else [column, k], axis=-1).astype(float) for k in at)
+    return pixels, np.stack([begin, end], axis=1)
 
 
-def _arcs(pixels, widths, camera, settings) -> list[LineSighting]:
+def _edges(around: np.ndarray, column: np.ndarray, first: np.ndarray, last: np.ndarray) -> list[np.ndarray]:
+    """Where runs begin and end: at the steepest places, which neither blur nor shading moves; (n,) each."""
+    steps = np.diff(around, axis=0)  # from row k - EDGE_REACH to the next: at k - EDGE_REACH + 1/2
+    found, run = [], np.arange(len(column))
+    for sign, outside in ((1.0, first - 2), (-1.0, last - EDGE_REACH)):
+        rows = outside[:, None] + np.arange(EDGE_REACH + 1)
+        slope = sign * steps[rows + EDGE_REACH, column[:, None]]
+        top = np.clip(np.argmax(slope, axis=1), 1, EDGE_REACH - 1)
+        before, peak, after = (slope[run, top + k] for k in (-1, 0, 1))
+        bend = np.minimum(before - 2.0 * peak + after, -1e-9)
+        found.append(rows[run, top] + 0.5 + np.clip(0.5 * (before - after) / bend, -1.0, 1.0))
+    return found
+
+
+def _arcs(pixels, edges, camera, settings) -> list[LineSighting]:
     """Arcs through the ridge points of one blob, the best first, each split where it has holes."""
     rays = camera.unproject(pixels)
     seen = np.all(np.isfinite(rays), axis=1)
-    pixels, widths, rays = pixels[seen], widths[seen], rays[seen]
+    pixels, edges, rays = pixels[seen], edges[seen], rays[seen]
     if len(rays) < settings.least:
         return []
     along, across = _arc_coordinates(rays)
@@ -146,7 +165,7 @@ def _arcs(pixels, widths, camera, settings) -> list[LineSighting]:
         chosen = left[inlier]
         chosen = chosen[np.argsort(along[chosen], kind="stable")]
         for piece in _pieces(chosen, pixels, settings):
-            sightings.append(_sighting(piece, pixels, widths, rays, spread, camera, settings))
+            sightings.append(_sighting(piece, pixels, edges, rays, spread, camera, settings))
         left = left[~inlier]
     return sightings
 
@@ -199,13 +218,31 @@ def _pieces(ordered: np.ndarray, pixels: np.ndarray, settings: LineDetectionConf
             and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.least]
 
 
-def _sighting(piece, pixels, widths, rays, spread, camera, settings) -> LineSighting:
+def _sighting(piece, pixels, edges, rays, spread, camera, settings) -> LineSighting:
     groups = np.array_split(piece, SAMPLES)
     means = np.array([rays[group].mean(axis=0) for group in groups])
     means /= np.linalg.norm(means, axis=1, keepdims=True)
-    span = pixels[piece[-1]] - pixels[piece[0]]
-    length = float(np.linalg.norm(span))
-    slant = max(abs(span)) / length  # runs are cut along an image axis, not across the wire
+    length = float(np.linalg.norm(pixels[piece[-1]] - pixels[piece[0]]))
     sigma = np.hypot(spread / np.sqrt(len(piece) / SAMPLES), settings.sigma / camera.fx)
-    return LineSighting(means, rays[piece[[0, -1]]], float(sigma),
-                        float(np.median(widths[piece]) * slant / camera.fx), length)
+    return LineSighting(means, rays[piece[[0, -1]]], float(sigma), _width(edges[piece], camera, settings), length)
+
+
+def _width(edges: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> float:
+    """Angle between the planes that touch a wire on both sides [rad], from its edges in the image (n, 2, 2).
+
+    Seen askew the wire's direction is not that of its image, so the planes are fitted each to its side. 0 where half of the edges
+    are not seen, or the wire is too thin to tell.
+    """
+    seen = np.all(np.isfinite(edges), axis=(1, 2))
+    if 2 * seen.sum() <= len(seen):
+        return 0.0
+    normals = []
+    for side in (0, 1):
+        rays = camera.unproject(edges[seen, side])
+        normal = np.linalg.eigh(rays.T @ rays)[1][:, 0]
+        off = np.abs(rays @ normal)
+        rays = rays[off <= 3.0 * np.median(off)]  # where another wire crosses, the edge is that one's
+        normals.append(np.linalg.eigh(rays.T @ rays)[1][:, 0])
+    between = float(np.linalg.norm(np.cross(*normals)))
+    width = np.arcsin(min(between, 1.0)) + settings.width_loss / camera.fx
+    return float(width) if width * camera.fx >= settings.min_width else 0.0

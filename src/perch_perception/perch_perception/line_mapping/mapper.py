@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
@@ -18,7 +18,6 @@ from perch_perception.pose_buffer import BodyState
 
 PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
-LEAST_WIDTH_PX = 3.0  # a wire thinner than this in the image has no measurable radius
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,6 @@ class _Track:
     estimate: WireEstimate | None = None
     extent: tuple[float, float] | None = None
     refusal: str = ""
-    radii: list[float] = field(default_factory=list)
 
 
 class LineMapper:
@@ -157,7 +155,6 @@ class LineMapper:
                 track.refusal = str(refusal)
             return
         track.extent = self._extent(track)
-        self._measure_radius(track)
 
     def _extent(self, track: _Track) -> tuple[float, float] | None:
         """Range of s that was seen at least twice."""
@@ -175,14 +172,6 @@ class LineMapper:
         ends = np.sort(against.s.reshape(-1, 2)[both], axis=1)
         low, high = float(np.sort(ends[:, 0])[1]), float(np.sort(ends[:, 1])[-2])
         return (low, high) if high - low > 0.1 else None
-
-    def _measure_radius(self, track: _Track) -> None:
-        one, curve = track.last, track.estimate.curve
-        centre = one.p_WC[None]
-        s = curve.nearest(centre, one.middle[None])
-        distance = float(np.linalg.norm(curve.at(s) - centre))
-        if one.width > LEAST_WIDTH_PX * one.sigma / 0.2 and 0.3 < distance < self.settings.max_range:
-            track.radii = (track.radii + [0.5 * one.width * distance])[-30:]
 
     def _merge(self) -> None:
         """Make one of two wires that turned out to be the same: the older keeps its id."""
@@ -218,7 +207,7 @@ class LineMapper:
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
         # chords of a parabola leave it by their share of its sag; half of it once they are moved to its middle
         pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * self.settings.straightness)))))
-        radius = float(np.median(track.radii)) if len(track.radii) >= 5 else self.settings.radius
+        radius = estimate.radius if np.isfinite(estimate.radius) else self.settings.radius
         lines = []
         for k in range(pieces):
             a, b = low + length * k / pieces, low + length * (k + 1) / pieces

@@ -21,7 +21,7 @@ class LineObservation:
         rays_W: unit rays to the wire's axis, in order, shape (7, 3).
         ends_W: rays to the visible ends, shape (2, 3).
         sigma: 1-sigma of a ray across the arc [rad].
-        width: angle that the wire's thickness subtends [rad]; 0 where it was not measured.
+        width: angle between the planes through the optical centre that touch the wire [rad]; 0 where it was not measured.
         R_WC: attitude of the camera, shape (3, 3).
     """
 

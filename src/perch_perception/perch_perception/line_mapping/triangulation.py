@@ -4,6 +4,9 @@ Each sighting gives a plane through the camera's centre that contains the wire: 
 intersection is the start; a robust least-squares fit to all rays, with the poses' own errors, refines it and says how
 well it is known. The odometry drifts as it flies: in its frame the wire wanders, and is estimated where it is now. Where the camera moved along the wire or towards it, all planes are the same plane, and the depth
 would be off by metres: such baselines are refused.
+
+A wire has one radius, and looks the wider the nearer it is: sin(width / 2) = radius / distance. From afar triangulation gives the
+distance, and so the radius; near the wire, where the camera flies towards it, the radius gives the distance.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ from perch_perception.line_mapping.observation import LineObservation
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
+WIDTH_GATE = 0.1       # a width that says another distance than 3 sigma and three times this [m] is that of two wires, or of a part of one
+ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radius
 
 
 @dataclass(frozen=True)
@@ -33,9 +38,11 @@ class TriangulationConfig:
                                            doc="error of the camera's position from image to image, 1 sigma")
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="random walk of the odometry; the wire is where the newest sightings see it")
+    pose_drift_moved: float = config.quantity(0.01, unit="m/sqrt(m)", low=0.0, high=1.0, doc="the same over the distance moved")
     pose_rotation: float = config.quantity(0.1, unit="deg", above=0.0, high=10.0, doc="the same for its attitude")
     mount_rotation: float = config.quantity(0.3, unit="deg", above=0.0, high=10.0,
                                             doc="error of the camera's attitude on the body, per axis, 1 sigma: the same in all sightings")
+    width: float = config.quantity(0.01, above=0.0, high=1.0, doc="error of a wire's width in an image, beside that of its edges: share of it")
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
                                  doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
 
@@ -58,6 +65,7 @@ class WireEstimate:
         ratio: sigma2/sigma1 of the baseline.
         used: sightings that agree with it, shape (n,).
         mount: error of the camera's attitude on the body that fits them best, in C [rad], shape (3,).
+        radius: of the wire [m]; nan where it was never wide enough in an image.
     """
 
     curve: WireCurve
@@ -65,6 +73,7 @@ class WireEstimate:
     ratio: float
     used: np.ndarray
     mount: np.ndarray
+    radius: float
 
     def point_covariance(self, s: float) -> np.ndarray:
         """Covariance of the point at s in W [m^2], shape (3, 3); across the wire only."""
@@ -116,37 +125,50 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     curve, mount = (line, np.zeros(3)) if before is None else (before.curve, before.mount)
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
+    size = _log_radius(curve, observations)  # their median anew: widths of crossing wires may have come first
     used = np.ones(len(observations), bool)
-    times = np.array([o.time for o in observations])
-    drifted = settings.pose_drift**2 * np.maximum(np.diff(times, prepend=times[0]), 0.0)  # variance added before each sighting
-    rigid, rounds = np.zeros(len(times)), RIGID_ITERATIONS if before is None else 0
+    drifted = _drifted(observations, settings)
+    rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
     for walk in [rigid] * rounds + [drifted] * ITERATIONS:
         residual, _ = _whitened(curve, mount, observations, centres, rays, settings, walk.sum() - np.cumsum(walk))
-        size = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
-        used = size < 3.0 * max(1.0, float(np.median(size)))
-        weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
-        information, gradient = _wandering(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight, walk, settings,
-                                           curve.curvature, mount)
+        misfit = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
+        used = misfit < 3.0 * max(1.0, float(np.median(misfit)))
+        weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
+        information, gradient = _wandering(
+            _normal_equations(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight),
+            _normal_equations(*_widths(curve, size, observations, settings), weight), walk, settings, curve.curvature, mount)
         step = -np.linalg.solve(information, gradient)
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
-        curve, mount = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:]
+        curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
         raise DegenerateBaseline(ratio, settings.min_ratio)
-    covariance = np.linalg.inv(information)[:PARAMETERS, :PARAMETERS] * max(1.0, float(np.mean(size[used] ** 2)))
-    return WireEstimate(curve, covariance, ratio, used, mount)
+    covariance = np.linalg.inv(information)[:PARAMETERS, :PARAMETERS] * max(1.0, float(np.mean(misfit[used] ** 2)))
+    return WireEstimate(curve, covariance, ratio, used, mount, float(np.exp(size)))
 
 
-def _wandering(residual, jacobian, weight, walk, settings, curvature, mount):
-    """Information (8, 8) and gradient (8,) of the wire where it is after the last sighting, and of the camera's mount.
+def _drifted(observations: Sequence[LineObservation], settings: TriangulationConfig) -> np.ndarray:
+    """Variance that the odometry's random walk adds before each sighting, shape (n,) [m^2]."""
+    times, centres = np.array([o.time for o in observations]), np.array([o.p_WC for o in observations])
+    waited = np.maximum(np.diff(times, prepend=times[0]), 0.0)
+    moved = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+    return settings.pose_drift**2 * waited + settings.pose_drift_moved**2 * moved
+
+
+def _normal_equations(residual, jacobian, weight):
+    """J' w J (n, 9, 9) and J' w r (n, 9) of every sighting."""
+    return np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian), np.einsum("n,nki,nk->ni", weight, jacobian, residual)
+
+
+def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
+    """Information (9, 9) and gradient (9,) of the wire where it is after the last sighting, of the camera's mount and the radius.
 
     A filter in information form from the oldest sighting to the newest: before each, the wire's two offsets lose what the
     odometry's random walk takes, W = walk G G', so that I <- (I^-1 + W)^-1. All sightings from before a drift share it:
     together they know the wire's place no better than that, however many they are.
     """
-    parts = np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian)
-    slopes = np.einsum("n,nki,nk->ni", weight, jacobian, residual)
-    tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2)])
-    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount])
+    parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
+    tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [1e-6]])
+    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [0.0]])
     for part, slope, variance in zip(parts, slopes, walk):
         if variance > 0.0:
             a, b, c = information[0, 0] + 1.0 / variance, information[1, 1] + 1.0 / variance, information[0, 1]
@@ -157,8 +179,39 @@ def _wandering(residual, jacobian, weight, walk, settings, curvature, mount):
     return information, gradient
 
 
+def _log_radius(curve, observations):
+    """Logarithm of the radius that the widths say on the whole; nan without any."""
+    said = [np.log(np.sin(0.5 * o.width)) + np.log(np.linalg.norm(_foot(curve, o.p_WC)[0])) for o in observations if o.width > 0.0]
+    return float(np.median(said)) if said else float("nan")
+
+
+def _foot(curve, centre):
+    """From a camera to the point of the wire that is square to it, shape (3,) [m], and the s of that point."""
+    to = curve.point - centre
+    s = -float(to @ curve.direction)
+    return to + s * curve.direction + 0.5 * curve.curvature * s * s * curve.axes[:, 1], s
+
+
+def _widths(curve, size, observations, settings):
+    """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, and their Jacobian (n, 1, 9)."""
+    residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, ALL))
+    e1, e2, _ = curve.axes.T
+    for k, one in enumerate(observations):
+        if one.width == 0.0:
+            continue
+        to, s = _foot(curve, one.p_WC)
+        distance = max(float(np.linalg.norm(to)), 1e-3)
+        misfit = np.log(np.sin(0.5 * one.width)) + np.log(distance) - size
+        sigma = np.sqrt(settings.width**2 + (one.sigma / one.width) ** 2 + (settings.pose_position / distance) ** 2)
+        if abs(misfit) < 3.0 * np.hypot(sigma, WIDTH_GATE / distance):
+            x, y = to @ e1 / distance**2, to @ e2 / distance**2
+            residual[k] = misfit / sigma
+            jacobian[k, 0] = np.array([x, y, s * x, s * y, 0.5 * s * s * y, 0.0, 0.0, 0.0, -1.0]) / sigma
+    return residual, jacobian
+
+
 def _whitened(curve, mount, observations, centres, rays, settings, walk):
-    """Residuals (n, k) in sigmas and their Jacobian (n, k, 8) by wire and mount, decorrelated within each image.
+    """Residuals (n, k) in sigmas and their Jacobian (n, k, 9) by wire, mount and radius, decorrelated within each image.
 
     All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. `walk` (n,)
     is added to the variance of the positions [m^2].
@@ -176,5 +229,5 @@ def _whitened(curve, mount, observations, centres, rays, settings, walk):
     root = np.linalg.cholesky(covariance)
     by_mount = by_rotation.reshape(n, k, 3) @ np.array([o.R_WC for o in observations])
     both = np.linalg.solve(root, np.concatenate([against.angles.reshape(n, k, 1) + by_mount @ mount[:, None],
-                                                 against.jacobian.reshape(n, k, PARAMETERS), by_mount], axis=2))
+                                                 against.jacobian.reshape(n, k, PARAMETERS), by_mount, np.zeros((n, k, 1))], axis=2))
     return both[..., 0], both[..., 1:]

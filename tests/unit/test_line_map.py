@@ -1,0 +1,153 @@
+"""The map of wires: from rendered images, its ids and extents, and what changes it."""
+
+import numpy as np
+import pytest
+from oracles.wires import MOUNT, WIRE, cables, observe
+from perch_core import so3
+from perch_perception.line_mapping import (
+    LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, detect_lines, place)
+from perch_perception.pose_buffer import BodyState
+from perch_sim.rendering import Renderer
+
+
+@pytest.fixture(scope="module")
+def wires():
+    hanging, scene = cables(0.1)
+    return hanging, Renderer(scene, MOUNT, seed=1)
+
+
+class Flight:
+    """Images along a path, with the estimator's errors: a drift, a turned camera, and noise from image to image."""
+
+    def __init__(self, renderer, seed):
+        self.renderer, self.rng = renderer, np.random.default_rng(seed)
+        self.drift = np.array([0.005, 0.005, 0.005]) * self.rng.standard_normal(3)
+        self.turn = so3.exp(np.radians(0.2) * self.rng.standard_normal(3))
+        self.mapper = LineMapper(MapperConfig(radius=0.012))
+        self.maps = []
+
+    def fly(self, start, end, images):
+        for k, share in enumerate(np.linspace(0.0, 1.0, images)):
+            p = np.array(start) + share * (np.array(end) - np.array(start))
+            R = so3.exp(np.array([0.04 * np.sin(5 * share), -0.2 + 0.05 * np.sin(7 * share), 0.03 * np.sin(9 * share)]))
+            image = self.renderer.render([(p, R)], self.rng)
+            noise = so3.exp(np.radians(0.03) * self.rng.standard_normal(3))
+            body = BodyState(0.1 * len(self.maps), p + self.drift + 0.001 * self.rng.standard_normal(3),
+                             so3.quat_from_matrix(noise @ self.turn @ R), np.zeros(3), np.zeros(3),
+                             np.diag([2.5e-5] * 3 + [1.2e-5] * 3))
+            seen = [place(one, body, MOUNT) for one in detect_lines(image, MOUNT.camera, LineDetectionConfig())]
+            self.maps.append(self.mapper.update(body.time, body, seen))
+        return self.maps[-1]
+
+
+def map_errors(lines, cable, around, reach=1.5):
+    """Distances [m] of a cable's points within `reach` of y = `around` from the nearest mapped segment."""
+    points = cable.sample(400)
+    points = points[np.abs(points[:, 1] - around) < reach]
+    return np.min([line.segment.distance(points) for line in lines], axis=0)
+
+
+@pytest.mark.parametrize(("start", "end"), [((0.0, 0.0, 1.8), (0.0, 0.0, 2.6)), ((0.0, -0.2, 1.9), (0.3, 0.2, 2.55))],
+                         ids=["0.8 m up", "0.8 m askew"])
+def test_maps_within_three_centimetres_from_a_motion_of_80_cm(wires, start, end):
+    hanging, renderer = wires
+    errors = []
+    for seed in range(4):
+        result = Flight(renderer, seed).fly(start, end, 16)
+        ids = [line.segment.id % 100 for line in result.lines]
+        assert len(set(ids)) == 3 and not result.degenerate, result.message
+        errors += [np.mean(map_errors(result.lines, cable, 0.0)) for cable in hanging]
+        for line in result.lines:
+            assert line.segment.radius == pytest.approx(0.012, rel=0.5)
+    assert np.mean(errors) <= 0.03
+    assert np.max(errors) <= 0.06
+
+
+def test_ids_are_stable_and_the_extent_is_what_was_seen(wires):
+    hanging, renderer = wires
+    flight = Flight(renderer, 7)
+    flight.fly((0.0, 0.0, 1.8), (0.0, 0.0, 2.6), 14)
+    before = {line.segment.id: line.segment for line in flight.maps[-1].lines}
+    flight.fly((0.0, 0.0, 2.6), (0.0, 0.3, 2.2), 8)
+    after = {line.segment.id: line.segment for line in flight.maps[-1].lines}
+    assert set(before) == set(after)
+    for number, segment in before.items():
+        assert segment_gap(segment, after[number]) < 0.05
+    # 640 px at f = 385 px see 0.83 of the distance (3 to 4 m) to either side, and the camera moves by 0.3 m
+    assert all(1.5 < abs(end[1]) < 3.9 for s in whole(after).values() for end in s)
+
+
+def segment_gap(a, b):
+    return float(np.linalg.norm(np.cross(b.centre - a.centre, a.direction)))
+
+
+def whole(segments):
+    """Outer ends of each wire over its pieces."""
+    out = {}
+    for number, segment in segments.items():
+        ends = np.concatenate([np.array(segment.ends), out.get(number % 100, np.zeros((0, 3)))])
+        out[number % 100] = ends[[np.argmin(ends[:, 1]), np.argmax(ends[:, 1])]]
+    return out
+
+
+def test_motion_along_the_wires_is_called_degenerate(wires):
+    _, renderer = wires
+    result = Flight(renderer, 3).fly((0.0, -0.5, 2.2), (0.0, 0.5, 2.2), 12)
+    assert result.degenerate and result.lines == ()
+    assert "baseline ratio" in result.message and "move across" in result.message
+
+
+def test_sightings_that_could_be_either_wire_change_nothing():
+    """Two wires that coincide from where the camera is: the sighting is left alone."""
+    rng = np.random.default_rng(8)
+    near, far = WireCurve(np.array([2.0, 0.0, 2.0]), np.array([0.0, 1.0, 0.0])), \
+        WireCurve(np.array([4.0, 0.0, 2.02]), np.array([0.0, 1.0, 0.0]))
+    mapper = LineMapper(MapperConfig())
+    for k in range(12):
+        centre = np.array([0.0, 0.0, 1.0 + 0.08 * k])
+        body = BodyState(0.1 * k, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        mapper.update(0.1 * k, body, [observe(rng, w, centre, 2e-4, time=0.1 * k) for w in (near, far)])
+    before = mapper.map(1.2)
+    assert len(before.lines) == 2
+    centre = np.array([0.0, 0.0, 2.0])
+    body = BodyState(1.3, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+    after = mapper.update(1.3, body, [observe(rng, near, centre, 2e-4, time=1.3)])
+    assert [line.observations for line in after.lines] == [line.observations for line in before.lines]
+
+
+def test_false_sightings_are_forgotten():
+    rng = np.random.default_rng(9)
+    mapper = LineMapper(MapperConfig(forget_after=1.0))
+    body = BodyState(0.0, np.array([0, 0, 2.0]), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
+    mapper.update(0.0, body, [observe(rng, WIRE, np.array([0, 0, 2.0]))])
+    assert len(mapper._tracks) == 1
+    mapper.update(1.5, body, [])
+    assert mapper._tracks == []
+
+
+def test_the_map_follows_an_odometry_that_drifts():
+    """What the newest sightings say counts more than what the oldest did: the vehicle will fly there from where it is now."""
+    wire, errors = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), {}
+    for drift in (0.0, 0.01):  # of the mapper; the odometry's own is 1 cm/s
+        rng, mapper = np.random.default_rng(10), LineMapper(MapperConfig(triangulation=TriangulationConfig(pose_drift=drift)))
+        for k in range(100):
+            time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])  # up and down
+            believed = true + time * np.array([0.003, 0.0, -0.01])
+            body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+            lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed)]).lines
+        assert len(lines) == 1
+        errors[drift] = np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - believed + true)[[0, 2]])
+    assert errors[0.01] < 0.3 * errors[0.0] and errors[0.01] < 0.025, errors
+
+
+def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
+    """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles."""
+    rng, mapper = np.random.default_rng(11), LineMapper(MapperConfig())
+    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.25])
+    for k in range(80):
+        time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
+        believed = true + (jump if k >= 30 else 0.0)
+        body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed)]).lines
+    assert len(lines) == 1
+    assert np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - jump)[[0, 2]]) < 0.03
