@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perch_core import so3
+from perch_core import config, so3
 from perch_core.errors import ConfigError, PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, V
@@ -64,6 +64,16 @@ def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlan
     later = recovery.states[recovery.times > 0.3 * recovery.duration]
     nearest = min(float(scaled_clearance(later[:, P], later[:, Q], line, vehicle.body_radii).min()) for line in planned.request.lines)
     assert (1 + nearest) ** 2 > (1 + planner.settings.margins.leaving) / (1 - planner.settings.margins.leaving) - 0.02
+
+
+def test_the_wire_is_met_from_above_the_gripper_with_room_beside_the_rotors_until_shortly_before() -> None:
+    """A map that is centimetres off must not bring the rotors to the wire before the gripper."""
+    settings = config.replace(SETUP.settings, margins=config.replace(SETUP.settings.margins, approaching=0.4))
+    perch = PowerlinePlanner(VEHICLE, settings).plan(replace(REQUEST, with_recovery=False)).perch
+    open_air = perch.states[(perch.times < 0.87 * perch.duration)]
+    nearest = float(scaled_clearance(open_air[:, P], open_air[:, Q], REQUEST.target(), VEHICLE.body_radii).min())
+    assert (1 + nearest) ** 2 > 1.4 / 0.6 - 0.05
+    assert all(bound.holds for bound in perch.bounds)
 
 
 def test_a_recovery_from_inside_a_wire_is_refused(planner: PowerlinePlanner, planned: PlannedProblem) -> None:

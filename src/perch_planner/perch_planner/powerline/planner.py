@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -44,6 +44,7 @@ class _Task:
         duration: bounds of T [s].
         margins: to begin with.
         leaving: clearance that the margins grow to within a quarter of the time; 0: they stay as they are.
+        approaching: clearance that they have until a tenth of the time before the end; 0: the same.
         radius_reduction: taken off the wires' radius [m].
         guess: attempt and N -> states and inputs.
         accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
@@ -61,6 +62,7 @@ class _Task:
     duration: tuple[float, float]
     margins: Margins
     leaving: float
+    approaching: float
     radius_reduction: float
     guess: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
     accuracy: tuple[float, float, float]
@@ -111,8 +113,9 @@ class PowerlinePlanner:
             return guess.perch_guess(self.solver.model, request.start, pose.p_WB, pose.s3_W, s.height_min + 0.05, intervals,
                                      T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn)
 
+        approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
-                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, 0.0, first_guess,
+                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, approaching, 0.0, first_guess,
                      (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
 
     def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
@@ -128,7 +131,7 @@ class PowerlinePlanner:
         nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
         pinned = np.array([1.0, 1.0, *[s.end_factor] * 4])  # upright and at rest, but not at one place
         return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
-                     False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, reduction, first_guess,
+                     False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, reduction, first_guess,
                      (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
@@ -141,13 +144,16 @@ class PowerlinePlanner:
         height = min(margins.height, max(0.0, 0.5 * (start[2] - self.settings.height_min)))
         for reduction in (0.0, RADIUS_REDUCTION):
             thin = [replace(line, radius=max(line.radius - reduction, 1e-3)) for line in lines]
-            clearance = min((float(scaled_clearance(start[None, P], start[None, Q], line, self.vehicle.body_radii)[0])
-                             for line in thin), default=np.inf)
+            clearance = self._clearance(start, thin)
             if clearance > 0:
-                share = 1.0 if np.isinf(clearance) else ((1 + clearance) ** 2 - 1) / ((1 + clearance) ** 2 + 1)
-                return replace(margins, height=height, clearance=min(margins.clearance, 0.5 * share)), reduction
+                return replace(margins, height=height, clearance=min(margins.clearance, 0.5 * _share(clearance))), reduction
         raise PlanningRefusal("start_invalid", "clearance [P:eq14j]", clearance,
                               f"no recovery: the body cuts a line, scaled distance {1 + clearance:.2f} < 1")
+
+    def _clearance(self, state: np.ndarray, lines: Sequence[Segment]) -> float:
+        """Scaled distance of the nearest line from the body, less 1, at a state (17,); inf without lines."""
+        return min((float(scaled_clearance(state[None, P], state[None, Q], line, self.vehicle.body_radii)[0]) for line in lines),
+                   default=np.inf)
 
     def _fly(self, task: _Task) -> Manoeuvre:
         """Solve, fly and check until the check passes.
@@ -170,7 +176,8 @@ class PowerlinePlanner:
                 end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
                 height_min=s.height_min + margins.height,
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
-                body_rate=vehicle.body_rate_max - margins.body_rate, clearance=_clearances(margins.clearance, task.leaving, intervals), states=states, inputs=inputs,
+                body_rate=vehicle.body_rate_max - margins.body_rate, states=states, inputs=inputs,
+                clearance=_clearances(margins.clearance, task.leaving, task.approaching, intervals),
                 defects=np.zeros((intervals, STATES + 1)))
             structure = Structure(intervals, len(lines), task.perception, solver_name)
             found = self.solver.solve(structure, numbers, numbers.end_weights * task.pinned, phase)
@@ -200,10 +207,16 @@ class PowerlinePlanner:
                               "start farther away, higher, or choose another pitch")
 
 
-def _clearances(first: float, later: float, intervals: int) -> np.ndarray:
-    """Clearance margins of all nodes but the first, shape (N,): from what the start leaves to what is wanted in the open."""
-    share = np.minimum(4.0 * np.arange(1, intervals + 1) / intervals, 1.0)
-    return first + share * max(later - first, 0.0)
+def _share(clearance: float) -> float:
+    """(d^2 - 1) / (d^2 + 1) of a scaled distance d = 1 + clearance: what margins are counted in."""
+    return 1.0 if np.isinf(clearance) else ((1 + clearance) ** 2 - 1) / ((1 + clearance) ** 2 + 1)
+
+
+def _clearances(least: float, leaving: float, approaching: float, intervals: int) -> np.ndarray:
+    """Clearance margins of all nodes but the first, shape (N,): `least` where a wire is left or met, more in the open."""
+    past = np.arange(1, intervals + 1) / intervals
+    open_air = np.maximum(np.minimum(4.0 * past, 1.0) * (leaving - least), np.minimum(10.0 * (1.0 - past), 1.0) * (approaching - least))
+    return least + np.maximum(open_air, 0.0)
 
 
 def _tightened(margins: Margins, broken: list[Bound]) -> Margins:
