@@ -6,7 +6,8 @@ from oracles.wires import MOUNT, WIRE, cables, observe
 from perch_core import so3
 from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, detect_lines, place)
-from perch_perception.pose_buffer import BodyState
+from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+from perch_perception.powerline_mapper_node import mapping_pose
 from perch_sim.rendering import Renderer
 
 
@@ -151,3 +152,14 @@ def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
         lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed)]).lines
     assert len(lines) == 1
     assert np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - jump)[[0, 2]]) < 0.03
+
+
+def test_nothing_is_mapped_from_a_pose_that_is_hardly_known():
+    poses, level = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0])
+    for time, sigma in ((1.0, 0.1), (1.02, 0.1), (1.04, 3.0), (1.06, 3.0)):
+        poses.add(BodyState(time, np.array([time, 0.0, 2.0]), level, np.zeros(3), np.zeros(3), np.eye(6) * sigma**2))
+    assert mapping_pose(poses, 1.01, 2.0).p_WB[0] == pytest.approx(1.01)
+    with pytest.raises(StampError, match="known to 3.00 m only"):
+        mapping_pose(poses, 1.05, 2.0)
+    with pytest.raises(StampError, match="older"):
+        mapping_pose(poses, 0.5, 2.0)

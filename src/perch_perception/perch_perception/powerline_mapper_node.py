@@ -17,7 +17,7 @@ from sensor_msgs.msg import Image
 
 from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
-from perch_perception.pose_buffer import StampError
+from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.ros.camera_node import CameraNode
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
@@ -67,10 +67,7 @@ class PowerlineMapperNode(CameraNode[PowerlineMapperConfig]):
 
     def _map(self, msg: Image, exposed: float) -> LineMap:
         image = (rgb_image if self._red else mono_image)(msg, self._mount.camera)
-        body = self._buffer.at(exposed)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(body.covariance[:3, :3])[-1]))
-        if sigma > self.params.max_pose_sigma:
-            raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")
+        body = mapping_pose(self._buffer, exposed, self.params.max_pose_sigma)
         self._images += 1
         sightings = detect_lines(image, self._mount.camera, self.params.detection)
         return self._mapper.update(exposed, body, [place(one, body, self._mount) for one in sightings])
@@ -84,6 +81,19 @@ class PowerlineMapperNode(CameraNode[PowerlineMapperConfig]):
             values = {"images": self._images, "lines": len(msg.lines), "dropped": self._pending.dropped,
                       "cost_ms_median": float(np.median(costs)), "cost_ms_p99": float(np.percentile(costs, 99))}
             self.publish_diagnostics(exposed, values, 1 if msg.message else 0, msg.message or "ok")
+
+
+def mapping_pose(poses: PoseBuffer, exposed: float, max_sigma: float) -> BodyState:
+    """Where the vehicle was at an exposure [s], when that is known well enough to map.
+
+    Raises:
+        StampError: there is no pose at this stamp, or its position is less certain than `max_sigma` [m].
+    """
+    body = poses.at(exposed)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(body.covariance[:3, :3])[-1]))
+    if sigma > max_sigma:
+        raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")
+    return body
 
 
 def map_message(lines: LineMap, exposed: float, problem: str = "") -> PowerlineArray:

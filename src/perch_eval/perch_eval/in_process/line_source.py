@@ -10,7 +10,7 @@ from perch_core.surface import PerchSurface
 from perch_eval.in_process.frame_source import FrameSource
 from perch_perception.line_mapping import LineMapper, detect_lines, place
 from perch_perception.pose_buffer import StampError
-from perch_perception.powerline_mapper_node import PowerlineMapperConfig, map_message
+from perch_perception.powerline_mapper_node import PowerlineMapperConfig, map_message, mapping_pose
 from perch_sim.camera_stream import Delivery
 from perch_sim.state_history import StateHistory
 
@@ -32,12 +32,8 @@ class LineSource(FrameSource):
             return None
         self._used = exposed
         try:
-            body = self._buffer.at(exposed)
+            body = mapping_pose(self._buffer, exposed, self._params.max_pose_sigma)
         except StampError as error:
             return map_message(self._mapper.map(exposed), exposed, str(error))
-        sigma = float(np.sqrt(np.linalg.eigvalsh(body.covariance[:3, :3])[-1]))
-        if sigma > self._params.max_pose_sigma:
-            problem = f"the odometry is known to {sigma:.2f} m only: nothing is mapped"
-            return map_message(self._mapper.map(exposed), exposed, problem)
         sightings = detect_lines(delivery.image.result(), self._mount.camera, self._params.detection)
         return map_message(self._mapper.update(exposed, body, [place(one, body, self._mount) for one in sightings]), exposed)
