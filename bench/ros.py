@@ -14,6 +14,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
+from machine import LateWakeUps, awake
 from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.conversions import to_seconds
@@ -122,17 +123,18 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[Probe]:
 def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geometric") -> list[Figure]:
     """A hover without cameras by the wall clock: rates of the 500 Hz chain, and what was missed."""
     overrides = {"vehicle": {"cameras": "none"}, "controller": {"controller.type": law}}
-    with running(scenario, folder, lockstep=False, overrides=overrides) as probe:
+    with awake(), running(scenario, folder, lockstep=False, overrides=overrides) as probe:
         probe.take_off()
         counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
                      ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
         before = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
-        rates = {topic: [] for topic in RATES}
+        rates, machine = {topic: [] for topic in RATES}, LateWakeUps()
         for _ in range(windows):
             counts = dict(probe.counts)
             span = probe.listen(WINDOW)
             for topic in RATES:
                 rates[topic].append((probe.counts[topic] - counts[topic]) / span)
+        late = machine.share()
         after = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
         delay = float(probe.diagnostics["vehicle"]["command_us_median"])
     out = [figure(f"real time, {law}: rate of {topic}", "Hz", samples, bar=499.0, comparison="median >=")
@@ -141,7 +143,8 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
         share = 100.0 * (new - old) / max(1, new_all - old_all)
         out.append(figure(f"real time, {law}: {part.replace('_', ' ')}, {node}", "% of steps", [share],
                           bar=None if part == "commands_missed" else 0.1))
-    return [*out, figure(f"real time, {law}: command after its IMU sample", "us", [delay])]
+    return [*out, figure(f"real time, {law}: bare timer beside it late by a period", "% of steps", [late]),
+            figure(f"real time, {law}: command after its IMU sample", "us", [delay])]
 
 
 def lockstep(scenario: Scenario, folder: Path, windows: int, composed: tuple[str, ...]) -> Figure:

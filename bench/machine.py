@@ -1,0 +1,77 @@
+"""What the machine itself does to a program that has to be on time."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+
+from perch_core.timing import CONTROL_PERIOD_NS
+
+_spawn = multiprocessing.get_context("spawn")
+
+
+@contextmanager
+def awake() -> Iterator[None]:
+    """Keep the cores from falling asleep, by work that yields to everything else.
+
+    A sleeping core of a virtual machine has been given away by its host and is back after milliseconds; on real machines for
+    real time idle=poll or the governor does this.
+    """
+    processes = [_start(_spin) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.terminate()
+            process.join()
+
+
+class LateWakeUps:
+    """Counts how often a program that does nothing but wake once per control period, before everyone else, is late by more
+    than a period: what no node can be better than. Linux, with permission for real-time scheduling; otherwise it runs as any
+    other."""
+
+    def __init__(self) -> None:
+        self._pipe, theirs = _spawn.Pipe()
+        self._process = _start(_wake, theirs)
+
+    def share(self) -> float:
+        """Percentage of late wake-ups since the start; ends the counting."""
+        self._pipe.send(None)
+        late, all_of_them = self._pipe.recv()
+        self._process.join()
+        return 100.0 * late / max(1, all_of_them)
+
+
+def _start(work, *arguments) -> BaseProcess:
+    process = _spawn.Process(target=work, args=arguments, daemon=True)
+    process.start()
+    return process
+
+
+def _spin() -> None:
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    while True:
+        pass
+
+
+def _wake(pipe: Connection) -> None:
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+    due, late, count = time.monotonic_ns(), 0, 0
+    while not pipe.poll():
+        due += CONTROL_PERIOD_NS
+        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+        behind = time.monotonic_ns() - due
+        count += 1
+        late += behind > CONTROL_PERIOD_NS
+        if behind > CONTROL_PERIOD_NS:  # those that were slept over are late too
+            skipped = behind // CONTROL_PERIOD_NS
+            late, count, due = late + skipped - 1, count + skipped, due + skipped * CONTROL_PERIOD_NS
+    pipe.send((late, count))
