@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_core.scenario import load_scenario
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
-    from perch_eval.nodes import ALL_NODES, node_programs
+    from perch_eval.nodes import node_programs, sharing
     from perch_eval.stack import Stack
     from perch_eval.view.address import check_free
     from ros_graph.connection import visit
@@ -117,8 +117,7 @@ def run(arguments: argparse.Namespace) -> None:
         overrides=overrides,
     )
     folder = (arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute()
-    composed = () if arguments.composed is None else arguments.composed or ALL_NODES
-    programs = node_programs(launches, folder, namespace=arguments.namespace, composed=composed)
+    programs = node_programs(launches, folder, namespace=arguments.namespace, composed=sharing(arguments.composed))
     stack = Stack(programs, folder, on_line=printer([program.name for program in programs]))
     try:
         stack.start()

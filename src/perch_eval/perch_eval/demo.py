@@ -14,7 +14,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.scenario import Scenario, load_scenario
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
-from perch_eval.nodes import ALL_NODES, FAST_NODES, programs
+from perch_eval.nodes import FAST_NODES, programs, sharing
 from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
 from perch_eval.report import build_report, inspection_words
 from perch_eval.stack import Stack, StackError
@@ -120,9 +120,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _composed(args: argparse.Namespace) -> Collection[str]:
     """Real time has deadlines at 500 Hz that a neighbour's work in the same process would miss."""
-    if args.composed is not None:
-        return args.composed or ALL_NODES
-    return () if args.separate or args.realtime else FAST_NODES
+    return sharing(args.composed, otherwise=() if args.separate or args.realtime else FAST_NODES)
 
 
 def summary(report: dict) -> str:

@@ -21,6 +21,11 @@ FAST_NODES = ("vehicle", "estimator", "controller", "mission", "recorder")
 """Nodes with a little to do at many steps: between processes their messages cost more than their work."""
 
 
+def sharing(names: Collection[str] | None, otherwise: Collection[str] = ()) -> Collection[str]:
+    """Nodes that share a process by the option `--composed [NODE ...]`: all without names, `otherwise` without the option."""
+    return otherwise if names is None else names or ALL_NODES
+
+
 def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", composed: Collection[str] = (),
              lockstep: bool = True, record: Path | None = None, hold_for_goal: bool = False,
              overrides: Overrides | None = None, namespace: str = "", folder: Path | None = None) -> tuple[Program, ...]:

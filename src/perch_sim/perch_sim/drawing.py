@@ -120,6 +120,7 @@ class DrawnInProcesses:
         """End the processes."""
         for draftsman in self._draftsmen.values():
             draftsman.process.terminate()
+            draftsman.process.join(1.0)
 
 
 class _Draftsman:
