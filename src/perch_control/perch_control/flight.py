@@ -12,6 +12,7 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import ControlOutput, packed_vehicle
 from perch_control.geometric.controller import NO_COMPENSATION
 from perch_control.geometric.step import predicted
+from perch_control.guidance import Running
 from perch_control.l1 import L1Augmentation
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import Command, CommandRefused, State, StepResult
@@ -39,8 +40,8 @@ class Law(Protocol):
     def believe(self, vehicle: Vehicle) -> None:
         """Fly a vehicle whose thrust differs from what its file says."""
 
-    def prepare(self, source: Any, contact: bool) -> Any:
-        """The reference to follow for a trajectory, which ends in a contact or not."""
+    def prepare(self, source: Any, contact: bool, running: Running | None = None) -> Any:
+        """The reference to follow for a trajectory, which ends in a contact or not, and takes over from a running reference."""
 
     def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
                 compensation: tuple[float, ...], time_to_contact: float) -> ControlOutput:
@@ -176,7 +177,8 @@ class FlightController:
         check_start(order, m.now, m.expected(max(order.start, m.now)), self.settings)
         if order.at_end is AtEnd.CONTACT and m.state is State.HOVERING and self.compensator is not None:
             self._thrust.adopt(self.law, self.compensator)
-        self._schedule.put(order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT))
+        running = Running(m.source, order.start - m.start) if m.state is State.TRACKING and order.start >= m.now else None
+        self._schedule.put(order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT, running))
 
     def keep_ready(self, order: Order) -> None:
         """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]

@@ -129,6 +129,30 @@ class Blend:
         return unpacked(self.many(np.array([t]))[0])
 
 
+@dataclass(frozen=True)
+class Running:
+    """A running reference, and the time on it at which another one shall take over [s]."""
+
+    source: object
+    time: float
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """Where it is then."""
+        return self.source.setpoint(self.time)
+
+    @property
+    def carried(self) -> np.ndarray:
+        """The lasting offset with which it ends (position, velocity), shape (2, 3); zero without one."""
+        source = self.source
+        while isinstance(source, Blend):
+            if source.lasting:
+                end = source.offset.setpoint(source.duration - source.start)
+                return np.array([end.p, end.v])
+            source = source.source
+        return np.zeros((2, 3))
+
+
 def blended(old: Setpoint, source, start: float, end: float, duration: float = 0.5):
     """`source` from its time `start` on, taken over from the old setpoint without a jump in position, velocity or
     acceleration, within half of the time to `end`; the source itself where it continues the old one exactly."""

@@ -10,6 +10,7 @@ import numpy as np
 from perch_control.allocation import mixing_columns
 from perch_control.geometric.rehearsal import flown, rehearsed
 from perch_control.geometric.step import control_step
+from perch_control.guidance import Running
 from perch_control.reference import Following
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
@@ -105,12 +106,18 @@ class GeometricController:
     def begin(self) -> None:
         """Take over in flight: nothing is remembered from one period to the next."""
 
-    def prepare(self, source, contact: bool):
-        """The reference to follow for a trajectory: one that ends in contact is rehearsed and offset first."""
+    def prepare(self, source, contact: bool, running: Running | None = None):
+        """The reference to follow for a trajectory: one that ends in contact is rehearsed and offset first.
+
+        Args:
+            source: the trajectory.
+            contact: it ends in a contact.
+            running: reference from which it takes over; None: the vehicle is where the trajectory begins.
+        """
         gains = self.gains
         if not (contact and gains.rehearse):
             return source
-        return rehearsed(source, self.vehicle, self, gains.contact_speed, gains.contact_overshoot)
+        return rehearsed(source, self.vehicle, self, gains.contact_speed, gains.contact_overshoot, running)
 
     def rehearse(self, start: np.ndarray, rotors: RotorEstimate, table: np.ndarray, period: float,
                  duration: float) -> np.ndarray:

@@ -18,8 +18,8 @@ from perch_core.timing import CONTROL_PERIOD
 from perch_core.vector3 import quaternion_of
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.geometric.step import control_step, drag_compensation, predicted
-from perch_control.guidance import Blend, Polynomial
-from perch_control.reference import packed_many
+from perch_control.guidance import Blend, Polynomial, Running
+from perch_control.reference import Setpoint, packed_many
 from perch_control.rotor_lag import RotorEstimate, approached, thrusts
 
 _ROUNDS = 5
@@ -55,12 +55,13 @@ def flown(start, speed, table, gains, limits, narrow, window, lead, period, dura
     return np.array(state)
 
 
-def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, overshoot: float):
+def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, overshoot: float, running: Running | None = None):
     """A contact trajectory, offset so that the controller arrives where and as fast as planned.
 
     The offset grows while the thrust is still high and goes on as a straight line through the rotation at the end, which
     therefore stays as it was rehearsed: what is added to the end's position and velocity arrives there nearly unchanged,
-    and a few rounds converge.
+    and a few rounds converge. A trajectory that continues one that was rehearsed (a new plan in flight) begins with the offset
+    that is flown by then: it is not taken back first, and the new rehearsal starts from there.
 
     Args:
         source: reference with `duration` and `setpoint(t)`.
@@ -68,27 +69,29 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
         controller: a `GeometricController`.
         contact_speed: least speed into the surface at the contact [m/s]; a slower plan arrives with this.
         overshoot: the end lies so far behind the surface [m]: a vehicle that estimation errors hold back touches it, too.
+        running: reference from which the trajectory takes over; None: the vehicle is where the trajectory begins.
 
     Returns:
         The reference to follow; `source` itself where it is too short, or where the rehearsal comes no closer.
     """
     T = source.duration
-    n = int(min(_SPAN, T) / CONTROL_PERIOD)
+    first = np.zeros((4, 3)) if running is None else _apart(running.setpoint, source.setpoint(0.0))
+    n = int((T if first.any() else min(_SPAN, T)) / CONTROL_PERIOD)
     growth = n * CONTROL_PERIOD - _QUIET
     if growth < _QUIET:
         return source
-    begin, lead = T - n * CONTROL_PERIOD, controller.lead
+    begin, lead = (0.0 if first.any() else T - n * CONTROL_PERIOD), controller.lead
     times = np.arange(n) * CONTROL_PERIOD + lead
     table = packed_many(source, begin + times)
-    start, rotors = _on_reference(source.setpoint(begin), vehicle)
+    start, rotors = _on_reference(running.setpoint if first.any() else source.setpoint(begin), vehicle)
     end = source.setpoint(T)
     s3 = np.add(end.a, (0.0, 0.0, GRAVITY)) / np.linalg.norm(np.add(end.a, (0.0, 0.0, GRAVITY)))
     faster = max(contact_speed + float(np.dot(end.v, s3)), 0.0)
     wanted = np.array([np.subtract(end.p, overshoot * s3), np.subtract(end.v, faster * s3)])
-    delta, best, least = np.zeros((2, 3)), None, np.inf
+    delta, best, least = running.carried if first.any() else np.zeros((2, 3)), None, np.inf
     for _ in range(_ROUNDS):
         shifted = table.copy()
-        shifted[:, :15] += _offset(delta, growth).many(times)[:, :15]
+        shifted[:, :15] += _offset(delta, growth, first).many(times)[:, :15]
         final = controller.rehearse(start, rotors, shifted, CONTROL_PERIOD, n * CONTROL_PERIOD)
         miss = np.array([final[0:3], final[3:6]]) - wanted
         error = float(np.linalg.norm(miss[0]) / _POSITION_SCALE + np.linalg.norm(miss[1]) / _SPEED_SCALE)
@@ -97,14 +100,26 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
         if error < _CLOSE:
             break
         delta = np.clip(delta - miss, -_LARGEST, _LARGEST)
-    return Blend(source, begin, _offset(best, growth), lasting=True) if best.any() else source
+    return Blend(source, begin, _offset(best, growth, first), lasting=True) if best.any() or first.any() else source
 
 
-def _offset(delta: np.ndarray, duration: float) -> Polynomial:
-    """From rest, without jerk at either end, onto the line that has offset `delta` (position, velocity) `_QUIET` later."""
-    p, v = delta[0] - _QUIET * delta[1], delta[1] * duration / 7.0
-    zero = np.zeros(3)
-    points = np.stack([zero, zero, zero, zero, p - 3.0 * v, p - 2.0 * v, p - v, p], axis=-1)
+def _apart(running: Setpoint, start: Setpoint) -> np.ndarray:
+    """What the running reference has beyond a trajectory's start: position and three derivatives, shape (4, 3); zero where
+    that is rounding."""
+    gap = np.array([np.subtract(getattr(running, k), getattr(start, k)) for k in ("p", "v", "a", "j")])
+    return gap if np.abs(gap[:3]).max() > 1e-6 else np.zeros((4, 3))
+
+
+def _offset(delta: np.ndarray, duration: float, first: np.ndarray) -> Polynomial:
+    """From `first` (offset and three derivatives) onto the line that has offset `delta` (position, velocity) `_QUIET` later.
+
+    Bernstein coefficients of degree 7, from both ends; on the line nothing accelerates.
+    """
+    T, (p0, v0, a0, j0) = duration, first
+    p, v = delta[0] - _QUIET * delta[1], delta[1] * T / 7.0
+    points = np.stack([
+        p0, p0 + v0 * T / 7, p0 + 2 * v0 * T / 7 + a0 * T**2 / 42, p0 + 3 * v0 * T / 7 + 3 * a0 * T**2 / 42 + j0 * T**3 / 210,
+        p - 3.0 * v, p - 2.0 * v, p - v, p], axis=-1)
     return Polynomial(points, duration, (0.0, 0.0, 0.0))
 
 

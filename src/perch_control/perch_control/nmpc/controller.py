@@ -8,6 +8,7 @@ import numpy as np
 
 from perch_control.geometric import ControlOutput, GeometricController, packed_vehicle
 from perch_control.geometric.controller import NO_COMPENSATION
+from perch_control.guidance import Running
 from perch_control.nmpc.condensing import solve_condensed
 from perch_control.nmpc.iteration import answer, apply, begin, finish, input_bounds
 from perch_control.nmpc.linearisation import Linearisation
@@ -106,7 +107,7 @@ class NmpcController:
         self._weights()
         self.fallback.believe(vehicle)
 
-    def prepare(self, source: Any, contact: bool) -> Any:
+    def prepare(self, source: Any, contact: bool, running: Running | None = None) -> Any:
         """The reference to follow for a trajectory: itself; the horizon sees the rotors' limits before they act."""
         return source
 
