@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from perch_core import so3
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.moves import LEAD, Moves, Place, place_of
+from perch_control.mission.running_perch import RunningPerch
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.settings import MissionSettings
+from perch_control.mission.usable_target import usable
 from perch_control.mission.values import (
     Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
 from perch_control.mission.waypoints import waypoint_lines
@@ -34,8 +33,6 @@ class MissionMachine:
         self._adhesion = AdhesionMonitor(settings.adhesion)
         self._goal: Goal | None = None
         self._next_id = 1
-        self._asked_target: Target | None = None             # the target of the newest plan query
-        self._replanned_at = -math.inf
 
     # -- interface ---------------------------------------------------------------------------------------------------
 
@@ -96,19 +93,18 @@ class MissionMachine:
         if self._lost(inputs, outputs):
             return
         if self._moves.arrived(inputs.time, inputs.state):
-            self._pattern = self._moves.pattern(self._goal)
             self._enter(Phase.SEARCHING, inputs.time, "looking for the target")
 
     def _searching(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._lost(inputs, outputs):
             return
         target = inputs.target
-        usable, why = self._usable(target)
-        if self._goal.mode is Mode.POWERLINE and self._place < self.settings.mapping_legs:
+        good, why = usable(target, self._entered_search, self._goal, self.settings)
+        if self._goal.mode is Mode.POWERLINE and self._moves.looked < self.settings.mapping_legs:
             if self._moves.arrived(inputs.time, inputs.state):
                 self._go_on_looking(inputs, outputs, "mapping the lines")
             return
-        if usable:
+        if good:
             if self._seen_since is None:
                 self._seen_since = inputs.time
                 self.message = "target in view"
@@ -126,13 +122,7 @@ class MissionMachine:
 
     def _go_on_looking(self, inputs: Inputs, outputs: Outputs, message: str) -> None:
         """Fly to the next place of the pattern."""
-        offset, turn = self._pattern[self._place % len(self._pattern)]
-        self._place += 1
-        p, yaw = self._moves.search_place(self._goal, inputs.state)
-        if self._goal.mode is Mode.POWERLINE and offset[0] > 0.0:
-            room = 0.0 if inputs.target is None else float(np.linalg.norm(inputs.target.p_WS - p)) - self.settings.mapping_standoff
-            offset = np.array([min(offset[0], max(room, 0.0)), *offset[1:]])
-        self._go(inputs, outputs, (p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn))
+        self._go(inputs, outputs, self._moves.next_look(self._goal, inputs.state, inputs.target))
         self.message = message
 
     def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -155,7 +145,7 @@ class MissionMachine:
         if self._goal.mode is Mode.POWERLINE:
             self._look_ahead(inputs, outputs)
         elif self._goal.replan:
-            self._replan(inputs, outputs, end)
+            self._replan(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
             self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
@@ -255,24 +245,18 @@ class MissionMachine:
     def _lead(self) -> float:
         return max(self.settings.plan_lead, self._latency + 0.04)
 
-    def _replan(self, inputs: Inputs, outputs: Outputs, end: float) -> None:
+    def _replan(self, inputs: Inputs, outputs: Outputs) -> None:
         """Refine the target in flight and continue from the running plan's future (M's future work)."""
-        plan = inputs.plan
-        if plan is not None and plan.success and plan.start_time > inputs.time:
-            if abs(plan.start_time + plan.duration - end) > self.settings.replan_shift:
-                return  # a detour: the running plan is better
-            self.target = self._asked_target
-            self._fly(plan, outputs)
-            self.message = f"re-planned, {plan.duration:.2f} s"
+        better = self._running.better(inputs.plan, inputs.time, self.settings)
+        if better is not None:
+            if better is not self._running:
+                self._running, self.target = better, better.target
+                self._fly(better.plan, outputs)
+                self.message = f"re-planned, {better.plan.duration:.2f} s"
             return
-        usable, _ = self._usable(inputs.target)
-        start = inputs.time + self._lead
-        if (usable and inputs.target.time > self._asked_target.time and end - start > self.settings.replan_until
-                and start > self._perch.start_time and inputs.time - self._replanned_at >= self.settings.replan_period):
-            self._replanned_at, self._asked_target = inputs.time, inputs.target
-            zero = np.zeros(3)
-            outputs.query = PlanQuery(start, zero, zero, zero, zero, 0.0, inputs.target, self._goal, self._latency,
-                                      current=self._perch.trajectory, duration=end - start)
+        asked = self._running.query(inputs.time, self._usable_now(inputs), self._goal, self.settings, inputs.time + self._lead, self._latency)
+        if asked is not None:
+            self._running, outputs.query = asked
 
     def _look_ahead(self, inputs: Inputs, outputs: Outputs) -> None:
         """On the way to a wire: follow the map as it gets better, and keep a way out ready."""
@@ -283,8 +267,7 @@ class MissionMachine:
                 self._running, self.target = better, better.target
                 self._fly(better.plan, outputs)
                 self.message = f"re-planned, {better.plan.duration:.2f} s"
-        usable, _ = self._usable(inputs.target)
-        target = inputs.target if usable else None
+        target = self._usable_now(inputs)
         moved = self._running.moved(inputs.time, target, self._goal)
         if moved is not None and outputs.perch is None and outputs.way_out is None:
             self._running, self.target, self._perch = moved, moved.target, moved.plan
@@ -295,26 +278,12 @@ class MissionMachine:
         self._perch, self._perch_id = plan, self._new_id()
         outputs.perch, outputs.trajectory_id = plan, self._perch_id
         if self.phase is Phase.PLANNING:
-            self._asked_target, self._replanned_at = self.target, -math.inf
-            if self._goal.mode is Mode.POWERLINE:
-                self._running = RunningPlan(plan, self.target, self.settings)
+            powerline = self._goal.mode is Mode.POWERLINE
+            self._running = RunningPlan(plan, self.target, self.settings) if powerline else RunningPerch(plan, self.target, self.target)
 
-    def _usable(self, target: Target | None) -> tuple[bool, str]:
-        """Whether a target is fresh and certain enough to plan on, and why not."""
-        settings = self.settings
-        if target is None or target.time < self._entered_search:
-            return False, "no tags seen" if self._goal.mode is Mode.SURFACE else "no lines mapped"
-        if target.position_sigma > settings.target_position_sigma:
-            return False, f"position uncertain by {target.position_sigma:.3f} m"
-        if target.attitude_sigma > math.radians(settings.target_attitude_sigma_deg):
-            return False, f"attitude uncertain by {math.degrees(target.attitude_sigma):.1f} deg"
-        hint = self._goal.inclination_hint
-        if hint is not None:
-            s3 = so3.quat_rotate(target.q_WS, np.array([0.0, 0.0, 1.0]))
-            inclination = math.acos(min(1.0, max(-1.0, s3[2])))
-            if abs(inclination - hint) > math.radians(settings.inclination_tolerance_deg):
-                return False, f"inclination {math.degrees(inclination):.0f} deg, expected {math.degrees(hint):.0f} deg"
-        return True, ""
+    def _usable_now(self, inputs: Inputs) -> Target | None:
+        """The target, where it is fresh and certain enough to plan on."""
+        return inputs.target if usable(inputs.target, self._entered_search, self._goal, self.settings)[0] else None
 
     def _go(self, inputs: Inputs, outputs: Outputs, place: Place) -> None:
         outputs.reference, outputs.trajectory_id = self._moves.go(inputs.time, place), self._new_id()
@@ -360,7 +329,7 @@ class MissionMachine:
         if phase is Phase.ARMING:
             self._asked, self._entered_search = False, time
         if phase is Phase.SEARCHING:
-            self._seen_since, self._place, self._entered_search = None, 0, time
+            self._seen_since, self._moves.looked, self._entered_search = None, 0, time
 
     def _elapsed(self, inputs: Inputs) -> float:
         return inputs.time - self._since

@@ -9,7 +9,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Goal, Mode, State
+from perch_control.mission.values import Goal, Mode, State, Target
 
 LEAD = 0.04       # a move starts this long after its decision: after the mission's own latency [s]
 TURN_RATE = 0.6   # mean yaw rate of a move [rad/s]
@@ -32,6 +32,7 @@ class Moves:
         self.hover: Place | None = None   # where the last move ends
         self.began = 0.0                  # when the last move was decided [s]
         self.length = 0.0                 # from then to its end [s]
+        self.looked = 0                   # places of the search pattern that were flown to
 
     def search_place(self, goal: Goal, state: State) -> Place:
         """The goal's search pose, or above the place where the vehicle stood."""
@@ -55,6 +56,17 @@ class Moves:
             return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
         return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
                 (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
+
+    def next_look(self, goal: Goal, state: State, target: Target | None) -> Place:
+        """The next place of the pattern; towards lines no nearer to the target than `mapping_standoff`."""
+        pattern = self.pattern(goal)
+        offset, turn = pattern[self.looked % len(pattern)]
+        self.looked += 1
+        p, yaw = self.search_place(goal, state)
+        if goal.mode is Mode.POWERLINE and offset[0] > 0.0:
+            room = 0.0 if target is None else float(np.linalg.norm(target.p_WS - p)) - self.settings.mapping_standoff
+            offset = np.array([min(offset[0], max(room, 0.0)), *offset[1:]])
+        return p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn
 
     def go(self, time: float, place: Place) -> FlatTrajectory:
         """A move from the present hover to another, at rest at both ends."""

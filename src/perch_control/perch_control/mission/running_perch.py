@@ -1,0 +1,61 @@
+"""What the mission asks while a perch on a surface is flown: the same perch to the target as it is seen nearer (M's future work)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, Target
+
+
+@dataclass(frozen=True)
+class RunningPerch:
+    """A surface plan in flight.
+
+    Attributes:
+        plan: what is flown.
+        target: the place that it was made for.
+        asked: target of the newest query.
+        asked_at: time of the newest query [s].
+    """
+
+    plan: PlanAnswer
+    target: Target
+    asked: Target
+    asked_at: float = -math.inf
+
+    @property
+    def end(self) -> float:
+        """Time of the planned contact [s]."""
+        return self.plan.start_time + self.plan.duration
+
+    def better(self, answer: PlanAnswer | None, time: float, settings: MissionSettings) -> RunningPerch | None:
+        """The plan to fly instead of this one, from the answer to the newest query; None: this one."""
+        if answer is None or not answer.success or answer.start_time <= time:
+            return None
+        if abs(answer.start_time + answer.duration - self.end) > settings.replan_shift:
+            return self  # a detour: the running plan is better
+        return replace(self, plan=answer, target=self.asked)
+
+    def query(self, time: float, target: Target | None, goal: Goal, settings: MissionSettings,
+              start: float, latency: float) -> tuple[RunningPerch, PlanQuery] | None:
+        """What to ask now, and the plan in flight that remembers it; None: nothing.
+
+        Args:
+            time: of the tick [s].
+            target: as seen now, when it is certain enough to plan on.
+            goal: what was asked of the mission.
+            settings: when plans are asked for.
+            start: when a new plan could start [s].
+            latency: from the request to the use of a plan [s].
+        """
+        if target is None or target.time <= self.asked.time or self.end - start <= settings.replan_until:
+            return None
+        if start <= self.plan.start_time or time - self.asked_at < settings.replan_period:
+            return None
+        zero = np.zeros(3)
+        query = PlanQuery(start, zero, zero, zero, zero, 0.0, target, goal, latency, current=self.plan.trajectory, duration=self.end - start)
+        return replace(self, asked=target, asked_at=time), query
