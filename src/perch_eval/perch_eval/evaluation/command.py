@@ -86,6 +86,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
+    out.add_argument("--seeds", type=int, default=100, metavar="N", help="flights of each perch condition with --full (default: %(default)s)")
     out.add_argument("--line-seeds", type=int, default=10, metavar="N", help="flights of each powerline scenario with --full (default: %(default)s)")
     out.add_argument("--fresh", action="store_true", help="fly again what an earlier evaluation of the same code has flown")
     return out
@@ -94,14 +95,12 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    if args.jobs < 1:
-        print(f"error: --jobs {args.jobs} is not >= 1", file=sys.stderr)
-        return 2
-    if args.line_seeds < 1:
-        print(f"error: --line-seeds {args.line_seeds} is not >= 1", file=sys.stderr)
-        return 2
+    for option in ("jobs", "seeds", "line_seeds"):
+        if getattr(args, option) < 1:
+            print(f"error: --{option.replace('_', '-')} {getattr(args, option)} is not >= 1", file=sys.stderr)
+            return 2
     mode = "full" if args.full else "quick"
-    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, args.fresh, args.line_seeds)
+    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, args.fresh, args.seeds, args.line_seeds)
     began = time.monotonic()
     try:
         args.out.mkdir(parents=True, exist_ok=True)

@@ -75,14 +75,14 @@ def _flights(effort: Effort) -> list[RunResult]:
         _remove(file)
         results = Results(file, "evaluation", digest, resume=True)
     try:
-        known = results.all()
+        known = [r for r in results.all() if r.number < len(tasks)]
         open_tasks = [t for t in tasks if t.run.number not in {r.number for r in known}]
         progress = Progress(len(tasks), len(known), sum(r.cause == SUCCESS for r in known), "flights")
         for result in in_pool(open_tasks, effort.jobs):
             results.add(result)
             progress.add(result.cause == SUCCESS)
         progress.close()
-        return results.all()
+        return [r for r in results.all() if r.number < len(tasks)]
     finally:
         results.close()
 

@@ -77,6 +77,7 @@ class Effort:
         out: folder of the results.
         state: folder of what a full evaluation resumes from.
         fresh: forget what an earlier evaluation has done.
+        perch_seeds: flights of each perch condition, if full.
         line_seeds: flights of each powerline scenario; of the same code, those that were flown before count.
     """
 
@@ -85,12 +86,13 @@ class Effort:
     out: Path
     state: Path
     fresh: bool = False
+    perch_seeds: int = 100
     line_seeds: int = 10
 
     @property
     def seeds(self) -> range:
-        """Seeds of the flights of each condition."""
-        return range(1, 101) if self.full else range(1, 6)
+        """Seeds of the flights of each perch condition."""
+        return range(1, self.perch_seeds + 1) if self.full else range(1, 6)
 
 
 Part = Callable[[Effort], list[Section]]
