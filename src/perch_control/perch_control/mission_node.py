@@ -15,6 +15,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Imu
 
 from perch_core import so3
+from perch_core.covariance import largest_sigma
 from perch_core.ros.conversions import pose_arrays, seconds, to_array, to_pose, to_seconds, to_stamp
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
@@ -80,8 +81,8 @@ class MissionNode(PerchNode[MissionParameters]):
             return
         self._target = Target(
             to_seconds(msg.header.stamp), p, q / np.linalg.norm(q),
-            position_sigma=math.sqrt(max(0.0, np.linalg.eigvalsh(covariance[:3, :3])[-1])),
-            attitude_sigma=math.sqrt(max(0.0, np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
+            position_sigma=largest_sigma(covariance[:3, :3]),
+            attitude_sigma=largest_sigma(covariance[3:, 3:]))
 
     def _receive_odometry(self, data: bytes) -> None:
         now = stamp_of(data)

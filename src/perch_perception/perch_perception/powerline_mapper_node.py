@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from perch_core import config
 from perch_core.camera import CameraMount
+from perch_core.covariance import largest_sigma
 from perch_core.ros.conversions import to_point, to_stamp
 from perch_core.ros.node import spin_main
 from perch_msgs.msg import Powerline, PowerlineArray
@@ -90,7 +91,7 @@ def mapping_pose(poses: PoseBuffer, exposed: float, max_sigma: float) -> BodySta
         StampError: there is no pose at this stamp, or its position is less certain than `max_sigma` [m].
     """
     body = poses.at(exposed)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(body.covariance[:3, :3])[-1]))
+    sigma = largest_sigma(body.covariance[:3, :3])
     if sigma > max_sigma:
         raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")
     return body

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance, PoseWithCovarianceStamped
 from perch_core import config, so3
+from perch_core.covariance import largest_sigma
 from perch_core.ros.conversions import to_pose, to_stamp
 from perch_core.ros.node import spin_main
 from perch_core.tag_board import load_board
@@ -129,10 +130,8 @@ class TargetLocalizerNode(CameraNode[TargetLocalizerConfig]):
 
     def _good(self, covariance: np.ndarray) -> bool:
         """Whether the worst axes of position and attitude are known within the limits."""
-        position = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-        attitude = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-        return bool(position <= self.params.max_position_sigma
-                    and attitude <= np.radians(self.params.max_attitude_sigma))
+        position, attitude = largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:, 3:])
+        return bool(position <= self.params.max_position_sigma and attitude <= np.radians(self.params.max_attitude_sigma))
 
     def _publish_diagnostics(self, now: float) -> None:
         costs = 1e3 * np.array(self._costs)

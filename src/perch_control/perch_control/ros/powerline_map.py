@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from perch_msgs.msg import PowerlineArray
 
 from perch_core.ros.conversions import to_array, to_seconds
 from perch_control.mission import Goal, Target
+from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
 from perch_control.mission.powerline import MappedLine, powerline_target
 
@@ -25,7 +24,7 @@ def mapped_target(lines: PowerlineArray, goal: Goal, p_WB: np.ndarray) -> Target
         The target, or None when no mapped line passes near the goal's point.
     """
     known = [MappedLine(m.id, to_array(m.start), to_array(m.end),
-                        math.sqrt(max(0.0, np.linalg.eigvalsh(np.reshape(m.covariance, (3, 3)))[-1])), m.direction_sigma)
+                        largest_sigma(np.reshape(m.covariance, (3, 3))), m.direction_sigma)
              for m in lines.lines]
     return powerline_target(to_seconds(lines.header.stamp), known, goal.perch_point, goal.perch_pitch, p_WB, lines.lines)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core.camera import CameraMount
+from perch_core.covariance import largest_sigma
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState, StampError
@@ -151,7 +152,7 @@ class TargetSource(FrameSource):
 
 def sigmas(covariance: np.ndarray) -> tuple[float, float]:
     """Largest 1 sigma of position [m] and attitude [rad] of a pose covariance, shape (6, 6)."""
-    return tuple(float(np.sqrt(max(0.0, np.linalg.eigvalsh(block)[-1]))) for block in (covariance[:3, :3], covariance[3:, 3:]))
+    return largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:, 3:])
 
 
 def _as_received(target, exposed: float) -> Target:
