@@ -7,7 +7,7 @@ import pytest
 
 from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
-from perch_control.admission import AtEnd
+from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
 from perch_control.rotor_health import RotorHealth, RotorHealthSettings
@@ -110,6 +110,20 @@ def test_weak_rotors_give_a_perch_up_until_the_vehicle_has_turned_to_the_wall(be
     loop.plant.disturbances = Disturbances(rotor_factor=(0.55,) * 4)
     loop.run(0.15)
     assert loop.controller.state is state
+
+
+@pytest.mark.parametrize("share, refused", [(0.7, False), (0.6, True)])
+def test_one_rotor_that_is_far_weaker_refuses_a_perch(share, refused):
+    """All rotors together still give 86 % of what is promised, which is not weak; but the one has nothing left in hover."""
+    loop = seen(make_loop(disturbances=Disturbances(rotor_factor=(share, 1, 1, 1))))
+    loop.begin_in_hover()
+    loop.run(2.0)
+    assert loop.controller.state is State.HOVERING and not loop.controller.health.weak
+    if refused:
+        with pytest.raises(TrajectoryRefused, match="thrust margin"):
+            loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=2)
+    else:
+        loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=2)
 
 
 def demand(v, height, left, tilt_deg=0.0):
