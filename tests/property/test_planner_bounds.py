@@ -178,3 +178,8 @@ def test_the_coarse_bound_of_the_body_rate_is_one(seed):
     jerk = bernstein.derivative(coefficients, 3) / duration**3
     coarse = rate_coarse_bound(specific_force(coefficients, duration), jerk, yaw, duration)
     assert coarse >= max(rate_by_flatness(coefficients, yaw, duration, s) for s in np.linspace(0.0, 1.0, 41))
+
+
+def test_squared_length_has_the_coefficients_of_the_product_with_itself():
+    vector = np.random.default_rng(3).normal(size=(3, 13))
+    assert bounds.squared(vector) == pytest.approx(bernstein.product(vector, vector).sum(axis=0), abs=1e-13)
