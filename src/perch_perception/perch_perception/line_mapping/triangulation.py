@@ -24,7 +24,7 @@ from perch_perception.line_mapping.observation import LineObservation
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
-WIDTH_GATE = 0.1       # a width that says another distance than 3 sigma and three times this [m] is that of two wires, or of a part of one
+WIDTH_GATE = 0.1       # a width farther off than 3 sigma and three times this in distance [m] is that of two wires, or of a part of one
 ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radius
 
 
@@ -181,32 +181,37 @@ def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
 
 def _log_radius(curve, observations):
     """Logarithm of the radius that the widths say on the whole; nan without any."""
-    said = [np.log(np.sin(0.5 * o.width)) + np.log(np.linalg.norm(_foot(curve, o.p_WC)[0])) for o in observations if o.width > 0.0]
-    return float(np.median(said)) if said else float("nan")
+    seen = [o for o in observations if o.width > 0.0]
+    if not seen:
+        return float("nan")
+    distance = np.linalg.norm(_feet(curve, seen)[0], axis=1)
+    return float(np.median(np.log(np.sin([0.5 * o.width for o in seen]) * distance)))
 
 
-def _foot(curve, centre):
-    """From a camera to the point of the wire that is square to it, shape (3,) [m], and the s of that point."""
-    to = curve.point - centre
-    s = -float(to @ curve.direction)
-    return to + s * curve.direction + 0.5 * curve.curvature * s * s * curve.axes[:, 1], s
+def _feet(curve, observations):
+    """From the cameras to the points of the wire that are square to them, shape (n, 3) [m], and the s of these points (n,)."""
+    to = curve.point - np.array([o.p_WC for o in observations])
+    s = -to @ curve.direction
+    return to + s[:, None] * curve.direction + (0.5 * curve.curvature * s * s)[:, None] * curve.axes[:, 1], s
 
 
 def _widths(curve, size, observations, settings):
     """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, and their Jacobian (n, 1, 9)."""
     residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, ALL))
-    e1, e2, _ = curve.axes.T
-    for k, one in enumerate(observations):
-        if one.width == 0.0:
-            continue
-        to, s = _foot(curve, one.p_WC)
-        distance = max(float(np.linalg.norm(to)), 1e-3)
-        misfit = np.log(np.sin(0.5 * one.width)) + np.log(distance) - size
-        sigma = np.sqrt(settings.width**2 + (one.sigma / one.width) ** 2 + (settings.pose_position / distance) ** 2)
-        if abs(misfit) < 3.0 * np.hypot(sigma, WIDTH_GATE / distance):
-            x, y = to @ e1 / distance**2, to @ e2 / distance**2
-            residual[k] = misfit / sigma
-            jacobian[k, 0] = np.array([x, y, s * x, s * y, 0.5 * s * s * y, 0.0, 0.0, 0.0, -1.0]) / sigma
+    width, ray = np.array([(o.width, o.sigma) for o in observations]).T
+    seen = np.flatnonzero(width > 0.0)
+    if not len(seen):
+        return residual, jacobian
+    width, ray = width[seen], ray[seen]
+    to, s = _feet(curve, [observations[k] for k in seen])
+    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
+    misfit = np.log(np.sin(0.5 * width) * distance) - size
+    sigma = np.sqrt(settings.width**2 + (ray / width) ** 2 + (settings.pose_position / distance) ** 2)
+    x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
+    zero = np.zeros_like(s)
+    rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]
+    one_wire = np.abs(misfit) < 3.0 * np.hypot(sigma, WIDTH_GATE / distance)
+    residual[seen, 0], jacobian[seen, 0] = np.where(one_wire, misfit / sigma, 0.0), np.where(one_wire[:, None], rows, 0.0)
     return residual, jacobian
 
 
