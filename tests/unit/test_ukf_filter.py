@@ -10,7 +10,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from perch_core import so3
 from perch_core.vehicle import GRAVITY
 from perch_eval.perch_motion import PerchMotion
-from perch_perception.ukf import UkfConfig, VioNoise, drift, kernels
+from perch_perception.ukf import UkfConfig, VioNoise, VioPose, drift, kernels, start
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.unscented import Belief, CovarianceError, UnscentedTransform
 
@@ -212,3 +212,36 @@ def test_drift_step_stays_positive_when_vios_covariance_shrinks():
     noise = VioNoise()
     W = drift.increment(noise, np.diag([1e-2] * 6), np.diag([1e-4] * 6), 1 / 30)
     assert np.linalg.eigvalsh(W)[0] > 0
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.3])
+def test_pose_and_velocity_are_as_sure_as_vios(size):
+    """Whether the filter was surer or more doubtful; what it knows of the biases does not get better by that."""
+    rng = np.random.default_rng(12)
+    belief = random_belief(rng)
+    A, B = rng.normal(size=(6, 6)) * size, rng.normal(size=(3, 3)) * size
+    pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), A @ A.T, np.zeros(3), B @ B.T)
+    P = drift.as_sure_as(belief, pose, np.zeros((6, 6))).P
+    R = so3.quat_to_matrix(belief.x[at.QUATERNION])
+    J = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), R]])
+    rows = np.r_[0:3, 6:9]
+    np.testing.assert_allclose(J @ P[np.ix_(rows, rows)] @ J.T, pose.covariance, rtol=1e-3, atol=1e-5 * size**2)
+    np.testing.assert_allclose(P[at.D_VELOCITY, at.D_VELOCITY], pose.velocity_covariance, rtol=1e-3, atol=1e-5 * size**2)
+    np.testing.assert_allclose(P[9:15, 9:15], belief.P[9:15, 9:15])
+    assert np.linalg.eigvalsh(P)[0] > 0
+
+
+def test_at_rest_tilt_and_accelerometer_bias_are_one_unknown():
+    """VIO's level is that of the same accelerometer: their sum, seen as a force, is known to the mean's noise."""
+    config, rng, tilt = UkfConfig(), np.random.default_rng(13), 0.005
+    q = so3.quat_exp(np.array([0.02, -0.01, 0.7]))
+    up_B = so3.quat_to_matrix(q).T @ np.array([0.0, 0.0, GRAVITY])
+    steps = np.column_stack([np.full(100, 0.002), np.zeros((100, 3)), up_B + rng.normal(0, 0.32, (100, 3)), np.full((100, 2), 0.01)])
+    pose = VioPose(200_000_000, np.zeros(3), q, np.diag([1e-6] * 3 + [tilt**2] * 3), np.zeros(3), np.eye(3) * 1e-4)
+    belief = start.from_vio(config, pose, steps)
+    H = np.zeros((3, 21))
+    H[:, at.D_ATTITUDE], H[:, at.D_ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
+    np.testing.assert_allclose(H @ belief.P @ H.T, np.eye(3) * config.imu.accel_noise**2 / 100, atol=1e-6)
+    across = np.linalg.svd(so3.hat(up_B))[0][:, 0]
+    own = across @ belief.P[at.D_ACCEL_BIAS, at.D_ACCEL_BIAS] @ across
+    assert own > (tilt * GRAVITY) ** 2  # alone, the bias is as unknown as the tilt makes it
