@@ -57,6 +57,7 @@ class Maneuvers:
         self.rotors = RotorEstimate((0.0,) * 4, (0.0,) * 4)
         self.source: Any = Hold(Setpoint(_ZERO))
         self.start = 0.0
+        self._asked: tuple[Any, float, Setpoint] = (None, 0.0, Setpoint(_ZERO))
         self.order: Order | None = None
         self.trajectory_id = 0
         self.attached_to: tuple[float, ...] | None = None
@@ -76,8 +77,11 @@ class Maneuvers:
         return self.now - self.start
 
     def setpoint(self, ahead: float = 0.0) -> Setpoint:
-        """The running reference `ahead` seconds from now."""
-        return self.source.setpoint(self.elapsed + ahead)
+        """The running reference `ahead` seconds from now; supervisor and step ask for the same one, which is worked out once."""
+        source, t = self.source, self.elapsed + ahead
+        if self._asked[0] is not source or self._asked[1] != t or getattr(source, "by_state", False):
+            self._asked = source, t, source.setpoint(t)
+        return self._asked[2]
 
     def expected(self, time: float) -> Setpoint:
         """Where the vehicle will be at a time [s]: on its reference in flight, where it is on the ground."""
