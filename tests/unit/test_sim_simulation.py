@@ -115,6 +115,8 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
     drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
     try:
         assert images(drawing) == images(DrawnOnThreads(SCENARIO, 3, ("front",), ThreadPoolExecutor(1)))
+        os.kill(drawing.process_ids["front"], signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
+        assert len(images(drawing, 1)) == 1
         os.kill(drawing.process_ids["front"], signal.SIGKILL)
         flight = Simulation(SCENARIO, 3, drawing)
         camera, frames = flight.cameras["front"], 0

@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from concurrent.futures import Executor, Future
 from concurrent.futures import wait as wait_for
 from contextlib import suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Protocol
 
@@ -101,6 +102,7 @@ class DrawnInProcesses:
         """
         self.cameras = tuple(cameras)
         seen = _seen(scenario, seed, cameras)
+        resource_tracker.ensure_running()  # it lets SIGINT through as it starts
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: Ctrl-C is the vehicle's own matter
         try:
             self._draftsmen = {name: _Draftsman(scene, mount, seed) for name, scene, mount in seen}
