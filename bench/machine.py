@@ -68,10 +68,6 @@ def _wake(pipe: Connection) -> None:
     while not pipe.poll():
         due += CONTROL_PERIOD_NS
         time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
-        behind = time.monotonic_ns() - due
-        count += 1
-        late += behind > CONTROL_PERIOD_NS
-        if behind > CONTROL_PERIOD_NS:  # those that were slept over are late too
-            skipped = behind // CONTROL_PERIOD_NS
-            late, count, due = late + skipped - 1, count + skipped, due + skipped * CONTROL_PERIOD_NS
+        behind = (time.monotonic_ns() - due) // CONTROL_PERIOD_NS  # whole periods: this one and those slept over are late
+        late, count, due = late + behind, count + 1 + behind, due + behind * CONTROL_PERIOD_NS
     pipe.send((late, count))

@@ -43,13 +43,6 @@ class _Camera:
         return ((u >= margin - 0.5) & (u <= self.width - 0.5 - margin)
                 & (v >= margin - 0.5) & (v <= self.height - 0.5 - margin))
 
-    def _to_pixels(self, plane: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pixels = plane * (self.fx, self.fy) + (self.cx, self.cy)
-        return np.where(valid[..., None], pixels, np.nan), valid
-
-    def _to_plane(self, pixels: np.ndarray) -> np.ndarray:
-        return (np.asarray(pixels, dtype=float) - (self.cx, self.cy)) / (self.fx, self.fy)
-
 
 @dataclass(frozen=True)
 class PinholeCamera(_Camera):
@@ -83,11 +76,12 @@ class PinholeCamera(_Camera):
         points_C = np.asarray(points_C, dtype=float)
         valid = points_C[..., 2] > self.near
         z = np.where(valid, points_C[..., 2], 1.0)
-        return self._to_pixels(points_C[..., :2] / z[..., None], valid)
+        pixels = points_C[..., :2] / z[..., None] * (self.fx, self.fy) + (self.cx, self.cy)
+        return np.where(valid[..., None], pixels, np.nan), valid
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
         """Unit rays in C, shape (..., 3), of pixels (..., 2)."""
-        plane = self._to_plane(pixels)
+        plane = (np.asarray(pixels, dtype=float) - (self.cx, self.cy)) / (self.fx, self.fy)
         rays_C = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         return rays_C / np.linalg.norm(rays_C, axis=-1, keepdims=True)
 

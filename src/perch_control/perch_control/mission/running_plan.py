@@ -16,11 +16,12 @@ import math
 import numpy as np
 
 from perch_core import so3
+from perch_core.timing import CONTROL_PERIOD, TICK_STEPS
 from perch_core.trajectory import StateSample
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, State, Target
 
-_TICK = 0.02      # the mission's period [s]
+_TICK = TICK_STEPS * CONTROL_PERIOD  # the mission's period [s]
 _DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
 
 

@@ -8,6 +8,7 @@ from typing import Sequence
 import numpy as np
 
 from perch_core import config, so3
+from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
 from perch_perception.line_mapping.association import AssociationConfig, associate
 from perch_perception.line_mapping.curve import WireCurve
@@ -212,8 +213,9 @@ class LineMapper:
         for k in range(pieces):
             a, b = low + length * k / pieces, low + length * (k + 1) / pieces
             covariance = self._covariance(estimate, 0.5 * (a + b))
-            if np.sqrt(np.linalg.eigvalsh(covariance)[-1]) > self.settings.max_sigma:
-                missing.append(f"line {track.id}: known to {np.sqrt(np.linalg.eigvalsh(covariance)[-1]):.2f} m only")
+            sigma = largest_sigma(covariance)
+            if sigma > self.settings.max_sigma:
+                missing.append(f"line {track.id}: known to {sigma:.2f} m only")
                 return []
             lines.append(MappedLine(_chord(estimate.curve, a, b, radius, track.id + PIECE_IDS * k), covariance,
                                     self._direction_sigma(estimate), track.count))

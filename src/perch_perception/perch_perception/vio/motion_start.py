@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from perch_core.camera import CameraMount
+from perch_core.covariance import largest_sigma
 from perch_core.vehicle import GRAVITY
 
 from perch_perception.ukf.imu_buffer import ImuBuffer
@@ -158,8 +159,8 @@ class MotionStart:
     def _state(self, found: MotionSolution, parts: list, pose: KnownPose, gyro_bias: np.ndarray, stamp: int) -> State | None:
         last = parts[-1]
         # twice the formal figure: biases and the IMU's noise are not in it
-        tilt = 2 * np.sqrt(np.linalg.eigvalsh(found.covariance[3:, 3:])[-1]) / GRAVITY
-        speed = 2 * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1])
+        tilt = 2 * largest_sigma(found.covariance[3:, 3:]) / GRAVITY
+        speed = 2 * largest_sigma(found.covariance[:3, :3])
         if tilt > 0.2 or speed > 0.5:
             return None
         bias_tilt = self._config.imu.accel_bias_init / GRAVITY
