@@ -11,6 +11,7 @@ import gc
 import importlib
 import json
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,13 @@ def create_nodes(plan: list[dict[str, Any]]) -> list[Node]:
 
 
 def close_nodes(nodes: list[Node]) -> None:
-    """Free threads and processes of the nodes, then the nodes."""
-    for node in nodes:
-        close = getattr(node, "close", None)
-        if close is not None:
-            close()
-        node.destroy_node()
+    """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
+    with ExitStack() as endings:
+        for node in nodes:
+            endings.callback(node.destroy_node)
+        for node in nodes:
+            if (close := getattr(node, "close", None)) is not None:
+                endings.callback(close)
 
 
 def main() -> None:

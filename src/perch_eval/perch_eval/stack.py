@@ -13,8 +13,8 @@ from perch_core.errors import PerchError
 from perch_eval.program import Ending, Program, RunningProgram
 from perch_eval.shared_memory import SharedMemory
 
-_ESCALATION = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-_PATIENCE_S = 1.0
+_ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 1.0))
+"""Signals to stop with, and how long each has [s]: on a busy machine a recording may need seconds to be finished."""
 _POLL_S = 0.02
 
 
@@ -132,17 +132,17 @@ class Stack:
             raise StackError("\n".join(str(ending) for ending in endings), endings)
 
     def stop(self) -> dict[str, Ending]:
-        """Stop everything: interrupt, after a second terminate, after another kill. Repeating it is harmless.
+        """Stop everything: interrupt, where that does not help terminate, then kill. Repeating it is harmless.
 
         Returns:
             How each program ended.
         """
         self._memory.observe(self.pids.values())
-        for number in _ESCALATION:
+        for number, patience in _ESCALATION:
             running = [program for program in self._started.values() if program.running]
             for program in running:
                 program.signal(number)
-            deadline = time.monotonic() + _PATIENCE_S
+            deadline = time.monotonic() + patience
             for program in running:
                 program.wait(max(0.0, deadline - time.monotonic()))
         for program in self._started.values():

@@ -121,7 +121,8 @@ class DrawnInProcesses:
     def close(self) -> None:
         """End the processes."""
         for draftsman in self._draftsmen.values():
-            draftsman.process.terminate()
+            draftsman.process.kill()
+        for draftsman in self._draftsmen.values():
             draftsman.process.join(1.0)
 
 

@@ -52,6 +52,22 @@ def _price_of_excess(X, soft, x_low, x_high, price, P, p):
 
 
 @compiled
+def _less(x, c, a, k, K):
+    """Row a of the gains less x times row c."""
+    k[a] -= x * k[c]
+    for j in range(K.shape[1]):
+        K[a, j] -= x * K[c, j]
+
+
+@compiled
+def _times(x, a, k, K):
+    """Row a of the gains times x."""
+    k[a] *= x
+    for j in range(K.shape[1]):
+        K[a, j] *= x
+
+
+@compiled
 def _gains(M, S, m, fixed, low, high, U, K, k, L):
     """Feedback K (4, n) and feed-forward k (4,) of one stage: du = K dx + k. Clamped inputs have K = 0 and k = bound - U."""
     n = K.shape[1]
@@ -83,27 +99,15 @@ def _gains(M, S, m, fixed, low, high, U, K, k, L):
             L[a, b] = s ** 0.5 if a == b else s / L[b, b]
         for c in range(a):
             if fixed[c] == 0:
-                x = L[a, c]
-                k[a] -= x * k[c]
-                for j in range(n):
-                    K[a, j] -= x * K[c, j]
-        x = 1.0 / L[a, a]
-        k[a] *= x
-        for j in range(n):
-            K[a, j] *= x
+                _less(L[a, c], c, a, k, K)
+        _times(1.0 / L[a, a], a, k, K)
     for a in range(3, -1, -1):
         if fixed[a] != 0:
             continue
         for c in range(a + 1, 4):
             if fixed[c] == 0:
-                x = L[c, a]
-                k[a] -= x * k[c]
-                for j in range(n):
-                    K[a, j] -= x * K[c, j]
-        x = 1.0 / L[a, a]
-        k[a] *= x
-        for j in range(n):
-            K[a, j] *= x
+                _less(L[c, a], c, a, k, K)
+        _times(1.0 / L[a, a], a, k, K)
 
 
 @compiled

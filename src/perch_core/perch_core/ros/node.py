@@ -13,6 +13,7 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -28,6 +29,7 @@ from perch_core.ros.parameters import Parameters
 from perch_core.ros.priority import priority
 
 T = TypeVar("T")
+LOOK = 0.1  # [s] wall clock, between looks for a signal to stop
 
 
 class PerchNode(Node, Generic[T]):
@@ -105,11 +107,18 @@ def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
     """Run callbacks until the signal.
 
     EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6, and spin_once() starts anew for every message, which
-    costs 30 us of each; so it waits, a tenth of a second at a time, for a future that never comes.
+    costs 30 us of each; so it waits, a tenth of a second at a time, for a future. The time limit is looked at only when nothing
+    waits to be called, which in lockstep may never be: there a timer completes the future.
     """
-    never = Future()
+    stopped = Future()
+
+    def look() -> None:
+        if stop and not stopped.done():
+            stopped.set_result(None)
+
+    next(iter(executor.get_nodes())).create_timer(LOOK, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
     while not stop and rclpy.ok():
-        executor.spin_until_future_complete(never, timeout_sec=0.1)
+        executor.spin_until_future_complete(stopped, timeout_sec=LOOK)
 
 
 def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> None:

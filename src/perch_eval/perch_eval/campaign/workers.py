@@ -96,11 +96,12 @@ def on_cluster(tasks: Sequence[Task], address: str, jobs: int) -> Iterator[RunRe
                        task for task in tasks}
             for future in as_completed(list(futures)):
                 task = futures.pop(future)
-                if future.status == "finished":
-                    yield future.result()
-                else:
-                    yield dead(task, f"{type(future.exception()).__name__}: {future.exception()}")
+                try:
+                    result = future.result()  # may be lost with its worker even now: Dask then carries it out again
+                except Exception as error:
+                    result = dead(task, f"{type(error).__name__}: {error}")
                 future.release()
+                yield result
     finally:
         if cluster is not None:
             cluster.close()
