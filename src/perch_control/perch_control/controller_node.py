@@ -24,6 +24,7 @@ from perch_control.parameters import ControllerParameters
 from perch_control.ros.powerline_map import mapped_segments
 from perch_core.errors import ConfigError, PerchError
 from perch_core.ros import qos
+from perch_core.ros.composition import composition
 from perch_core.ros.conversions import seconds, to_pose, to_stamp, to_vector
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.lockstep import Participant
@@ -57,7 +58,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         command = MotorCommand()
         command.header.frame_id = "base_link"
         self._command = MotorCommandTemplate(command)
-        self._motors = self.create_publisher(MotorCommand, "motor_command", qos.CHAIN)
+        self._motors = composition.publisher(self, MotorCommand, "motor_command", qos.CHAIN)
         self._references = self.create_publisher(ControlReference, "controller/reference", qos.CHAIN)
         self._status = self.create_publisher(ControllerStatus, "controller/status", qos.CHAIN)
         self._participant = Participant(self)

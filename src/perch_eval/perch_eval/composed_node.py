@@ -17,6 +17,7 @@ from typing import Any
 
 import rclpy
 from perch_core.errors import PerchError
+from perch_core.ros.composition import composition
 from perch_core.ros.node import StopSignal, spin_until_stopped
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -64,12 +65,14 @@ def main() -> None:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Node] = []
     try:
-        nodes = create_nodes(plan)
+        with composition.creating():
+            nodes = create_nodes(plan)
         gc.collect()
         gc.freeze()  # as in spin_main
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
+        composition.connect(executor.create_task)
         spin_until_stopped(executor, stop)
     except (PerchError, rclpy.exceptions.InvalidParameterValueException) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -10,6 +10,7 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from perch_core import so3
 from perch_core.ros import qos
+from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds, odometry_arrays, to_stamp, to_vector
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.lockstep import Participant
@@ -40,7 +41,7 @@ class EstimatorNode(PerchNode[UkfConfig]):
         odometry = Odometry(child_frame_id="base_link")
         odometry.header.frame_id = "map"
         self._odometry = OdometryTemplate(odometry)
-        self._odometry_publisher = self.create_publisher(Odometry, "odometry", qos.CHAIN)
+        self._odometry_publisher = composition.publisher(self, Odometry, "odometry", qos.CHAIN)
         self._status_publisher = self.create_publisher(EstimatorStatus, "estimator/status", qos.CHAIN)
         self._participant = Participant(self)
         self._participant.subscribe(Odometry, "vio/odometry", self._receive_vio)

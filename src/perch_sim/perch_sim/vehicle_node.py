@@ -13,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
+from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.priority import priority
@@ -54,7 +55,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self.destroy_node()
             raise
         self._topics = VehicleTopics(self, self._simulation.vehicle.imu, self._simulation.vehicle.mounts)
-        self._steps = self.create_publisher(Step, "step", qos.STEP)
+        self._steps = composition.publisher(self, Step, "step", qos.STEP)
         self._ticks = self.create_publisher(Step, "tick", qos.STEP)
         self._released: dict[str, int] = {}    # since the last tick
         self._output: Output | None = None     # of the step that is to be published next
@@ -66,7 +67,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
         self._busy = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_subscription(MotorCommand, "motor_command", self._receive_command, qos.CHAIN, raw=True)
+        composition.subscription(self, MotorCommand, "motor_command", self._receive_command, qos.CHAIN)
         self.create_timer(1.0, self._diagnose, clock=steady)
         self._watch: LockstepWatch | None = None
         self._pacing: Pacing | None = None
@@ -210,6 +211,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._published = time.perf_counter()
         self._released |= released
         if index % TICK_STEPS == 0:
+            composition.flush()
             self._ticks.publish(self._step(self._released))
             self._released = {}
         if index % CLOCK_STEPS == 0:
@@ -224,6 +226,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
         if index % ROTOR_STEPS == 0:
             plant = self._simulation.plant
             topics.publish_rotors(output.time, plant.rotor_speed, plant.rotor_thrust)
+        if frames:
+            composition.flush()
         for name, delivery in frames:
             self._simulation.cameras[name].take()
             topics.cameras[name].publish(delivery.frame.stamp, delivery.image.result() if delivery.image else None)

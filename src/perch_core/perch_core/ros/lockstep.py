@@ -28,6 +28,7 @@ from rclpy.serialization import deserialize_message
 
 from perch_core.ros import qos
 from perch_core.ros.backlog import Backlog
+from perch_core.ros.composition import composition
 from perch_core.ros.conversions import to_stamp
 from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_step, stamp_of
@@ -99,7 +100,7 @@ class Participant:
         self.step: StepReading | None = None   # the step handled last
         self._reports: Publisher | None = None
         self._greeting = self._retry = None
-        node.create_subscription(Step, "step" if every == 1 else "tick", self._receive_step, qos.STEP, raw=True)
+        composition.subscription(node, Step, "step" if every == 1 else "tick", self._receive_step, qos.STEP)
 
     # -- wiring ------------------------------------------------------------------------------------------------------
 
@@ -135,7 +136,7 @@ class Participant:
                 self._retry = self._node.create_timer(RETRY, self._advance, clock=Clock(clock_type=ClockType.STEADY_TIME))
                 self._retry.cancel()
         else:
-            self._node.create_subscription(msg_type, topic, lambda data: self._receive_chain(chain, data), qos.CHAIN, raw=True)
+            composition.subscription(self._node, msg_type, topic, lambda data: self._receive_chain(chain, data), qos.CHAIN)
 
     def publisher(self, msg_type: type, topic: str, profile: QoSProfile = qos.GATED) -> GatedPublisher:
         """A publisher on a gated topic. Only slow participants, which send reports, have these."""

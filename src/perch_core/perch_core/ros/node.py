@@ -24,6 +24,7 @@ from rclpy.task import Future
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.backlog import Backlog
+from perch_core.ros.composition import composition
 from perch_core.ros.conversions import to_stamp
 from perch_core.ros.parameters import Parameters
 from perch_core.ros.priority import priority
@@ -62,9 +63,15 @@ class PerchNode(Node, Generic[T]):
 
     def create_backlog(self, msg_type: type, topic: str, profile: QoSProfile) -> Backlog:
         """Subscribe to a topic without being woken by its messages; `profile.depth` of them are kept."""
-        subscription = self.create_subscription(msg_type, topic, lambda _: None, profile, raw=True)
-        self._unwatched.add(subscription)
-        return Backlog(subscription)
+        backlog = Backlog(profile.depth)
+
+        def subscribe() -> None:
+            subscription = self.create_subscription(msg_type, topic, lambda _: None, profile, raw=True)
+            self._unwatched.add(subscription)
+            backlog.subscribe(subscription)
+
+        composition.subscribe(self.resolve_topic_name(topic), backlog.keep, subscribe)
+        return backlog
 
     def publish_diagnostics(self, time: float, values: dict[str, Any], level: int = 0, message: str = "ok") -> None:
         """Publish one status of this node on /diagnostics.

@@ -16,6 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image, Imu
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.ros import qos
+from perch_core.ros.composition import composition
 from perch_core.ros.conversions import to_pose, to_stamp
 from perch_core.ros.wire import ImuTemplate, OdometryTemplate
 from perch_core.surface import PerchSurface
@@ -61,8 +62,8 @@ class VehicleTopics:
     """Everything but `step` that the vehicle publishes."""
 
     def __init__(self, node: Node, imu: ImuConfig, mounts: Mapping[str, CameraMount]) -> None:
-        self.imu = node.create_publisher(Imu, "imu/data_raw", qos.CHAIN)
-        self.odometry = node.create_publisher(Odometry, "ground_truth/odometry", qos.CHAIN)
+        self.imu = composition.publisher(node, Imu, "imu/data_raw", qos.CHAIN)
+        self.odometry = composition.publisher(node, Odometry, "ground_truth/odometry", qos.CHAIN)
         self.target = node.create_publisher(PoseStamped, "ground_truth/target", qos.LATCHED)
         self.rotors = node.create_publisher(RotorState, "rotor_state", qos.CHAIN)
         self.contact = node.create_publisher(Contact, "contact", qos.GATED)
