@@ -24,7 +24,8 @@ from perch_perception.line_mapping.observation import LineObservation
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
-WIDTH_GATE = 0.1       # a width farther off than 3 sigma and three times this in distance [m] is that of two wires, or of a part of one
+GATE = 4.0             # widths farther off than so many sigma are not this wire's
+WIDTH_GATE = 0.08      # error of the distance, 1 sigma, before there is an earlier result [m]
 ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radius
 
 
@@ -66,6 +67,7 @@ class WireEstimate:
         used: sightings that agree with it, shape (n,).
         mount: error of the camera's attitude on the body that fits them best, in C [rad], shape (3,).
         radius: of the wire [m]; nan where it was never wide enough in an image.
+        time: of the last sighting: there the wire is where `curve` has it [s].
     """
 
     curve: WireCurve
@@ -74,6 +76,7 @@ class WireEstimate:
     used: np.ndarray
     mount: np.ndarray
     radius: float
+    time: float = 0.0
 
     def point_covariance(self, s: float) -> np.ndarray:
         """Covariance of the point at s in W [m^2], shape (3, 3); across the wire only."""
@@ -129,21 +132,33 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     used = np.ones(len(observations), bool)
     drifted = _drifted(observations, settings)
     rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
-    for walk in [rigid] * rounds + [drifted] * ITERATIONS:
-        residual, _ = _whitened(curve, mount, observations, centres, rays, settings, walk.sum() - np.cumsum(walk))
+    known, newest = _before(observations, before)
+    for number, walk in enumerate([rigid] * rounds + [drifted] * ITERATIONS):
+        walked = np.cumsum(walk)
+        # an earlier result is where the wire was at its own last sighting: what came since may be off by the walk and by its error
+        apart = np.abs(walked[newest if number == rounds else -1] - walked) + known
+        residual, _ = _whitened(curve, mount, observations, centres, rays, settings, apart)
         misfit = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
         used = misfit < 3.0 * max(1.0, float(np.median(misfit)))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
         information, gradient = _wandering(
             _normal_equations(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight),
-            _normal_equations(*_widths(curve, size, observations, settings), weight), walk, settings, curve.curvature, mount)
+            _normal_equations(*_widths(curve, size, observations, settings, apart if known > 0.0 else apart + WIDTH_GATE**2), weight), walk, settings, curve.curvature, mount)
         step = -np.linalg.solve(information, gradient)
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
         raise DegenerateBaseline(ratio, settings.min_ratio)
     covariance = np.linalg.inv(information)[:PARAMETERS, :PARAMETERS] * max(1.0, float(np.mean(misfit[used] ** 2)))
-    return WireEstimate(curve, covariance, ratio, used, mount, float(np.exp(size)))
+    return WireEstimate(curve, covariance, ratio, used, mount, float(np.exp(size)), observations[-1].time)
+
+
+def _before(observations: Sequence[LineObservation], before: WireEstimate | None) -> tuple[float, int]:
+    """Variance of an earlier result's place [m^2], and the last of the sightings that it rests on."""
+    if before is None:
+        return 0.0, -1
+    return (float(np.linalg.eigvalsh(before.covariance[:2, :2])[-1]),
+            max((k for k, one in enumerate(observations) if one.time <= before.time), default=0))
 
 
 def _drifted(observations: Sequence[LineObservation], settings: TriangulationConfig) -> np.ndarray:
@@ -195,8 +210,11 @@ def _feet(curve, observations):
     return to + s[:, None] * curve.direction + (0.5 * curve.curvature * s * s)[:, None] * curve.axes[:, 1], s
 
 
-def _widths(curve, size, observations, settings):
-    """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, and their Jacobian (n, 1, 9)."""
+def _widths(curve, size, observations, settings, apart):
+    """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, and their Jacobian (n, 1, 9).
+
+    A width that says a distance farther off than `apart` (n,) [m^2] allows is that of two wires, or of a part of one.
+    """
     residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, ALL))
     width, ray = np.array([(o.width, o.sigma) for o in observations]).T
     seen = np.flatnonzero(width > 0.0)
@@ -210,7 +228,7 @@ def _widths(curve, size, observations, settings):
     x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
     zero = np.zeros_like(s)
     rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]
-    one_wire = np.abs(misfit) < 3.0 * np.hypot(sigma, WIDTH_GATE / distance)
+    one_wire = np.abs(misfit) < GATE * np.hypot(sigma, np.sqrt(apart[seen]) / distance)
     residual[seen, 0], jacobian[seen, 0] = np.where(one_wire, misfit / sigma, 0.0), np.where(one_wire[:, None], rows, 0.0)
     return residual, jacobian
 
