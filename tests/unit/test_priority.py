@@ -41,6 +41,7 @@ assert nice(os.getpid()) == before, 'a process with other work is left alone'
 own = Priority(); own.own_process = True
 own.give_way()
 assert nice(os.getpid()) == NICE
+assert os.sched_getscheduler(0) == os.SCHED_BATCH, 'it interrupts nobody'
 """
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import multiprocessing
-import os
 import signal
 from collections import deque
 from collections.abc import Collection, Sequence
@@ -19,7 +18,7 @@ import cv2
 import numpy as np
 
 from perch_core.camera import CameraMount
-from perch_core.processes import end_with_parent
+from perch_core.processes import end_with_parent, give_way
 from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
@@ -189,7 +188,7 @@ class _Ordered:
 
 def _draw_until_closed(orders: Connection, images: Connection, scene: Scene, mount: CameraMount, seed: int) -> None:
     end_with_parent(signal.SIGTERM)
-    os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    give_way(0, NICE)
     cv2.setNumThreads(1)
     renderer = Renderer(scene, mount, seed)
     with suppress(EOFError, BrokenPipeError):

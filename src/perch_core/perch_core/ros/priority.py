@@ -6,6 +6,8 @@ import os
 import threading
 from contextlib import suppress
 
+from perch_core.processes import give_way
+
 PRIORITY = 10  # of SCHED_FIFO: above everything ordinary, below the kernel's own threads
 NICE = 10      # of work that has time
 
@@ -39,7 +41,7 @@ class Priority:
         if self.own_process:
             for task in _tasks():
                 with suppress(ProcessLookupError):
-                    os.setpriority(os.PRIO_PROCESS, task, NICE)
+                    give_way(task, NICE)
 
 
 def _tasks() -> set[int]:
