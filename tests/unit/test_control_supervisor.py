@@ -161,6 +161,17 @@ def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
     np.testing.assert_allclose(mixed.setpoint(1.0).p, new.setpoint(1.0).p, atol=1e-12)
 
 
+@pytest.mark.parametrize("left, taken", [(0.2, 0.2), (0.4, 0.3), (0.8, 0.4), (3.0, 0.5)])
+def test_a_late_takeover_uses_the_time_there_is(left, taken):
+    """Four centimetres within 0.14 s ask for 10 m/s^2, which no vehicle follows."""
+    new = FlatReference(rest_to_rest(np.zeros(3), np.array([1, 0, 0]), 0, 0, 4.0))
+    begin = 4.0 - left
+    old = Hold.at(np.add(new.setpoint(begin).p, (0.0, 0.0, 0.04)), (0, 1, 0)).setpoint(0)
+    mixed = blended(old, new, begin, 4.0)
+    off = [np.linalg.norm(np.subtract(mixed.setpoint(begin + share * taken).p, new.setpoint(begin + share * taken).p)) for share in (0.0, 0.9, 1.0)]
+    assert off[0] == pytest.approx(0.04) and off[1] > 1e-5 and off[2] < 1e-9
+
+
 def test_brake_meets_state_and_rest():
     b = brake((1, 2, 3), (2, -1, 0.5), (1, 0, -2), (0, 1, 0))
     x, y = b.setpoint(0.0), b.setpoint(b.duration + 1.0)

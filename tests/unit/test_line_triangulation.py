@@ -133,6 +133,23 @@ def test_a_wire_is_as_near_as_it_is_wide():
     assert error[0.03] < 0.025 and found.radius == pytest.approx(0.03, rel=0.02), (error, found.radius)
 
 
+def test_a_wire_that_comes_back_after_a_gap_is_taken_where_it_is_seen():
+    """The odometry has drifted by 7 cm while the wire was out of sight; one look from 0.7 m, then another, put it right."""
+    wire, rng = WireCurve(np.array([5.0, 0.0, 3.8]), np.array([0.0, 1.0, 0.0])), np.random.default_rng(6)
+    seen = [observe(rng, wire, np.array([2.7, 0.0, 3.6 + 0.03 * min(k, 50 - k)]), 3e-4, time=0.1 * k, radius=0.03) for k in range(0, 50, 2)]
+    estimate = triangulate(seen, SETTINGS)
+    for _ in range(3):
+        estimate = triangulate(seen, SETTINGS, estimate)
+    drift, errors = np.array([-0.03, 0.0, -0.065]), []
+    for time, below in ((6.3, 0.75), (6.4, 0.5)):
+        true = wire.point - [0.05, 0.0, below]
+        seen.append(observe(rng, wire, true, 3e-4, time=time, radius=0.03, believed=true + drift))
+        estimate = triangulate(seen, SETTINGS, estimate)
+        assert estimate.used[-1]
+        errors.append(float(np.linalg.norm((estimate.curve.point - wire.point - drift)[[0, 2]])))
+    assert errors[0] < 0.04 and errors[1] < 0.02, errors
+
+
 def test_the_width_of_two_wires_taken_for_one_is_left_out():
     rng = np.random.default_rng(4)
     seen = [observe(rng, WIRE, np.array([0.0, 0.1 * k, 1.5 + 0.1 * k]), 1e-4, radius=0.06 if k in (3, 7) else 0.03) for k in range(12)]

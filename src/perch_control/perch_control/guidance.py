@@ -12,6 +12,7 @@ import numpy as np
 from perch_control.reference import Setpoint, flat_setpoints, packed_many, unpacked
 from perch_core.trajectory import FlatTrajectory
 
+SHORT = 0.3  # a takeover shorter than this asks for more than the vehicle can follow: it uses what time there is [s]
 BRAKE_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
 
 
@@ -155,11 +156,13 @@ class Running:
 
 def blended(old: Setpoint, source, start: float, end: float, duration: float = 0.5):
     """`source` from its time `start` on, taken over from the old setpoint without a jump in position, velocity or
-    acceleration, within half of the time to `end`; the source itself where it continues the old one exactly."""
+    acceleration, within half of the time to `end`, but no faster than within `SHORT` where there is so much; the source itself
+    where it continues the old one exactly."""
     new = source.setpoint(start)
     gap = [np.subtract(getattr(old, k), getattr(new, k)) for k in ("p", "v", "a")]
     if max(float(np.abs(g).max()) for g in gap) < 1e-6:
         return source
     zero = np.zeros(3)
-    duration = min(duration, max(0.5 * (end - start), 0.1))
+    left = end - start
+    duration = min(duration, max(0.5 * left, min(left, SHORT), 0.1))
     return Blend(source, start, Polynomial(quintic(*gap, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))
