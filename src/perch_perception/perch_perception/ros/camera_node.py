@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, TypeVar
 
 import cv2
@@ -23,7 +24,7 @@ from perch_perception.ros.states import body_state
 T = TypeVar("T")
 
 
-class CameraNode(PerchNode[T]):
+class CameraNode(PerchNode[T], ABC):
     """Each image waits until the odometry has passed its exposure and is then given to `use`, in order.
 
     The parameters have `vehicle` and `camera`. A subclass makes what `use` needs, then calls `begin()`.
@@ -56,6 +57,7 @@ class CameraNode(PerchNode[T]):
         """Why this node cannot use a camera; empty when it can."""
         return ""
 
+    @abstractmethod
     def use(self, msg: Image, exposed: float, refusal: str) -> None:
         """Use one image, and report to the lockstep, whatever happens.
 
@@ -64,7 +66,6 @@ class CameraNode(PerchNode[T]):
             exposed: middle of its exposure on the IMU's clock [s].
             refusal: why the image must not be used; empty when it may.
         """
-        raise NotImplementedError
 
     def _take_odometry(self) -> None:
         """Take the states that have come, and handle the images whose exposure they have passed."""
