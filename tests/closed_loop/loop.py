@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.guidance import Hold
 from perch_control.modes import Command, State
+from perch_control.nmpc import NmpcController, NmpcSettings
 from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
@@ -105,6 +107,12 @@ class Loop:
     def rmse(self) -> np.ndarray:
         """RMS of the distance to the reference per axis over the recorded steps [m], shape (3,)."""
         return np.sqrt(np.mean((np.array(self.states)[:, :3] - np.array(self.references)) ** 2, axis=0))
+
+
+def predictive(vehicle: Vehicle | None = None, **settings: Any) -> NmpcController:
+    """The predictive controller with some settings of its own; the Snapdragon vehicle by default."""
+    vehicle = vehicle or load_vehicle("snapdragon")
+    return NmpcController(vehicle, NmpcSettings(**settings), GeometricController(vehicle, GeometricGains()))
 
 
 def make_loop(vehicle: Vehicle | None = None, p=(0.0, 0.0, 0.0), disturbances: Disturbances | None = None,

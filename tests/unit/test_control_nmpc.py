@@ -1,5 +1,4 @@
-"""The predictive controller: condensing and its QP against second implementations, the model against the rigid body, and
-closed loop; the L1 augmentation."""
+"""The predictive controller: the model against the rigid body, and closed loop; the L1 augmentation."""
 
 from __future__ import annotations
 
@@ -8,21 +7,17 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from closed_loop.loop import fly_to_contact, make_loop, perch
+from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.l1 import L1Augmentation, L1Settings
-from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings
-from perch_control.nmpc.condensing import condense, solve_condensed
+from perch_control.nmpc import LineWeights
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import StageLayout, stage
-from perch_control.nmpc.qp import solve, solve_osqp
 from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
-from perch_control.nmpc.riccati import Workspace, solve_stages
 from perch_control.reference import FlatReference, SampledReference
 from perch_control.settings import GeometricGains
 from perch_core import rigid_body, so3
@@ -34,10 +29,6 @@ from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
 
 SNAPDRAGON, RPG = load_vehicle("snapdragon"), load_vehicle("rpg")
-
-
-def controller(vehicle=SNAPDRAGON, **settings):
-    return NmpcController(vehicle, NmpcSettings(**settings), GeometricController(vehicle, GeometricGains()))
 
 
 def argument(layout, rng):
@@ -102,71 +93,6 @@ def test_compiled_linearisation_and_finite_differences_agree(states, with_lines)
         assert np.linalg.eigvalsh(Q).min() > -1e-9
 
 
-def random_stages(rng, N=6, n=13):
-    A = np.eye(n) + 0.1 * rng.normal(size=(N, n, n))
-    L = rng.normal(size=(N + 1, n, n))
-    return (A, 0.3 * rng.normal(size=(N, n, 4)), 0.1 * rng.normal(size=(N, n)), L @ L.transpose(0, 2, 1),
-            rng.normal(size=(N + 1, n)), rng.normal(size=(N, 4)), 0.7, rng.normal(size=n))
-
-
-def test_condensed_cost_is_the_stage_costs_sum():
-    """Against the definition: simulate the linear system for a given du and add the stage costs up."""
-    rng = np.random.default_rng(0)
-    A, B, c, Q, q, r, R, dx0 = random = random_stages(rng)
-    N, n = c.shape
-    H, h, xi, G = condense(*random)
-
-    def cost(du):
-        x, total = dx0, 0.0
-        for k in range(N):
-            u = du[4 * k:4 * k + 4]
-            total += 0.5 * R * u @ u + r[k] @ u
-            x = A[k] @ x + B[k] @ u + c[k]
-            total += 0.5 * x @ Q[k + 1] @ x + q[k + 1] @ x
-        return total
-
-    base = cost(np.zeros(4 * N))
-    for _ in range(5):
-        du = rng.normal(size=4 * N)
-        assert cost(du) - base == pytest.approx(0.5 * du @ H @ du + h @ du, rel=1e-9)
-        x = dx0
-        for k in range(N):
-            x = A[k] @ x + B[k] @ du[4 * k:4 * k + 4] + c[k]
-        np.testing.assert_allclose(xi[-1] + G[-1] @ du, x, rtol=1e-9, atol=1e-9)
-
-
-def both_solutions(law):
-    """The law's last QP anew from nothing, by Riccati recursions and by condensing and DAQP: du of both, active inputs and states."""
-    N, n, s = len(law.U), law.X.shape[1], law.settings
-    stages, dx, du, work = law._stages.stages, np.zeros_like(law.X), np.zeros_like(law.U), Workspace(N, n)
-    X, U = law._stages.arguments[:, :n].copy(), law._stages.arguments[:N, n:n + 4].copy()
-    weight = s.thrust_rate if s.thrust_states else s.thrust
-    args = stages, X, U, law._start - X[0], weight, law._target, s.terminal, law._low, law._high, law._x_low, law._x_high
-    assert solve_stages(*args, law._price, 30, work.arrays, dx, du) > 0
-    other_x, other_u = solve_condensed(*args)
-    np.testing.assert_allclose(dx[:, :10], other_x[:, :10], atol=1e-5)
-    return du, other_u, np.count_nonzero(work.fixed), np.count_nonzero(work.soft)
-
-
-@pytest.mark.parametrize("thrust_states, rate_max, off", [(False, 0.0, 1e-9), (True, 0.0, 1e-4), (False, 2.0, 1e-4)])
-def test_riccati_and_condensing_solve_the_same_qp(thrust_states, rate_max, off):
-    """Along a perch, where bounds are active. A soft bound is not as stiff for both: DAQP prices it by its own scaling."""
-    law, active = controller(thrust_states=thrust_states, rate_max=rate_max), [0, 0]
-    loop = make_loop(law=law)
-    loop.begin_in_hover()
-    loop.plant.floor = -10.0
-    loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=2)
-    for _ in range(40):
-        loop.run(0.036)
-        du, other, fixed, soft = both_solutions(law)
-        if not soft:
-            np.testing.assert_allclose(du, other, atol=1e-9)
-        np.testing.assert_allclose(du, other, atol=off)
-        active[0] += bool(fixed)
-        active[1] += bool(soft)
-    assert active[0] > 3 if not (thrust_states or rate_max) else active[1] > 3, active
-
-
 def test_reference_rows_are_those_of_their_times():
     source, vehicle, out = FlatReference(perch("surface_90_1.7m").trajectory), packed_vehicle(SNAPDRAGON), np.zeros((21, 17))
     rows = ReferenceRows(vehicle, 0.5, 500)
@@ -177,26 +103,9 @@ def test_reference_rows_are_those_of_their_times():
             np.testing.assert_allclose(out[k], expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("with_rows", [False, True])
-def test_qp_solvers_agree(with_rows):
-    rng = np.random.default_rng(3)
-    n = 12
-    L = rng.normal(size=(n, n))
-    H, h = L @ L.T + np.eye(n), 5 * rng.normal(size=n)
-    rows = rng.normal(size=(3, n)) if with_rows else np.zeros((0, n))
-    args = H, h, np.full(n, -0.3), np.full(n, 0.4), rows, np.full(len(rows), -0.5), np.full(len(rows), 0.5), np.zeros(len(rows), bool)
-    x = solve(*args)
-    np.testing.assert_allclose(x, solve_osqp(*args), atol=1e-4)
-    bounds = [(-0.3, 0.4)] * n
-    constraints = [{"type": "ineq", "fun": lambda y: 0.5 - rows @ y}, {"type": "ineq", "fun": lambda y: 0.5 + rows @ y}] if with_rows else []
-    peer = minimize(lambda y: 0.5 * y @ H @ y + h @ y, np.zeros(n), jac=lambda y: H @ y + h, bounds=bounds,
-                    constraints=constraints, method="SLSQP", options={"ftol": 1e-12, "maxiter": 500})
-    np.testing.assert_allclose(x, peer.x, atol=1e-4)
-
-
 @pytest.mark.parametrize("thrust_states", [False, True])
 def test_perch_in_closed_loop_needs_no_rehearsal(thrust_states):
-    arrival, _ = fly_to_contact(perch("surface_90_1.7m"), law=controller(thrust_states=thrust_states))
+    arrival, _ = fly_to_contact(perch("surface_90_1.7m"), law=predictive(thrust_states=thrust_states))
     assert arrival.holds, arrival
     assert np.all(arrival.rmse < 0.02)
 
@@ -219,7 +128,7 @@ def test_a_powerline_perch_in_closed_loop_stops_its_rotation_at_the_wire():
     """With the weights of the scenario and the true state: within what the paper flew, 6.9 cm and 3.0 deg with an optical tracking
     system; the moment that stops 4.9 rad/s acts within the last 60 ms."""
     settings = load_scenario("line_180").parameters["controller"]
-    law = controller(RPG, **{key.removeprefix("nmpc."): tuple(v) if isinstance(v, list) else v for key, v in settings.items() if key.startswith("nmpc.")})
+    law = predictive(RPG, **{key.removeprefix("nmpc."): tuple(v) if isinstance(v, list) else v for key, v in settings.items() if key.startswith("nmpc.")})
     planned = problem.plan(problem.load("powerline_line_180"))
     loop = make_loop(RPG, law=law)
     loop.begin_in_hover(planned.request.start[:3])
@@ -234,12 +143,12 @@ def test_a_powerline_perch_in_closed_loop_stops_its_rotation_at_the_wire():
 
 
 def test_perch_with_estimation_errors():
-    arrival, _ = fly_to_contact(perch("surface_90_3m"), law=controller(), noise_seed=1)
+    arrival, _ = fly_to_contact(perch("surface_90_3m"), law=predictive(), noise_seed=1)
     assert arrival.holds, arrival
 
 
 def test_rotor_thrusts_and_body_rates_keep_their_limits():
-    law = controller(rate_max=3.0)
+    law = predictive(rate_max=3.0)
     loop = make_loop(law=law)
     loop.begin_in_hover()
     loop.plant.v = np.array([2.0, 0.0, 0.0])  # far from the reference: the limits act
@@ -262,7 +171,7 @@ def test_laws_switch_in_flight_without_a_jump():
     p = loop.plant.p.copy()
     loop.follow(rest_to_rest(p, p + [2, 0, 0.5], 0, 0.4, 2.0))
     loop.run(0.8)
-    flight, law = loop.controller, controller()
+    flight, law = loop.controller, predictive()
     for following in (law, GeometricController(SNAPDRAGON, GeometricGains()), law):
         before = np.array(flight.maneuvers.rotors.command)
         flight.use(following, flight.maneuvers.gains, flight.settings)
@@ -279,7 +188,7 @@ def test_l1_cuts_the_error_under_wind_and_mass(law):
     """Issue 6: position RMSE under 5 m/s wind and +20 % mass at least 60 % smaller than without."""
     rmse = {}
     for adaptive in (False, True):
-        flown = controller() if law == "nmpc" else GeometricController(SNAPDRAGON, GeometricGains())
+        flown = predictive() if law == "nmpc" else GeometricController(SNAPDRAGON, GeometricGains())
         loop = make_loop(law=flown, disturbances=Disturbances(mass_factor=1.2, wind=(5.0, 0.0, 0.0)))
         if adaptive:
             loop.controller.compensator = L1Augmentation(SNAPDRAGON, L1Settings())
@@ -312,7 +221,7 @@ def test_line_terms_lead_around_a_wire_that_the_reference_cuts():
     wire = Segment.between(np.array([1.5, -3.0, 1.25]), np.array([1.5, 3.0, 1.25]), 0.03)
     closest = {}
     for weight in (0.0, 2000.0):
-        law = controller(RPG, lines=LineWeights(collision=weight, perception=1e-6, ramp_time=0.5), rate_max=5.0)
+        law = predictive(RPG, lines=LineWeights(collision=weight, perception=1e-6, ramp_time=0.5), rate_max=5.0)
         law.lines(((*wire.centre, *wire.direction, wire.half_length, wire.radius),))
         loop = make_loop(vehicle=RPG, law=law)
         loop.begin_in_hover()
@@ -327,9 +236,9 @@ def test_line_terms_lead_around_a_wire_that_the_reference_cuts():
 
 def test_interpreted_linearisation_flies_the_same(monkeypatch):
     monkeypatch.setenv("PERCH_COMPILE", "0")
-    slow = controller()
+    slow = predictive()
     monkeypatch.delenv("PERCH_COMPILE")
-    fast = controller()
+    fast = predictive()
     assert not slow.compiled and (fast.compiled or ca.__version__)
     speeds = []
     for law in (slow, fast):

@@ -18,6 +18,7 @@ from typing import Any
 import rclpy
 from perch_core.errors import PerchError
 from perch_core.ros.composition import composition
+from perch_core.ros.priority import priority
 from perch_core.ros.node import StopSignal, spin_until_stopped
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -69,6 +70,7 @@ def main() -> None:
             nodes = create_nodes(plan)
         gc.collect()
         gc.freeze()  # as in spin_main
+        priority.own_process = True
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
