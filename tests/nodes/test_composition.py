@@ -54,7 +54,7 @@ class Process:
         self.on_message = lambda number: None
         for node in (self.listener, self.talker, self.stranger):
             self.executor.add_node(node)
-        self.composition.connect(self.executor.create_task)
+        self.composition.connect(self.executor)
 
     def receive(self, data: bytes) -> None:
         self.heard.append(stamp_of(data))
@@ -138,6 +138,16 @@ def test_what_leaves_waits_for_the_neighbours_unless_it_is_flushed(process):
     process.fast.publish(message(1))
     process.until(lambda: len(process.overheard) == 3)
     assert order == ["handled 1", "handled 2", "sent 1", "sent 2", "sent 3", "handled 3"]
+
+
+def test_an_error_ends_the_program(process):
+    def fail(number: int) -> None:
+        raise ZeroDivisionError(f"message {number}")
+
+    process.on_message = fail
+    process.fast.publish(message(3))
+    with pytest.raises(ZeroDivisionError, match="message 3"):
+        process.until(lambda: False)
 
 
 class Spy:

@@ -18,7 +18,6 @@ from typing import Any
 import rclpy
 from perch_core.errors import PerchError
 from perch_core.ros.composition import composition
-from perch_core.ros.priority import priority
 from perch_core.ros.node import StopSignal, spin_until_stopped
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -70,11 +69,10 @@ def main() -> None:
             nodes = create_nodes(plan)
         gc.collect()
         gc.freeze()  # as in spin_main
-        priority.own_process = True
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)
-        composition.connect(executor.create_task)
+        composition.connect(executor)
         spin_until_stopped(executor, stop)
     except (PerchError, rclpy.exceptions.InvalidParameterValueException) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from typing import Any, Iterator
 
+from rclpy.clock import Clock, ClockType
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -65,7 +67,7 @@ class Composition:
         self._subscriptions: list[tuple[str, Receive, Callable[[], Any]]] = []
         self._messages: deque[tuple[Receive, bytes]] = deque()  # the one under way is the first
         self._leaving: list[tuple[Publisher, bytes]] = []
-        self._create_task: Callable[[Callable[[], None]], Any] | None = None
+        self._executor: EventsExecutor | None = None
 
     # -- wiring ------------------------------------------------------------------------------------------------------
 
@@ -103,13 +105,9 @@ class Composition:
         else:
             subscribe()
 
-    def connect(self, create_task: Callable[[Callable[[], None]], Any]) -> None:
-        """Connect the nodes, which are all there now.
-
-        Args:
-            create_task: of the executor that runs them.
-        """
-        self._create_task = create_task
+    def connect(self, executor: EventsExecutor) -> None:
+        """Connect the nodes, which are all there and have been added to their executor."""
+        self._executor = executor
         for topic, receive, subscribe in self._subscriptions:
             if topic in self._publishers:
                 self._publishers[topic].add_neighbour(receive)
@@ -133,10 +131,20 @@ class Composition:
 
     def _queue(self, receive: Receive, data: bytes) -> None:
         if not self._messages:
-            self._create_task(self._hand_on)
+            self._executor.create_task(self._hand_on)
         self._messages.append((receive, data))
 
     def _hand_on(self) -> None:
+        """An exception out of a task is a segmentation fault in rclpy 7.1.6; out of a timer it ends the program with its traceback."""
+        try:
+            self._hand_on_burst()
+        except Exception as error:
+            def fail(error: Exception = error) -> None:
+                raise error
+
+            next(iter(self._executor.get_nodes())).create_timer(0.0, fail, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _hand_on_burst(self) -> None:
         """Hand on waiting messages in the order in which they were published, and those that follow from them."""
         messages = self._messages
         for _ in range(BURST):
@@ -148,7 +156,7 @@ class Composition:
             if not messages:
                 break
         else:
-            self._create_task(self._hand_on)
+            self._executor.create_task(self._hand_on)
         self.flush()
 
 
