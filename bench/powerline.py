@@ -3,28 +3,35 @@
     python3 scripts/bench.py powerline            1,000 random starts, some five minutes
     python3 scripts/bench.py powerline --quick    50 random starts
 
+Every plan is written to out/bench as it is made: a run that was interrupted goes on where it was, unless the sources have changed.
 Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
+from pathlib import Path
 
 import numpy as np
 from harness import Figure, figure
 
 from perch_core import compiled
 from perch_core.errors import PlanningRefusal
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.campaign.progress import Progress
+from perch_eval.evaluation.perching import source_digest
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
+from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.solving import Solver
 from perch_planner.powerline.starts import random_start
 from perch_planner.powerline.visibility import visibility
 
 SOLVE_BARS = {"line_20": 60.0, "line_80": 60.0, "line_20_pa": 100.0, "line_80_pa": 100.0, "line_180": 110.0}  # [ms]
 PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # [s]
+STATE = Path(__file__).resolve().parents[1] / "out" / "bench"
 END_BARS = {"end_position": 1e-3, "end_tilt": 0.1, "end_speed": 0.02}
 
 
@@ -32,42 +39,62 @@ def figures(quick: bool) -> list[Figure]:
     """Measure everything; `quick` takes 10 starts a case instead of 200."""
     vehicle = load_vehicle("rpg")
     out = [figure("compilation", "s", [_compile_time()], bar=30.0, comparison="max <=")]
+    answers = _answers(vehicle, 10 if quick else 200)
+    for case, bar in SOLVE_BARS.items():
+        plans = [answer for answer in answers if answer["case"] == case and not answer["refusal"]]
+        out += [figure(f"{case} perch solve", "ms", [plan["perch_ms"] for plan in plans], bar=bar),
+                figure(f"{case} recovery solve", "ms", [plan["recovery_ms"] for plan in plans], bar=70.0),
+                figure(f"{case} perch iterations", "-", [plan["iterations"] for plan in plans])]
+    plans = [answer for answer in answers if not answer["refusal"]]
+    out += [figure("every perch solve", "ms", [plan["perch_ms"] for plan in plans], bar=250.0, comparison="max <="),
+            figure("every perch solve, wall clock", "ms", [plan["wall_ms"] for plan in plans]),
+            figure("random starts solved", "%", [100.0 * len(plans) / len(answers)], bar=99.5, comparison="min >="),
+            figure("limits violated at 1 ms", "-", [sum(plan["violated"] for plan in plans)], bar=0, comparison="max ==")]
+    out += [figure(name, {"end_tilt": "deg", "end_speed": "m/s"}.get(name, "m"), [plan[name] for plan in plans], bar=END_BARS[name],
+                   comparison="max <=") for name in END_BARS]
+    for answer in answers:
+        if answer["refusal"]:
+            print(f"refused: {answer['case']}: {answer['refusal']}")
+    return out + _published() + _perception()
+
+
+def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
+    """What the planner says to so many random starts of each case; plans of the same sources are not made again."""
+    STATE.mkdir(parents=True, exist_ok=True)
+    path = STATE / f"powerline_{source_digest()[:12]}.jsonl"
+    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
+    known = {(one["case"], one["start"]): one for one in (json.loads(line) for line in lines if line.endswith("\n"))}
+    asked = [(case, k) for case in SOLVE_BARS for k in range(starts)]
+    already = [known[key] for key in asked if key in known]
+    progress = Progress(len(asked), len(already), sum(not one["refusal"] for one in already), what="starts")
     planner = PowerlinePlanner(vehicle)
     planner.warm_up()
-    solved, asked, refusals, violated, every, wall = 0, 0, [], 0, [], []
-    ends: dict[str, list[float]] = {name: [] for name in END_BARS}
-    for case, bar in SOLVE_BARS.items():
-        setup = problem.load(f"powerline_{case}")
-        nominal, rng = setup.request(vehicle), np.random.default_rng(2026)
-        perch, recovery, iterations = [], [], []
-        for _ in range(10 if quick else 200):
-            asked += 1
-            try:
-                plan = planner.plan(random_start(nominal, setup, vehicle, rng))
-            except PlanningRefusal as refusal:
-                refusals.append(f"{case}: {refusal}")
-                continue
-            solved += 1
-            violated += sum(not bound.holds for bound in plan.bounds)
-            for bound in plan.perch.bounds:
-                if bound.quantity in ends:
-                    ends[bound.quantity].append(bound.maximum)
-            perch.append(1e3 * plan.perch.cpu_time)
-            recovery.append(1e3 * plan.recovery.cpu_time)
-            wall.append(1e3 * plan.perch.solve_time)
-            iterations.append(plan.perch.iterations)
-        every += perch
-        out += [figure(f"{case} perch solve", "ms", perch, bar=bar), figure(f"{case} recovery solve", "ms", recovery, bar=70.0),
-                figure(f"{case} perch iterations", "-", iterations)]
-    out += [figure("every perch solve", "ms", every, bar=250.0, comparison="max <="),
-            figure("every perch solve, wall clock", "ms", wall),
-            figure("random starts solved", "%", [100.0 * solved / asked], bar=99.5, comparison="min >="),
-            figure("limits violated at 1 ms", "-", [violated], bar=0, comparison="max ==")]
-    out += [figure(name, {"end_tilt": "deg", "end_speed": "m/s"}.get(name, "m"), values, bar=END_BARS[name], comparison="max <=")
-            for name, values in ends.items()]
-    for refusal in refusals:
-        print(f"refused: {refusal}")
-    return out + _published() + _perception()
+    with path.open("w") as file:
+        file.writelines(json.dumps(one) + "\n" for one in known.values())
+        for case in SOLVE_BARS:
+            setup, rng = problem.load(f"powerline_{case}"), np.random.default_rng(2026)
+            nominal = setup.request(vehicle)
+            for k in range(starts):
+                request = random_start(nominal, setup, vehicle, rng)  # drawn in any case: a start does not depend on what is known
+                if (case, k) not in known:
+                    known[case, k] = {"case": case, "start": k, **_answer(planner, request)}
+                    file.write(json.dumps(known[case, k]) + "\n")
+                    file.flush()
+                    progress.add(not known[case, k]["refusal"])
+    progress.close()
+    return [known[key] for key in asked]
+
+
+def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> dict:
+    """A plan's times, iterations, broken limits and end errors, or why there is none."""
+    try:
+        plan = planner.plan(request)
+    except PlanningRefusal as refusal:
+        return {"refusal": str(refusal)}
+    return {"refusal": "", "perch_ms": 1e3 * plan.perch.cpu_time, "recovery_ms": 1e3 * plan.recovery.cpu_time,
+            "wall_ms": 1e3 * plan.perch.solve_time, "iterations": plan.perch.iterations,
+            "violated": sum(not bound.holds for bound in plan.bounds),
+            **{bound.quantity: bound.maximum for bound in plan.perch.bounds if bound.quantity in END_BARS}}
 
 
 def _compile_time() -> float:
