@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +34,8 @@ class BodyState:
         v_WB: velocity in W [m/s], shape (3,).
         w_WB_B: angular velocity in B [rad/s], shape (3,).
         covariance: of position and attitude, errors in the axes of W [m, rad], shape (6, 6).
+        corrected: what the odometry has moved its position by beside its velocity, since the beginning, in W [m], shape (3,): it found
+            that it was elsewhere. Without it the motion is smooth, as the vehicle's own is.
     """
 
     time: float
@@ -42,6 +44,7 @@ class BodyState:
     v_WB: np.ndarray
     w_WB_B: np.ndarray
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    corrected: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def R_WB(self) -> np.ndarray:
@@ -61,6 +64,7 @@ class PoseBuffer:
         self._span, self._reach = span, reach
         self._states: deque[BodyState] = deque()
         self._times: deque[float] = deque()
+        self._corrected: deque[np.ndarray] = deque()
 
     def __len__(self) -> int:
         return len(self._states)
@@ -77,11 +81,13 @@ class PoseBuffer:
         squares = sum(x @ x for x in (state.p_WB, state.q_WB, state.v_WB, state.w_WB_B))
         if not math.isfinite(state.time + squares):  # one check: this runs at 500 Hz
             return False
+        self._corrected.append(self._correction(state))
         self._states.append(state)
         self._times.append(state.time)
         while self._times[-1] - self._times[0] > self._span:
             self._times.popleft()
             self._states.popleft()
+            self._corrected.popleft()
         return True
 
     def at(self, time: float) -> BodyState:
@@ -98,14 +104,23 @@ class PoseBuffer:
         if time < oldest:
             raise StampError(f"stamp {time:.4f} s is {1e3 * (oldest - time):.1f} ms older than the odometry kept")
         if time >= newest:
-            return _moved(self._states[-1], time)
+            return replace(_moved(self._states[-1], time), corrected=self._corrected[-1])
         right = bisect_left(self._times, time)
         if self._times[right] == time:
-            return self._states[right]
+            return replace(self._states[right], corrected=self._corrected[right])
         a, b = self._states[right - 1], self._states[right]
         if b.time - a.time > MAX_GAP:
             raise StampError(f"stamp {time:.4f} s lies in a gap of {1e3 * (b.time - a.time):.0f} ms of the odometry")
-        return _between(a, b, (time - a.time) / (b.time - a.time))
+        return replace(_between(a, b, (time - a.time) / (b.time - a.time)), corrected=self._corrected[right])
+
+    def _correction(self, state: BodyState) -> np.ndarray:
+        """`corrected` of a state that comes after the newest; a gap tells nothing of it."""
+        if not self._states:
+            return np.zeros(3)
+        before, dt = self._states[-1], state.time - self._times[-1]
+        if dt > MAX_GAP:
+            return self._corrected[-1]
+        return self._corrected[-1] + state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB)
 
 
 def _between(a: BodyState, b: BodyState, share: float) -> BodyState:

@@ -22,6 +22,7 @@ from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, State, Target
 
 _TICK = TICK_STEPS * CONTROL_PERIOD  # the mission's period [s]
+_AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
 _DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
 
 
@@ -122,7 +123,7 @@ class RunningPlan:
         return following
 
     def _seen_better(self, target: Target) -> bool:
-        return target.time > self.target.time and target.position_sigma <= self.target.position_sigma
+        return target.time > self.target.time and target.position_sigma <= _AS_SURE * self.target.position_sigma
 
     def _better(self, target: Target, time: float, start: float) -> bool:
         s = self._settings

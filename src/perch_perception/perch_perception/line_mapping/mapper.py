@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Sequence
 
 import numpy as np
@@ -88,13 +88,18 @@ class _Track:
 
 
 class LineMapper:
-    """Follows, triangulates and keeps wires. The state is the list of wires."""
+    """Follows, triangulates and keeps wires. The state is the list of wires.
+
+    They are kept in a frame that leaves out what the odometry corrects its position by: the vehicle does not move by that, and neither
+    does the wire as the vehicle sees it. The map is given in W as the odometry has it now.
+    """
 
     def __init__(self, settings: MapperConfig | None = None) -> None:
         self.settings = settings or MapperConfig()
         self._tracks: list[_Track] = []
         self._next_id = 0
         self._body: BodyState | None = None
+        self._corrected = np.zeros(3)
 
     def update(self, time: float, body: BodyState, seen: Sequence[LineObservation]) -> LineMap:
         """Take the sightings of one image.
@@ -104,7 +109,9 @@ class LineMapper:
             body: state of the body then; the covariance of its attitude is the odometry's share of the map's.
             seen: the sightings, placed with this state.
         """
-        self._body = body
+        self._corrected = body.corrected
+        self._body = replace(body, p_WB=body.p_WB - body.corrected)
+        seen = [replace(one, p_WC=one.p_WC - body.corrected) for one in seen]
         changed = set()
         for one, owner in zip(seen, associate(self._tracks, seen, self.settings.association)):
             if owner is None:
@@ -217,7 +224,7 @@ class LineMapper:
             if sigma > self.settings.max_sigma:
                 missing.append(f"line {track.id}: known to {sigma:.2f} m only")
                 return []
-            lines.append(MappedLine(_chord(estimate.curve, a, b, radius, track.id + PIECE_IDS * k), covariance,
+            lines.append(MappedLine(_chord(estimate.curve, a, b, radius, track.id + PIECE_IDS * k, self._corrected), covariance,
                                     self._direction_sigma(estimate), track.count))
         return lines
 
@@ -235,10 +242,10 @@ class LineMapper:
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
 
 
-def _chord(curve: WireCurve, a: float, b: float, radius: float, id: int) -> Segment:
-    """The straight piece nearest to the wire between a and b: the chord, moved by a third of the sag's two thirds."""
+def _chord(curve: WireCurve, a: float, b: float, radius: float, id: int, offset: np.ndarray) -> Segment:
+    """The straight piece nearest to the wire between a and b: the chord, moved by a third of the sag's two thirds, and by `offset` (3,) [m]."""
     lift = -curve.curvature * (b - a) ** 2 / 12.0  # mean of the parabola below its chord
-    shift = lift * curve.axes[:, 1]
+    shift = lift * curve.axes[:, 1] + offset
     return Segment.between(curve.at(np.array(a)) + shift, curve.at(np.array(b)) + shift, radius, id)
 
 
