@@ -59,7 +59,7 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
 
     contact = Contact(problem, settings, vehicle.perch_offset)
     linear = contact.constraints(durations)
-    bubbles = contact.bubbles(durations, linear, everywhere=False)
+    bubbles = contact.bubbles(durations, everywhere=False)
     times = np.arange(0.0, durations.sum(), SAMPLE)
     edges = np.concatenate([[0.0], np.cumsum(durations)])
     segments = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(durations) - 1)

@@ -153,7 +153,7 @@ def test_body_rate_is_that_of_flatness_and_its_bound_is_one(seed):
     coefficients, yaw, duration = motion(seed)
     force = specific_force(coefficients, duration)
     jerk = bernstein.derivative(coefficients, 3) / duration**3
-    parts = rate_parts(force, jerk, yaw, duration)
+    parts = rate_parts(force, bounds.squared(force), jerk, yaw, duration)
     places = np.linspace(0.0, 1.0, 41)
     rates = [rate_by_flatness(coefficients, yaw, duration, s) for s in places]
     for s, rate in zip(places[::8], rates[::8]):
@@ -176,10 +176,23 @@ def test_body_rate_is_that_of_flatness_and_its_bound_is_one(seed):
 def test_the_coarse_bound_of_the_body_rate_is_one(seed):
     coefficients, yaw, duration = motion(seed)
     jerk = bernstein.derivative(coefficients, 3) / duration**3
-    coarse = rate_coarse_bound(specific_force(coefficients, duration), jerk, yaw, duration)
+    force = specific_force(coefficients, duration)
+    coarse = rate_coarse_bound(force, bounds.squared(force), jerk, yaw, duration)
     assert coarse >= max(rate_by_flatness(coefficients, yaw, duration, s) for s in np.linspace(0.0, 1.0, 41))
 
 
 def test_squared_length_has_the_coefficients_of_the_product_with_itself():
     vector = np.random.default_rng(3).normal(size=(3, 13))
     assert bounds.squared(vector) == pytest.approx(bernstein.product(vector, vector).sum(axis=0), abs=1e-13)
+
+
+@given(seeds)
+@settings(max_examples=40)
+def test_halves_are_the_polynomial_on_their_halves(seed):
+    rng = np.random.default_rng(seed)
+    whole = rng.normal(size=rng.integers(1, 50))
+    right, left = whole.copy(), np.empty(len(whole))
+    bounds.split(right, left)
+    for s in np.linspace(0.0, 1.0, 7):
+        assert bernstein.evaluate(left, s) == pytest.approx(bernstein.evaluate(whole, 0.5 * s), abs=1e-12)
+        assert bernstein.evaluate(right, s) == pytest.approx(bernstein.evaluate(whole, 0.5 + 0.5 * s), abs=1e-12)

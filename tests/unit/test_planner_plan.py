@@ -225,3 +225,20 @@ def test_random_problems_end_in_verified_plans_or_typed_refusals(chunk):
         assert verify(answer.trajectory.durations, answer.trajectory.coefficients, need, step=2e-3) == []
         planned += 1
     assert planned >= 40  # these problems are generous: most have a plan
+
+
+@pytest.mark.parametrize("inclination", [40.0, 50.0, 55.0])
+def test_the_rim_clears_the_surface_from_the_first_program_on(inclination):
+    """Where the rotation begins the rim comes nearest; without the row that is set ahead these take two programs."""
+    planned = checked(PerchProblem(HOVER, surface(inclination), (Waypoint((0.6, 0.1, 1.5)),)))
+    assert planned.iterations == 1
+
+
+def test_the_row_ahead_leaves_a_surface_without_clearance_alone():
+    problem = PerchProblem(HOVER, surface(45.0))
+    snaps = []
+    for settings in (PerchSettings(clearance_min=-1e3), PerchSettings()):
+        trajectory = plan(problem, settings, VEHICLE).trajectory
+        times = np.linspace(0.0, trajectory.duration, 2000)
+        snaps.append(sum(np.sum(trajectory.derivative(t, 4)[:3] ** 2) for t in times) * trajectory.duration)
+    assert snaps[0] < 0.99 * snaps[1]

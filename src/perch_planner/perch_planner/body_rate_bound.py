@@ -53,11 +53,11 @@ def _elevate(coefficients, size):
 
 
 @compiled
-def rate_parts(force, jerk, yaw, duration):
+def rate_parts(force, force2, jerk, yaw, duration):
     """Bernstein coefficients of what the body rate consists of.
 
     Args:
-        force: f, shape (3, 13) [m/s^2].
+        force, force2: f and |f|^2, shapes (3, 13) and (25,) [m/s^2].
         jerk: shape (3, 12) [m/s^3].
         yaw: shape (15,) [rad].
         duration: of the segment [s].
@@ -67,7 +67,6 @@ def rate_parts(force, jerk, yaw, duration):
     """
     parts = np.zeros((_PARTS, _TILT))
     x = cross(force, jerk)
-    force2 = squared(force)
     fourth, tilt, turn = squared(force2.reshape((1, 25))), _elevate(squared(x), _TILT), derivative(yaw, 1)
     for k in range(_TILT):
         parts[0, k], parts[1, k] = fourth[k], tilt[k]
@@ -86,13 +85,12 @@ def rate_parts(force, jerk, yaw, duration):
 
 
 @compiled
-def rate_coarse_bound(force, jerk, yaw, duration):
+def rate_coarse_bound(force, force2, jerk, yaw, duration):
     """A quick upper bound of |omega| on a segment from |x| <= |f| |j|; infinite where it is of no use.
 
     Args:
-        force, jerk, yaw, duration: as for `rate_parts`.
+        force, force2, jerk, yaw, duration: as for `rate_parts`.
     """
-    force2 = squared(force)
     least, most = smallest(force2), largest(force2)
     if least <= 0.0:
         return np.inf
@@ -241,3 +239,35 @@ def rate_at(parts, s):
     for row in range(_PARTS):
         at[row, 0] = value(parts[row, :_SIZES[row]], s)
     return sqrt(_squared_rate(at))
+
+
+@compiled
+def prove_rate(forces, squares, jerks, yaw, durations, coarse, limit, sampled):
+    """Prove a body rate near the greatest that is attained, or find where the limit fails.
+
+    Args:
+        forces, squares, jerks, yaw, durations: of all segments, as for `rate_parts`.
+        coarse: of `rate_coarse_bound`, shape (f,) [rad/s].
+        limit: of the rate [rad/s].
+        sampled: a rate that the plan is known to attain [rad/s].
+
+    Returns:
+        (proved, doubt, doubt_at, found, found_at): the proved bound, or infinity and segment and place where the limit is in
+        doubt (segment -1: none, or `sampled` breaks it); segment and place of a rate above the sampled one, segment -1
+        where there is none.
+    """
+    found, found_at = -1, 0.0
+    if sampled >= limit:
+        return np.inf, -1, 0.0, found, found_at
+    attained, most = sampled, sampled
+    for i in range(len(durations)):
+        proved = coarse[i]
+        if proved > min(RATE_SLACK * attained, limit):
+            parts = rate_parts(forces[i], squares[i], jerks[i], yaw[i], durations[i])
+            attained, proved, place = rate_maximum(parts, attained, limit)
+            if place >= 0.0:
+                found, found_at = i, place
+            if proved > limit:
+                return np.inf, i, max(place, 0.0), found, found_at
+        most = max(most, proved)
+    return most, -1, 0.0, found, found_at

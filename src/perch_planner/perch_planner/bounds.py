@@ -53,12 +53,26 @@ def magnitude(values):
 
 @compiled
 def split(work, left):
-    """De Casteljau at 1/2: the left half is written to `left`, and `work` becomes the right half."""
-    last = len(work) - 1
-    for k in range(last + 1):
+    """De Casteljau at 1/2: the left half is written to `left`, and `work` becomes the right half.
+
+    Four levels in one pass: a pass for each level waits for its own stores, and takes three times as long.
+    """
+    n, k = len(work), 0
+    while k + 3 < n:
+        a, b, c, d = work[0], work[1], work[2], work[3]
+        left[k], left[k + 1] = a, 0.5 * (a + b)
+        left[k + 2], left[k + 3] = 0.25 * (a + c) + 0.5 * b, 0.125 * (a + d) + 0.375 * (b + c)
+        m = n - k - 4
+        for i in range(m):
+            work[i] = 0.0625 * (work[i] + work[i + 4]) + 0.25 * (work[i + 1] + work[i + 3]) + 0.375 * work[i + 2]
+        a, b, c, d = work[m], work[m + 1], work[m + 2], work[m + 3]
+        work[m], work[m + 1], work[m + 2] = 0.125 * (a + d) + 0.375 * (b + c), 0.25 * (b + d) + 0.5 * c, 0.5 * (c + d)
+        k += 4
+    while k < n:
         left[k] = work[0]
-        for i in range(last - k):
+        for i in range(n - 1 - k):
             work[i] = 0.5 * (work[i] + work[i + 1])
+        k += 1
 
 
 @compiled
@@ -179,13 +193,22 @@ def bernstein_row(degree, s):
 
 
 @compiled
-def _add_product(a, b, sign, out):
-    """Add sign a b to `out`, which holds Bernstein coefficients times binomials."""
-    n, m = len(a), len(b)
+def _scaled(a):
+    """Coefficients times binomials: so scaled, a product is a convolution."""
+    n = len(a)
+    out = np.empty(n)
     for i in range(n):
-        scaled = sign * a[i] * _BINOMIALS[n - 1, i]
-        for k in range(m):
-            out[i + k] += scaled * (b[k] * _BINOMIALS[m - 1, k])
+        out[i] = a[i] * _BINOMIALS[n - 1, i]
+    return out
+
+
+@compiled
+def _add_product(a, b, sign, out):
+    """Add sign a b to `out`; all three are `_scaled`."""
+    for i in range(len(a)):
+        factor = sign * a[i]
+        for k in range(len(b)):
+            out[i + k] += factor * b[k]
 
 
 @compiled
@@ -199,7 +222,7 @@ def _divide_binomials(out):
 def product(a, b):
     """Bernstein coefficients of the product of two polynomials, shapes (n + 1,), (m + 1,) -> (n + m + 1,)."""
     out = np.zeros(len(a) + len(b) - 1)
-    _add_product(a, b, 1.0, out)
+    _add_product(_scaled(a), _scaled(b), 1.0, out)
     _divide_binomials(out)
     return out
 
@@ -234,18 +257,8 @@ def time_derivative(coefficients, order, duration):
 
 
 @compiled
-def dot(a, b):
-    """Bernstein coefficients of a . b for polynomial vectors, shapes (3, n + 1), (3, m + 1)."""
-    out = np.zeros(a.shape[1] + b.shape[1] - 1)
-    for d in range(3):
-        _add_product(a[d], b[d], 1.0, out)
-    _divide_binomials(out)
-    return out
-
-
-@compiled
 def squared(a):
-    """Bernstein coefficients of |a|^2 for a polynomial vector, shape (3, n + 1) -> (2 n + 1,): half the products of `dot`."""
+    """Bernstein coefficients of |a|^2 for a polynomial vector, shape (3, n + 1) -> (2 n + 1,): half the products."""
     n = a.shape[1]
     out, scaled = np.zeros(2 * n - 1), np.empty(n)
     for d in range(a.shape[0]):
@@ -264,10 +277,13 @@ def squared(a):
 def cross(a, b):
     """Bernstein coefficients of a x b for polynomial vectors, shapes (3, n + 1), (3, m + 1) -> (3, n + m + 1)."""
     out = np.zeros((3, a.shape[1] + b.shape[1] - 1))
+    p, q = np.empty(a.shape), np.empty(b.shape)
+    for d in range(3):
+        p[d], q[d] = _scaled(a[d]), _scaled(b[d])
     for d in range(3):
         e, g = (d + 1) % 3, (d + 2) % 3
-        _add_product(a[e], b[g], 1.0, out[d])
-        _add_product(a[g], b[e], -1.0, out[d])
+        _add_product(p[e], q[g], 1.0, out[d])
+        _add_product(p[g], q[e], -1.0, out[d])
         _divide_binomials(out[d])
     return out
 

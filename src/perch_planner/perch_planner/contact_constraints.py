@@ -16,11 +16,12 @@ INSET = 1e-7
 
 _FACETS = 4  # the tangential speed stays inside a regular octagon
 _INSCRIBED = cos(pi / (2 * _FACETS))
+_NO_DERIVATIVES = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))  # of waypoints: their numbers, orders, values
 _OCTAGON = np.array([[cos(k * pi / _FACETS), sin(k * pi / _FACETS)] for k in range(_FACETS)])
 
 
 @compiled
-def bounds_kernel(durations, before_end, tube_lower, tube_upper, window, window_lower, window_upper):
+def _bounds(durations, before_end, tube_lower, tube_upper, window, window_lower, window_upper):
     """Tube rows for each instant and axis, then the window's rows: fields of `Bounds`. Instants before the start are dropped.
 
     Args:
@@ -92,7 +93,7 @@ def _window(R_WS, velocity, least, most, tangential):
 
 
 @compiled
-def knots_kernel(durations, given, values, p_contact, velocity):
+def _knots(durations, given, values, velocity):
     """What is given at the knots; those between the last waypoint and contact are free."""
     f, last = len(durations), len(given) - 1
     out, at = np.zeros((f + 1, 4), np.bool_), np.zeros((f + 1, 4, 3))
@@ -104,18 +105,19 @@ def knots_kernel(durations, given, values, p_contact, velocity):
                 at[to, k, d] = values[i, k, d]
     duration = durations.sum()
     for d in range(3):
-        at[f, 0, d] = p_contact[d] + velocity[d] * duration
+        at[f, 0, d] += velocity[d] * duration
     return out, at
 
 
 @compiled
-def bubbles_kernel(count, first_in_tube, complete, everywhere):
-    """Which segments have bubbles: those of the tube, and those after a knot at which everything is given, or all."""
+def _bubbles(count, given, first_in_tube, everywhere):
+    """Which segments have bubbles: those of the tube, and those after a waypoint at which everything is given, or all."""
     out = np.zeros(count, np.bool_)
     for i in range(count):
         out[i] = everywhere or i >= first_in_tube
-    for k in complete:
-        out[k] = True
+    for k in range(1, len(given) - 1):
+        if given[k, 0] and given[k, 1] and given[k, 2] and given[k, 3]:
+            out[k] = True
     return out
 
 
@@ -129,25 +131,47 @@ def _instants(duration, tube_time, tube_step):
 
 
 @compiled
-def _contact(points, v, a, j, R_WS, offset, velocity, alpha, share, floor, tube_time, tube_step, least, most, tangential):
-    """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] of a problem; the last of `points` moves to the contact.
+def _contact(points, v, a, j, places, orders, fixed, R_WS, velocity, alpha, share, floor, tube_time, tube_step, least, most,
+             tangential):
+    """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] of a problem, for a target that stands still.
 
     Returns:
-        (given, values, before_contact): see `Contact`; waypoints have their positions only.
+        (given, values, before_contact): what is given at start, waypoints and contact, shapes (k, 4) and (k, 4, 3), and
+        arguments of `_bounds`.
     """
     acceleration, last = np.empty(3), len(points) - 1
     for d in range(3):
-        points[last, d] += offset * R_WS[d, 2]
         acceleration[d] = alpha * R_WS[d, 2]
     acceleration[2] -= GRAVITY
     given, values = np.zeros((last + 1, 4), np.bool_), np.zeros((last + 1, 4, 3))
     given[:, 0], given[0], given[last, 2] = True, True, True
-    values[:last, 0] = points[:last]
+    values[:, 0] = points
     values[0, 1], values[0, 2], values[0, 3], values[last, 2] = v, a, j, acceleration
+    for q in range(len(places)):
+        given[places[q], orders[q]], values[places[q], orders[q]] = True, fixed[q]
     lower, upper = _tube(acceleration, share, floor)
     directions, window_lower, window_upper = _window(R_WS, velocity, least, most, tangential)
     return given, values, (_instants(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
                            window_upper)
+
+
+@compiled
+def conditions_kernel(durations, everywhere, velocity, problem):
+    """All of `Contact` for given durations, in one call.
+
+    Args:
+        durations: of the segments [s], shape (f,).
+        everywhere: all segments have bubbles.
+        velocity, problem: attributes of `Contact`.
+
+    Returns:
+        (given, values, bubbles, bounds): arguments of `reduced_qp.assemble_kernel`, and fields of `Bounds`.
+    """
+    given, values, before_contact = _contact(*problem)
+    bounds = _bounds(durations, *before_contact)
+    bubbles = _bubbles(len(durations), given, bounds[1][0], everywhere)
+    given, values = _knots(durations, given, values, velocity)
+    return given, values, bubbles, bounds
 
 
 def tube_times(duration: float, settings: PerchSettings) -> np.ndarray:
@@ -161,29 +185,23 @@ class Contact:
     Attributes:
         velocity: of the target in W [m/s], shape (3,).
         points: start, waypoints, and the contact if the target stood still [m], shape (waypoints + 2, 3).
-        at_knots, before_contact, complete: arguments of `knots_kernel`, `bounds_kernel`, `bubbles_kernel`.
+        problem: arguments of `_contact`.
     """
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float) -> None:
-        start, surface = problem.start, problem.surface
+        start, R_WS = problem.start, problem.surface.R_WS
         least, most = settings.impact_speed_min + INSET, settings.impact_speed_max - INSET
         if least > most:
             least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
         self.velocity = problem.target_velocity
-        self.points = problem.points()
-        given, values, self.before_contact = _contact(
-            self.points, start.v, start.a, start.j, surface.R_WS, perch_offset, self.velocity, settings.impact_acceleration,
-            settings.tube_tolerance, settings.tube_floor, settings.tube_time, settings.tube_step, least, most,
-            settings.tangential_speed_max * _INSCRIBED - INSET)
-        complete = []  # knots at which everything is given
-        for k, waypoint in enumerate(problem.waypoints, start=1):
-            for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)):
-                if value is not None:
-                    given[k, order], values[k, order] = True, value
-            if waypoint.j is not None and given[k].all():
-                complete.append(k)
-        self.at_knots = given, values, self.points[-1], self.velocity
-        self.complete = np.array(complete, np.int64)
+        self.points = problem.points.copy()
+        self.points[-1] += perch_offset * R_WS[:, 2]
+        fixed = [(k, order, value) for k, waypoint in enumerate(problem.waypoints, start=1)
+                 for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)) if value is not None]
+        derivatives = tuple(map(np.array, zip(*fixed))) if fixed else _NO_DERIVATIVES
+        self.problem = (self.points, start.v, start.a, start.j, *derivatives, R_WS, self.velocity, settings.impact_acceleration,
+                        settings.tube_tolerance, settings.tube_floor, settings.tube_time, settings.tube_step, least, most,
+                        settings.tangential_speed_max * _INSCRIBED - INSET)
 
     def knots(self, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]
@@ -194,7 +212,11 @@ class Contact:
         Returns:
             given, bool, shape (f + 1, 4), and values, shape (f + 1, 4, 3).
         """
-        return knots_kernel(durations, *self.at_knots)
+        return conditions_kernel(durations, False, self.velocity, self.problem)[:2]
+
+    def bubbles(self, durations: np.ndarray, everywhere: bool) -> np.ndarray:
+        """Segments with bubbles, bool, shape (f,): those of the tube, those after a knot whose derivatives are all given, or all."""
+        return conditions_kernel(durations, everywhere, self.velocity, self.problem)[2]
 
     def constraints(self, durations: np.ndarray) -> Bounds:
         """Tube and impact window for these durations. [M:eq14, M:eq15]
@@ -202,8 +224,4 @@ class Contact:
         The approach runs along -s3, the *outward* normal, so [M:eq14] reads v_min <= -v(t_f) . s3 <= v_max; all
         velocities are relative to the surface.
         """
-        return Bounds(*bounds_kernel(durations, *self.before_contact))
-
-    def bubbles(self, durations: np.ndarray, constraints: Bounds, everywhere: bool) -> np.ndarray:
-        """Segments with bubbles: those of the tube, and those after a knot whose derivatives are all given."""
-        return bubbles_kernel(len(durations), constraints.segments[0], self.complete, everywhere)
+        return Bounds(*conditions_kernel(durations, False, self.velocity, self.problem)[3])

@@ -17,13 +17,14 @@ from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import derivatives_at
 from perch_planner.linear_bounds import Bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
-from perch_planner.problem import Limits, PerchProblem
 from perch_planner.rotor_thrusts import linear_bounds
 
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
 _KEEP_AHEAD = 0.985  # of the limit, for cuts that are set ahead
-_PREVENTED = ((-1, 0.6), (-1, 0.8), (0, 0.0), (0, 0.15))  # segments from the last, places
+_PREVENTED = ((-1, 0.7), (-1, 0.8), (-1, 0.9), (0, 0.0))  # segments from the last, places
 _LEANS = ((1.0, 0.0), (0.980, 0.199))  # the thrust is upright or leans 11 degrees back where it is greatest
+_RIM_ROOM = 1.1     # times the rim's reach at the present tilt, as the tilt changes with the cut
+_LEAN_AHEAD = 0.05  # [rad] that the thrust leans back from upright where the rotation begins
 _RAISE = 1.02       # cuts of the thrust from below
 _HEIGHT_ROOM = 2e-3  # [m]
 _BESIDE = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
@@ -46,7 +47,19 @@ def _specific_force(coefficients, duration, place):
 
 
 @compiled
-def _thrust_cuts(coefficients, durations, extrema, low, high, side):
+def thrust_cuts(coefficients, durations, extrema, low, high, side):
+    """Cuts where the specific thrust leaves [low, high]. [M:eq16]
+
+    Args:
+        coefficients: shape (f, 3, 15).
+        durations: shape (f,) [s].
+        extrema: of `plan_checks.thrust_extrema`.
+        low, high: limits of the specific thrust [m/s^2].
+        side: unit vector over which the thrust turns where it nearly vanishes, shape (3,).
+
+    Returns:
+        Fields of `Bounds`.
+    """
     most = 0
     for i in range(len(durations)):
         most += 3 * (extrema[i, 4] > high) + (extrema[i, 1] < low)
@@ -77,49 +90,47 @@ def _thrust_cuts(coefficients, durations, extrema, low, high, side):
     return owner[:r], segments[:r], places[:r], orders[:r], direction[:r], lower[:r], upper[:r]
 
 
-def thrust_cuts(coefficients: np.ndarray, durations: np.ndarray, extrema: np.ndarray, low: float, high: float,
-                side: np.ndarray) -> Bounds:
-    """Cuts where the specific thrust leaves [low, high]. [M:eq16]
+@compiled
+def preventive_cuts(durations, given, high, side, p_S, v_S, s3, extension, clearance):
+    """Bounds where a perch nearly always needs them, before the first program is solved. [M:eq16]
+
+    From above on the thrust, early in the run-up and the rotation: they hold for every plan that keeps the bound, whatever
+    the direction. And from below on the distance from the surface where the rotation begins, if that place is free: there
+    the rim comes nearest, while the thrust still leans a little back from upright. Both save a round in most plans.
 
     Args:
-        coefficients: shape (f, 3, 15).
-        durations: shape (f,) [s].
-        extrema: of `plan_checks.thrust_extrema`.
-        low, high: limits of the specific thrust [m/s^2].
-        side: unit vector over which the thrust turns where it nearly vanishes, shape (3,).
+        durations: of the segments [s], shape (f,), f > 1.
+        given: number of knots after the start whose positions are given, contact among them.
+        high: limit of the specific thrust [m/s^2].
+        side: of `turning_side`, shape (3,).
+        p_S, v_S, s3, extension, clearance: as for `plan_checks.check`.
+
+    Returns:
+        Fields of `Bounds`.
     """
-    return Bounds(*_thrust_cuts(coefficients, durations, extrema, low, high, side))
-
-
-@compiled
-def _preventive_cuts(count, high, side):
-    places = len(_PREVENTED) if count > 1 else 2
-    owner, segments, at, orders, direction, lower, upper = _empty(2 * places, 2 * places)
+    last = len(durations) - 1
+    most = len(_LEANS) * len(_PREVENTED) + 1
+    owner, segments, at, orders, direction, lower, upper = _empty(most, most)
     r = 0
     for segment, place in _PREVENTED:
-        if count - 1 + segment < 0:
-            continue
         for up, back in _LEANS:
-            owner[r], segments[r], at[r] = r, count - 1 + segment, place
+            owner[r], segments[r], at[r] = r, last + segment, place
             for d in range(3):
                 direction[r, d] = back * side[d]
             direction[r, 2] += up
             upper[r] = _KEEP_AHEAD * high - direction[r, 2] * GRAVITY
             r += 1
-    return owner, segments, at, orders, direction, lower, upper
-
-
-def preventive_cuts(count: int, high: float, side: np.ndarray) -> Bounds:
-    """Upper thrust bounds where a perch nearly always meets them, before the first program is solved. [M:eq16]
-
-    They hold for every plan that keeps the bound, whatever the direction, and save one round in most plans.
-
-    Args:
-        count: number of segments.
-        high: limit of the specific thrust [m/s^2].
-        side: of `turning_side`, shape (3,).
-    """
-    return Bounds(*_preventive_cuts(count, high, side))
+    if last >= given:
+        owner[r], segments[r], orders[r] = r, last, 0
+        time, plane = durations[:last].sum(), 0.0
+        for d in range(3):
+            direction[r, d] = s3[d]
+            plane += s3[d] * (p_S[d] + time * v_S[d])
+        upright = np.arccos(min(max(s3[2], -1.0), 1.0))
+        tilt = np.sin(min(upright + _LEAN_AHEAD, 0.5 * np.pi) if upright < 0.5 * np.pi else upright)
+        lower[r] = plane + clearance + _RIM_ROOM * extension * tilt + _HEIGHT_ROOM
+        r += 1
+    return owner[:r], segments[:r], at[:r], orders[:r], direction[:r], lower[:r], upper[:r]
 
 
 def turning_side(heading: float) -> np.ndarray:
@@ -128,7 +139,17 @@ def turning_side(heading: float) -> np.ndarray:
 
 
 @compiled
-def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
+def limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
+    """Cuts where speed, height, clearance or body rate could not be proved.
+
+    Args:
+        where: of `plan_checks.check`.
+        coefficients, durations: the plan.
+        p_S, v_S, s3, low_height, high_height, speed, rate, extension: as for `plan_checks.check`.
+
+    Returns:
+        Fields of `Bounds`.
+    """
     owner, segments, places, orders, direction, lower, upper = _empty(9, 6)
     t = r = 0
     for row in (SPEED, HEIGHT, CLEARANCE, BODY_RATE):
@@ -157,7 +178,7 @@ def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_h
                 tilt = np.sqrt(max(1.0 - dot(f, s3) ** 2 / squared, 0.0))
                 time = durations[:i].sum() + s * durations[i]
                 orders[t] = 0
-                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + 1.1 * extension * tilt + _HEIGHT_ROOM
+                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + _RIM_ROOM * extension * tilt + _HEIGHT_ROOM
                 for d in range(3):
                     direction[t, d] = s3[d]
             else:
@@ -175,20 +196,6 @@ def _limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_h
                 t += 1
             t, r = t + 1, r + 1
     return owner[:t], segments[:t], places[:t], orders[:t], direction[:t], lower[:r], upper[:r]
-
-
-def limit_cuts(where: np.ndarray, coefficients: np.ndarray, durations: np.ndarray, problem: PerchProblem,
-               limits: Limits) -> Bounds:
-    """Cuts where speed, height, clearance or body rate could not be proved.
-
-    Args:
-        where: of `plan_checks.check`.
-        coefficients, durations: the plan.
-        problem, limits: what was asked.
-    """
-    surface = problem.surface
-    return Bounds(*_limit_cuts(where, coefficients, durations, surface.p_WS, problem.target_velocity, surface.normal.copy(),
-                               *limits.height, limits.speed, limits.body_rate, limits.extension))
 
 
 def rotor_bounds(thrusts: tuple[np.ndarray, np.ndarray], coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray,

@@ -9,18 +9,9 @@ import numpy as np
 from perch_core import bernstein
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
-from perch_planner.body_rate_bound import RATE_SLACK, rate_coarse_bound, rate_maximum, rate_parts
-from perch_planner.bounds import (
-    BELOW,
-    cross,
-    magnitude,
-    maximum,
-    product,
-    smallest,
-    squared,
-    stays_below,
-    time_derivative,
-)
+from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound
+from perch_planner.bounds import magnitude, maximum, smallest, squared, time_derivative
+from perch_planner.clearance_bound import prove_clearance, surface_distance
 
 THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE, ROTOR_THRUST = range(6)
 """Rows of the results; thrust is the specific thrust |a + g e3|. `check` gives the first five, which are proved."""
@@ -35,7 +26,6 @@ _AT11, _AT12, _AT13, _AT14 = (bernstein.basis(n, _PLACES).T.copy() for n in (11,
 
 _RELATIVE = 1e-3   # width of the enclosures, relative to the quantity's largest value
 _FINE = 1e-10      # where a limit falls inside the enclosure
-_CLEARANCE_SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself
 
 
 @compiled
@@ -95,37 +85,6 @@ def thrust_extrema(coefficients, durations, low, high):
         out[i, 3], out[i, 4], out[i, 5] = sqrt(attained), sqrt(proved), place
         proved_least, proved_most = min(proved_least, out[i, 1]), max(proved_most, out[i, 4])
     return out, proved_least, proved_most
-
-
-@compiled
-def surface_distance(coefficients, duration, begin, p_S, v_S, s3):
-    """Distance of the centre of mass from the moving surface, Bernstein coefficients, shape (15,) [m]."""
-    out = np.zeros(coefficients.shape[1])
-    last = len(out) - 1
-    for d in range(3):
-        for k in range(last + 1):
-            out[k] += s3[d] * (coefficients[d, k] - p_S[d] - v_S[d] * (begin + duration * k / last))
-    return out
-
-
-@compiled
-def _rim_clears(distance, force, s3, extension, gap):
-    """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful.
-
-    The rim of a disc around the centre of mass reaches extension sin(tilt) towards the surface, and
-    sin(tilt) = |f x s3| / |f|: so (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
-    """
-    reduced = distance - gap
-    verdict, place = stays_below(-reduced, _CLEARANCE_SLACK)
-    if verdict != BELOW:
-        return False, place
-    tilt = cross(force, s3.reshape((3, 1)))
-    far = product(squared(reduced.reshape((1, len(reduced)))), squared(force))
-    near = product(squared(tilt), np.ones(len(far) - 24))
-    for k in range(len(far)):
-        near[k] = extension * extension * near[k] - far[k]
-    verdict, place = stays_below(near, _CLEARANCE_SLACK)
-    return verdict == BELOW, place
 
 
 @compiled
@@ -254,16 +213,18 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
             _doubt(where, HEIGHT, i, place)
         begin += T
 
+    forces, squares, jerks, distances = np.empty((f, 3, 13)), np.empty((f, 25)), np.empty((f, 3, 12)), np.empty((f, 15))
     # Backwards, as the vehicle turns and comes near at the end: most segments before need no samples then.
     gap_wanted, rate_wanted = np.inf, 1e-3
     coarse = np.empty(f)
     for i in range(f - 1, -1, -1):
         T, c, heading = durations[i], coefficients[i], yaw[i:i + 1]
-        force, jerk, distance = specific_force(c, T), time_derivative(c, 3, T), surface_distance(c, T, begins[i], p_S, v_S, s3)
-        coarse[i] = rate_coarse_bound(force, jerk, yaw[i], T)
-        if smallest(distance) - extension >= gap_wanted and coarse[i] <= min(rate_wanted, 0.999 * rate):
+        forces[i], jerks[i] = specific_force(c, T), time_derivative(c, 3, T)
+        squares[i], distances[i] = squared(forces[i]), surface_distance(c, T, begins[i], p_S, v_S, s3)
+        coarse[i] = rate_coarse_bound(forces[i], squares[i], jerks[i], yaw[i], T)
+        if smallest(distances[i]) - extension >= gap_wanted and coarse[i] <= min(rate_wanted, 0.999 * rate):
             continue
-        gap, gap_at, rate_here, rate_at_ = _sample(distance.reshape((1, 15)), force, jerk, heading,
+        gap, gap_at, rate_here, rate_at_ = _sample(distances[i:i + 1], forces[i], jerks[i], heading,
                                                    time_derivative(heading, 1, T), s3, extension)
         if gap < gap_wanted:
             gap_wanted, out[CLEARANCE, MINIMUM_AT] = gap, begins[i] + T * gap_at
@@ -271,61 +232,20 @@ def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_t
             rate_wanted, out[BODY_RATE, MAXIMUM_AT] = rate_here, begins[i] + T * rate_at_
         if rate_here >= rate:
             where[BODY_RATE, 0], where[BODY_RATE, 1] = i, rate_at_  # in the end the first segment that is too fast
-    out[SPEED, MINIMUM] = 0.0
-    _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, clearance, gap_wanted)
-    _prove_rate(out, where, coefficients, yaw, durations, coarse, rate, rate_wanted)
+    out[SPEED, MINIMUM] = out[BODY_RATE, MINIMUM] = 0.0
+    out[CLEARANCE, MAXIMUM] = np.inf
+    out[CLEARANCE, MINIMUM], i, place = prove_clearance(distances, forces, squares, s3, extension, clearance, gap_wanted)
+    if i >= 0:
+        _doubt(where, CLEARANCE, i, place)
+    out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,
+                                                                    rate_wanted)
+    if i >= 0:
+        _doubt(where, BODY_RATE, i, place)
+    if found >= 0:
+        out[BODY_RATE, MAXIMUM_AT] = begins[found] + found_at * durations[found]
     holds = True
     for k in range(5):
         if where[k, 0] >= 0.0:
             out[k, HOLDS] = 0.0
             holds = False
     return out, where, holds
-
-
-@compiled
-def _prove_clearance(out, where, coefficients, durations, p_S, v_S, s3, extension, limit, sampled):
-    """Prove a clearance near the sampled one, or else that the limit holds, or else find where it fails."""
-    out[CLEARANCE, MINIMUM], out[CLEARANCE, MAXIMUM] = -np.inf, np.inf
-    for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, limit):
-        if gap < limit:
-            continue
-        begin, failed, place = 0.0, -1, 0.0
-        for i in range(len(durations)):
-            distance = surface_distance(coefficients[i], durations[i], begin, p_S, v_S, s3)
-            clears = smallest(distance) > gap + extension
-            if not clears:
-                clears, place = _rim_clears(distance, specific_force(coefficients[i], durations[i]), s3, extension, gap)
-            if not clears:
-                failed = i
-                break
-            begin += durations[i]
-        if failed < 0:
-            out[CLEARANCE, MINIMUM] = gap
-            return
-        if gap == limit:
-            _doubt(where, CLEARANCE, failed, place)
-
-
-@compiled
-def _prove_rate(out, where, coefficients, yaw, durations, coarse, limit, sampled):
-    """Prove a body rate near the greatest that is attained, or find where the limit fails.
-
-    `sampled` is the greatest of `_sample`; `coarse` bounds the rate on each segment.
-    """
-    out[BODY_RATE, MINIMUM], out[BODY_RATE, MAXIMUM] = 0.0, np.inf
-    if sampled >= limit:
-        return
-    attained, most, begin = sampled, sampled, 0.0
-    for i in range(len(durations)):
-        T, proved = durations[i], coarse[i]
-        if proved > min(RATE_SLACK * attained, limit):
-            parts = rate_parts(specific_force(coefficients[i], T), time_derivative(coefficients[i], 3, T), yaw[i], T)
-            attained, proved, place = rate_maximum(parts, attained, limit)
-            if place >= 0.0:
-                out[BODY_RATE, MAXIMUM_AT] = begin + place * T
-            if proved > limit:
-                _doubt(where, BODY_RATE, i, max(place, 0.0))
-                return
-        most = max(most, proved)
-        begin += T
-    out[BODY_RATE, MAXIMUM] = most

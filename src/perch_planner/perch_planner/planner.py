@@ -19,7 +19,6 @@ from perch_planner.certificates import Certificate, certificates
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Attempt, Outcome, Search
-from perch_planner.time_allocation import split_last
 
 _PREFERRED = 60  # programs in which a plan that keeps the rotors' limits must be found where they are preferred
 _CODES = {"": refusals.INFEASIBLE_WINDOW, "thrust": refusals.THRUST_FLOOR, "speed": refusals.BOX, "height": refusals.BOX,
@@ -83,16 +82,15 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     if not outcome.proved:
         raise _refusal(search, outcome)
     if settings.minimum_time:
-        durations, outcome = search.shortest(durations, outcome)
-    durations = split_last(durations)
+        outcome = search.shortest(durations, outcome)
     method = "bernstein"
     if settings.decider == "sturm":
         method = "sturm"
-        if not sturm.thrust_below(outcome.coefficients, durations, search.high):
+        if not sturm.thrust_below(outcome.coefficients, outcome.durations, search.high):
             raise PerchRefusal(refusals.SOLVER, "Algorithm 1 [M:alg1]", 0.0,
                                "Sturm's chain does not confirm the thrust bound that subdivision proves",
                                certificates(outcome.results, limits, vehicle.mass), search.iterations)
-    trajectory = FlatTrajectory(durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
+    trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
     proofs = certificates(outcome.results, limits, vehicle.mass, method)
     return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import atan2, hypot
 from typing import NamedTuple
 
@@ -123,6 +124,7 @@ class PerchProblem:
                 raise ConfigError("problem", "segment_times", f"{list(times)} are not durations in (0.001, 1000) s")
             object.__setattr__(self, "segment_times", times)
 
+    @cached_property
     def points(self) -> np.ndarray:
         """Start, waypoints and the surface's centre at time 0, in W [m], shape (waypoints + 2, 3)."""
         return np.concatenate([self.start.p, *[w.p for w in self.waypoints], self.surface.p_WS]).reshape(-1, 3)

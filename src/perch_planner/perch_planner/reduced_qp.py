@@ -233,7 +233,8 @@ def assemble_kernel(durations, given, values, bubbles, gram, cost_order):
 
 
 @compiled
-def _coefficients(durations, first, unit, spread, centre, w):
+def coefficients_kernel(durations, first, unit, spread, centre, w):
+    """`coefficients` on plain arrays."""
     m, n = spread.shape
     unknowns = np.empty((3, n))
     for d in range(3):
@@ -274,4 +275,4 @@ def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbl
 
 def coefficients(program: ReducedProgram, w: np.ndarray) -> np.ndarray:
     """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]."""
-    return _coefficients(*program, w)
+    return coefficients_kernel(*program, w)

@@ -38,32 +38,39 @@ class PerchRefusal(PlanningRefusal):
 
 
 @compiled
-def _figures(points, a, s3, extension, offset, moving):
+def _figures(points, a, R_WS, extension, offset, moving, low_height, high_height, clearance):
     """What is known of a plan from its start and its points.
 
     Args:
         points: start, waypoints and the surface's centre in W [m], shape (k, 3).
         a: acceleration of the start [m/s^2].
-        s3: the surface's outward normal.
+        R_WS: axes of the surface, the last its outward normal.
         extension, offset: radius of the vehicle's disc, and distance of its centre from the surface at contact [m].
         moving: the contact's place is not known.
+        low_height, high_height, clearance: limits [m].
 
     Returns:
-        (specific thrust of the start [m/s^2], reach of the rim towards the surface at the start [m], heights [m] and
-        distances from the surface's plane [m], each of shape (k,) or, without the contact, (k - 1,)).
+        (specific thrust of the start [m/s^2], reach of the rim towards the surface at the start [m], distance of the start
+        from the surface's plane [m], first point whose height is out of range and that height [m], first waypoint that is too
+        near to the plane and its distance [m]); points are -1 where there is none.
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
     specific = sqrt(x * x + y * y + z * z)
-    lean = min(abs(x * s3[0] + y * s3[1] + z * s3[2]) / max(specific, 1e-9), 1.0)
-    last = len(points) - 1
-    heights, distances = np.empty(last + 1), np.zeros(last + 1)
+    lean = min(abs(x * R_WS[0, 2] + y * R_WS[1, 2] + z * R_WS[2, 2]) / max(specific, 1e-9), 1.0)
+    last, wrong, near = len(points) - 1, -1, -1
+    start = height = distance = 0.0
     for k in range(last + 1):
-        heights[k] = points[k, 2]
+        z = points[k, 2] + (offset * R_WS[2, 2] if k == last else 0.0)
+        if wrong < 0 and not (moving and k == last) and not low_height <= z <= high_height:
+            wrong, height = k, z
+        far = 0.0
         for d in range(3):
-            distances[k] += s3[d] * (points[k, d] - points[last, d])
-    heights[last] += offset * s3[2]
-    count = last if moving else last + 1
-    return specific, extension * sqrt(1.0 - lean * lean), heights[:count], distances
+            far += R_WS[d, 2] * (points[k, d] - points[last, d])
+        if k == 0:
+            start = far
+        elif k < last and near < 0 and far <= clearance:
+            near, distance = k, far
+    return specific, extension * sqrt(1.0 - lean * lean), start, wrong, height, near, distance
 
 
 def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
@@ -90,34 +97,30 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
                            f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N", limits=("thrust",))
     start, surface = problem.start, problem.surface
-    specific, rim, heights, distances = _figures(problem.points(), start.a, surface.normal, limits.extension,
-                                                 vehicle.perch_offset, bool(problem.target_velocity[2]))
+    specific, rim, distance, wrong, height, near, at_waypoint = _figures(
+        problem.points, start.a, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
+        *limits.height, limits.clearance)
     specific *= vehicle.mass
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
                            f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N",
                            limits=("thrust",))
-    for k, height in enumerate(heights.tolist()):
+    if wrong >= 0:
         margin = min(height - limits.height[0], limits.height[1] - height)
-        if margin < 0.0:
-            name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[k]
-            raise PerchRefusal(BOX, f"height of the {name}", margin,
-                               f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m",
-                               limits=("height",))
+        name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[wrong]
+        raise PerchRefusal(BOX, f"height of the {name}", margin,
+                           f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m",
+                           limits=("height",))
     speed = hypot(*start.v.tolist())
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s",
                            limits=("speed",))
-    distance, *at_waypoints = distances[:-1].tolist()
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
                            f"the start is {distance:.3f} m in front of the surface's plane; the rim needs {rim:.3f} m",
                            limits=("clearance",))
-    if any(problem.target_velocity.tolist()):
-        return
-    for k, distance in enumerate(at_waypoints):
-        if distance <= limits.clearance:
-            raise PerchRefusal(BOX, f"clearance of waypoint {k} from the surface's plane", distance,
-                               f"waypoint {k} is {-distance:.3f} m behind the surface's plane", limits=("clearance",))
+    if near >= 0 and not any(problem.target_velocity.tolist()):
+        raise PerchRefusal(BOX, f"clearance of waypoint {near - 1} from the surface's plane", at_waypoint,
+                           f"waypoint {near - 1} is {-at_waypoint:.3f} m behind the surface's plane", limits=("clearance",))

@@ -10,8 +10,8 @@ import numpy as np
 from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks
 from perch_planner.contact_constraints import Contact
-from perch_planner.cutting import limit_cuts, preventive_cuts, rotor_bounds, thrust_cuts, turning_side
-from perch_planner.linear_bounds import NONE
+from perch_planner.cutting import rotor_bounds, turning_side
+from perch_planner.judgement import Judgement, Question
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.rotor_thrusts import rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, FORMULATIONS
@@ -19,8 +19,7 @@ from perch_planner.time_allocation import allocate, lengthen_approach, split_las
 from perch_planner.yaw_profile import yaw_coefficients
 
 _CUT_ROUNDS = 24
-_CUT_REACH = 1.7      # peaks beyond this multiple of the limit are stretched before they are cut, and so, the first
-_PATIENCE = 5         # few times, are peaks before the last waypoint: there a longer time helps most
+_PATIENCE = 5         # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
 _NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
 _PLAIN_STRETCH = 1.15
 _SEGMENT_STRETCH = 1.1  # of the paper's per-segment stretching
@@ -43,8 +42,9 @@ class Attempt(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a set of durations gave: a plan (`failure` empty) or why not, and how much longer to try."""
+    """What a set of durations [s] gave: a plan (`failure` empty) or why not, and how much longer to try."""
 
+    durations: np.ndarray
     coefficients: np.ndarray | None
     yaw: np.ndarray | None
     results: np.ndarray | None
@@ -68,7 +68,10 @@ class Search:
         self.contact = Contact(problem, settings, vehicle.perch_offset)
         self.first = allocate(problem, settings, self.contact.points)
         self.end_yaw = contact_heading(problem.surface)
-        self.side, self.normal = turning_side(self.end_yaw), problem.surface.normal.copy()
+        self.question = Question(
+            problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turning_side(self.end_yaw), self.low,
+            self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _NEAR * self.high,
+            len(problem.waypoints), settings.cuts)
         self.rotors = rotor_model(vehicle) if settings.rotors != "free" else None
         self.attempts: list[Attempt] = []
         self.failures: Counter[str] = Counter()
@@ -85,81 +88,65 @@ class Search:
             patient: give up early where longer durations promise more than cuts.
         """
         settings, start = self.settings, self.problem.start
-        ahead = preventive_cuts(len(durations), self.high, self.side) if settings.cuts and len(durations) > 1 else NONE
+        nothing = Outcome(durations, None, None, None)
         try:
-            program = FORMULATIONS[settings.formulation](self.contact, durations, settings, ahead)
+            program = FORMULATIONS[settings.formulation](self.contact, durations, settings,
+                                                         self.question if settings.cuts else None)
         except np.linalg.LinAlgError:
-            return Outcome(None, None, None, "solver")
+            return nothing._replace(failure="solver")
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
         best, count, turning, duration = None, 0, False, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= settings.iterations_max:
                 break
-            coefficients, solution = program.solve()
-            if not solution.solved:
+            found = program.judged(yaw, self.question, patient, rounds > 0)
+            if found is None:
                 self._note(duration, np.nan, np.nan, count)
                 break
-            extrema, least, most = plan_checks.thrust_extrema(coefficients, durations, self.low, self.high)
-            self._note(duration, least, most, count)
-            outcome = self._thrust(coefficients, extrema, least, most)
-            if outcome and (not settings.cuts or patient and self._better_stretched(extrema)):
+            self._note(duration, found.least, found.most, count)
+            outcome = self._thrust(durations, found)
+            if found.stretch:
                 return outcome
-            cuts = []
-            if outcome:
-                cuts.append(thrust_cuts(coefficients, durations, extrema, self.low, self.high, self.side))
-            if not outcome or rounds and outcome.margin > -_NEAR * self.limits.thrust[1]:
-                results, where, holds, thrusts = self._check(coefficients, yaw, durations, extrema)
+            count += found.cuts
+            if found.checked:
+                results, holds, thrusts = found.results, found.holds, None
+                if self.rotors is not None:
+                    results, kept, thrusts = self._rotors(found.coefficients, yaw, durations, results)
+                    holds = holds and kept
+                    turning = turning or not kept
                 if holds:
-                    return Outcome(coefficients, yaw, results)
-                cuts.append(limit_cuts(where, coefficients, durations, self.problem, self.limits))
-                turning = turning or thrusts is not None and not results[plan_checks.ROTOR_THRUST, plan_checks.HOLDS]
+                    return Outcome(durations, found.coefficients, yaw, results)
                 if turning and settings.cuts:
-                    bounds = rotor_bounds(thrusts, coefficients, yaw, durations, *self.limits.rotor_thrust, self.rotors)
+                    bounds = rotor_bounds(thrusts, found.coefficients, yaw, durations, *self.limits.rotor_thrust, self.rotors)
                     program.replace(bounds)
                     count += len(bounds.lower)
-                outcome = outcome or self._limit(coefficients, yaw, results)
+                outcome = outcome or self._limit(durations, found.coefficients, yaw, results)
             best = outcome
-            cuts = [bounds for bounds in cuts if len(bounds.lower)]
-            if not (cuts or turning) or not settings.cuts:
+            if not (found.cuts or turning) or not settings.cuts:
                 break
-            for bounds in cuts:
-                program.add(bounds)
-                count += len(bounds.lower)
         # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
-        return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or Outcome(None, None, None)
+        return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or nothing
 
-    def _thrust(self, coefficients: np.ndarray, extrema: np.ndarray, least: float, most: float) -> Outcome | None:
+    def _thrust(self, durations: np.ndarray, found: Judgement) -> Outcome | None:
         """The failure of the thrust range, or None."""
-        if most <= self.high and least >= self.low:
+        if found.most <= self.high and found.least >= self.low:
             return None
-        margin = min(self.high - most, least - self.low) * self.vehicle.mass
-        return Outcome(coefficients, None, None, "thrust", margin, stretch_factor(most, self.high), extrema)
+        margin = min(self.high - found.most, found.least - self.low) * self.vehicle.mass
+        return Outcome(durations, found.coefficients, None, None, "thrust", margin, stretch_factor(found.most, self.high),
+                       found.extrema)
 
-    def _better_stretched(self, extrema: np.ndarray) -> bool:
-        """Whether the peak lies where a longer time lowers it."""
-        segment = int(extrema[:, 4].argmax())
-        peak = extrema[segment, 4]
-        return bool(peak > self.high and (segment < len(self.problem.waypoints) or peak > _CUT_REACH * self.high))
-
-    def _limit(self, coefficients: np.ndarray, yaw: np.ndarray, results: np.ndarray) -> Outcome:
+    def _limit(self, durations: np.ndarray, coefficients: np.ndarray, yaw: np.ndarray, results: np.ndarray) -> Outcome:
         """The failure of another limit than the thrust range."""
         name = [n for n, row in zip(plan_checks.NAMES, results) if not row[plan_checks.HOLDS]][-1]
-        return Outcome(coefficients, yaw, results, name, self._margin(results, name))
+        return Outcome(durations, coefficients, yaw, results, name, self._margin(results, name))
 
-    def _check(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, extrema: np.ndarray):
-        """Rows of `plan_checks.NAMES`, first doubts of the proved ones, whether all hold, rotor samples (or None)."""
-        surface, limits = self.problem.surface, self.limits
-        results, where, holds = plan_checks.check(
-            coefficients, yaw, durations, extrema, surface.p_WS, self.problem.target_velocity, self.normal, self.low,
-            self.high, limits.speed, limits.height[0], limits.height[1], limits.extension, limits.clearance,
-            limits.body_rate)
-        if self.rotors is None:
-            return results, where, holds, None
-        low, high = limits.rotor_thrust
+    def _rotors(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, results: np.ndarray):
+        """Rows of `plan_checks.NAMES`, whether the rotors' limits are kept, and their samples."""
+        low, high = self.limits.rotor_thrust
         thrusts, row = sampled(coefficients, yaw, durations, *self.rotors)
         kept = low <= row[0] and row[2] <= high
-        return np.vstack([results, [*row, kept]]), where, holds and kept, (thrusts, row)
+        return np.vstack([results, [*row, kept]]), kept, (thrusts, row)
 
     def _margin(self, results: np.ndarray, name: str) -> float:
         row, limits = results[plan_checks.NAMES.index(name)], self.limits
@@ -213,7 +200,7 @@ class Search:
             grown = outcome.stretch * durations
         return with_last_segment(grown, self.settings)
 
-    def shortest(self, durations: np.ndarray, outcome: Outcome) -> tuple[np.ndarray, Outcome]:
+    def shortest(self, durations: np.ndarray, outcome: Outcome) -> Outcome:
         """Bisect the scale of all durations for the shortest plan whose limits are still proved."""
         shortest = max(self.settings.tube_time, self.settings.last_segment_min)
         low, high = min(shortest / durations[-1], 1.0), 1.0
@@ -226,4 +213,4 @@ class Search:
                 high, outcome = middle, tried
             else:
                 low = middle
-        return high * durations, outcome
+        return outcome

@@ -10,7 +10,7 @@ import numpy as np
 
 from perch_core import bernstein
 from perch_core.jit import compiled
-from perch_planner.bounds import dot
+from perch_planner.bounds import squared
 from perch_planner.plan_checks import specific_force
 
 
@@ -111,7 +111,7 @@ def thrust_below(coefficients: np.ndarray, durations: np.ndarray, high: float) -
     """
     for segment, duration in zip(coefficients, durations):
         force = specific_force(segment, duration)
-        powers = bernstein.to_powers(dot(force, force) / high**2)
+        powers = bernstein.to_powers(squared(force) / high**2)
         if not global_bound_check(powers, 1.0, 0.0, 1.0):
             return False
     return True

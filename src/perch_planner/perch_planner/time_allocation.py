@@ -34,7 +34,7 @@ def _turn(points, legs, i):
 
 
 @compiled
-def _along_waypoints(points, v_start, v_end, speed, acceleration, turn_acceleration):
+def _along_waypoints(points, v_start, v_end, speed, acceleration, turn_acceleration, last_least):
     """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns, and longer by
     the time that the difference of the end velocities takes.
 
@@ -65,7 +65,7 @@ def _along_waypoints(points, v_start, v_end, speed, acceleration, turn_accelerat
     stretch = 1.0 + extra / out.sum()
     for i in range(n):
         out[i] = max(stretch * out[i], SEGMENT_MIN)
-    out[n - 1] = max(out[n - 1], APPROACH_TIME)
+    out[n - 1] = max(max(out[n - 1], APPROACH_TIME), last_least)
     return out
 
 
@@ -81,11 +81,9 @@ def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray)
         Durations [s], shape (len(waypoints) + 1,).
     """
     if problem.segment_times is not None:
-        durations = np.array(problem.segment_times)
-    else:
-        durations = _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
-                                     TURN_ACCELERATION)
-    return with_last_segment(durations, settings)
+        return with_last_segment(np.array(problem.segment_times), settings)
+    return _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
+                            TURN_ACCELERATION, max(settings.tube_time, settings.last_segment_min))
 
 
 def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndarray:

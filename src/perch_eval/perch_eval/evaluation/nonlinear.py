@@ -56,7 +56,7 @@ def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, dura
     begin = perf_counter()
     contact = Contact(problem, settings, vehicle.perch_offset)
     linear = contact.constraints(durations)
-    bubbles = contact.bubbles(durations, linear, settings.objective == "jerk" or settings.bubbles == "everywhere")
+    bubbles = contact.bubbles(durations, settings.objective == "jerk" or settings.bubbles == "everywhere")
     program = reduced_qp.assemble(durations, *contact.knots(durations), bubbles, COST_ORDER[settings.objective])
     rows, lower, upper = rows_of(program, linear)
     n = rows.shape[1]

@@ -1,0 +1,73 @@
+"""A proved bound on the distance of the vehicle's rim from the surface, until contact."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.jit import compiled
+from perch_planner.bounds import BELOW, cross, product, smallest, squared, stays_below
+
+_SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself
+
+
+@compiled
+def surface_distance(coefficients, duration, begin, p_S, v_S, s3):
+    """Distance of the centre of mass from the moving surface, Bernstein coefficients, shape (15,) [m]."""
+    out = np.zeros(coefficients.shape[1])
+    last = len(out) - 1
+    for d in range(3):
+        for k in range(last + 1):
+            out[k] += s3[d] * (coefficients[d, k] - p_S[d] - v_S[d] * (begin + duration * k / last))
+    return out
+
+
+@compiled
+def _rim_clears(distance, force, force2, s3, extension, gap):
+    """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful.
+
+    The rim of a disc around the centre of mass reaches extension sin(tilt) towards the surface, and
+    sin(tilt) = |f x s3| / |f|: so (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
+    """
+    reduced = distance - gap
+    verdict, place = stays_below(-reduced, _SLACK)
+    if verdict != BELOW:
+        return False, place
+    tilt = cross(force, s3.reshape((3, 1)))
+    far = product(squared(reduced.reshape((1, len(reduced)))), force2)
+    near = product(squared(tilt), np.ones(len(far) - 24))
+    for k in range(len(far)):
+        near[k] = extension * extension * near[k] - far[k]
+    verdict, place = stays_below(near, _SLACK)
+    return verdict == BELOW, place
+
+
+@compiled
+def prove_clearance(distances, forces, squares, s3, extension, limit, sampled):
+    """Prove a clearance near the sampled one, or else that the limit holds, or else find where it fails.
+
+    Args:
+        distances: of `surface_distance`, shape (f, 15) [m].
+        forces, squares: f and |f|^2, shapes (f, 3, 13) and (f, 25).
+        s3: outward normal, shape (3,).
+        extension: radius of the vehicle's disc [m].
+        limit: least distance of its rim from the surface [m].
+        sampled: a distance that the plan is known to attain [m].
+
+    Returns:
+        (proved, segment, place): the proved clearance, or -inf and where it is doubtful; segment -1 where there is no doubt.
+    """
+    failed, place = -1, 0.0
+    for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, limit):
+        if gap < limit:
+            continue
+        failed = -1
+        for i in range(len(distances)):
+            if smallest(distances[i]) > gap + extension:
+                continue
+            clears, place = _rim_clears(distances[i], forces[i], squares[i], s3, extension, gap)
+            if not clears:
+                failed = i
+                break
+        if failed < 0:
+            return gap, -1, 0.0
+    return -np.inf, failed, place
