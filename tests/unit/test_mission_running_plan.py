@@ -113,6 +113,7 @@ def test_a_target_known_worse_than_the_planned_one_is_not_followed():
     query = running().query(START + 0.1, AT_REST, target(10.0, x=5.26, sigma=0.03), GOAL)
     assert query.recovery
     assert running().moved(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL) is None
+    assert running().moved(START + 0.1, target(10.0, x=5.06, sigma=0.022), GOAL), "out of sight it gets a little less certain, and moves with the map"
 
 
 @pytest.mark.parametrize("time", [START + 0.1, START + LENGTH - 0.4])
