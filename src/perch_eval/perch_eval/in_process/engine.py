@@ -105,6 +105,7 @@ class _Flight:
         self.trace = FlightTrace(self.simulation.pad)
         self.poses, self.sightings, self.orders = Mailbox(), Mailbox(), Mailbox()
         self.truth = StateHistory(MEMORY)
+        self.truth.append(self.simulation.state)  # an exposure may have its middle before the first step ends
         self.frames: dict[str, deque[Delivery]] = {"down": deque(), "front": deque()}
         self.index = 0
         self.status: PilotStatus | None = None
