@@ -22,6 +22,7 @@ from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import RotorEstimate, thrusts
 from perch_control.schedule import Schedule
 from perch_control.settings import GeometricGains
+from perch_control.smooth_position import SmoothPosition
 from perch_control.supervisor import Supervisor
 from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 
@@ -65,6 +66,7 @@ class FlightController:
         self._imu_stamp = -inf
         self._refused = ""
         self._schedule = Schedule(self.maneuvers)
+        self._smooth = SmoothPosition()
 
     @property
     def settings(self) -> FlightSettings:
@@ -250,7 +252,7 @@ class FlightController:
     def _believe(self, verdict: Verdict, sample: tuple[float, ...], dt: float) -> None:
         m = self.maneuvers
         if verdict.usable:
-            m.belief, self._refused = sample, ""
+            m.belief, self._refused = self._smooth.of(m.now, sample, m.order), ""
             m.seen = m.now, sample
             m.unseen.clear()
             return
