@@ -11,7 +11,7 @@ import os, threading
 from perch_core.ros.priority import Priority
 release = threading.Event()
 drawing = threading.Thread(target=release.wait); drawing.start()
-own = Priority(); own.own_process = True
+own = Priority(); own.nodes = 1
 problem = own.ask()
 later = threading.Thread(target=release.wait); later.start()
 policy = [os.sched_getscheduler(t) & ~os.SCHED_RESET_ON_FORK for t in (os.getpid(), drawing.native_id, later.native_id)]
@@ -38,7 +38,10 @@ nice = lambda task: os.getpriority(os.PRIO_PROCESS, task)
 before = nice(os.getpid())
 Priority().give_way()
 assert nice(os.getpid()) == before, 'a process with other work is left alone'
-own = Priority(); own.own_process = True
+composed = Priority(); composed.nodes = 3
+composed.give_way()
+assert nice(os.getpid()) == before, 'neighbours may be in a hurry'
+own = Priority(); own.nodes = 1
 own.give_way()
 assert nice(os.getpid()) == NICE
 assert os.sched_getscheduler(0) == os.SCHED_BATCH, 'it interrupts nobody'

@@ -19,6 +19,7 @@ import rclpy
 from perch_core.errors import PerchError
 from perch_core.ros.composition import composition
 from perch_core.ros.node import StopSignal, spin_until_stopped
+from perch_core.ros.priority import priority
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -67,6 +68,7 @@ def main() -> None:
     try:
         with composition.creating():
             nodes = create_nodes(plan)
+        priority.nodes = len(nodes)
         gc.collect()
         gc.freeze()  # as in spin_main
         executor = EventsExecutor()

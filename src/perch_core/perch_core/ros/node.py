@@ -139,7 +139,7 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
         _refuse(str(error))
     except RuntimeError as error:  # rcl refuses command lines and parameter files with this one
         _refuse(" ".join(str(error).split()))
-    priority.own_process = True
+    priority.nodes = 1
     gc.collect()
     gc.freeze()  # what the imports left is never garbage: looking through it again takes tens of milliseconds
     executor = EventsExecutor()

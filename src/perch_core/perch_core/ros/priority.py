@@ -21,11 +21,11 @@ class Priority:
     """
 
     def __init__(self) -> None:
-        self.own_process = False  # `spin_main` says so; a test or a composition is not raised as a whole
+        self.nodes = 0  # that this process runs and does nothing else; 0: it is a test
 
     def ask(self) -> str:
         """Raise the threads; returns why that was not possible, or nothing."""
-        if not self.own_process:
+        if self.nodes == 0:
             return ""
         ordinary = {thread.native_id for thread in threading.enumerate() if thread is not threading.main_thread()}
         try:
@@ -37,8 +37,11 @@ class Priority:
         return ""
 
     def give_way(self) -> None:
-        """Let others go first: in lockstep everyone waits for the chain of a step, and a slow participant has its latency."""
-        if self.own_process:
+        """Let others go first: in lockstep everyone waits for the chain of a step, and a slow participant has its latency.
+
+        Not where it shares its process: a neighbour may be of the chain.
+        """
+        if self.nodes == 1:
             for task in _tasks():
                 with suppress(ProcessLookupError):
                     give_way(task, NICE)

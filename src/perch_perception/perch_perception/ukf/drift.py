@@ -19,9 +19,13 @@ import numpy as np
 from perch_core import so3
 
 from perch_perception.ukf import layout as at
+from perch_perception.ukf import update_kernels
 from perch_perception.ukf.config import VioNoise
 from perch_perception.ukf.measurement import VioPose
-from perch_perception.ukf.unscented import Belief
+from perch_perception.ukf.unscented import Belief, CovarianceError
+from perch_perception.ukf.update_kernels import missing
+
+_POSE, _VELOCITY = np.r_[at.D_POSITION, at.D_ATTITUDE], np.r_[at.D_VELOCITY]
 
 
 def least_growth(noise: VioNoise, dt: float) -> np.ndarray:
@@ -51,9 +55,7 @@ def increment(noise: VioNoise, C_before: np.ndarray, C_now: np.ndarray, dt: floa
         floor[:3, :3] += np.diag(np.diag(velocity)) * noise.velocity_time * dt
     scale = np.sqrt(np.diag(floor)) + 1e-9
     # eigenvalues in units of the floor, so that metres and radians are not compared
-    values, vectors = np.linalg.eigh((C_now - phi * phi * C_before) / np.outer(scale, scale))
-    W = (vectors * np.maximum(values, 1.0)) @ vectors.T
-    return W * np.outer(scale, scale)
+    return update_kernels.clipped(C_now - phi * phi * C_before, scale, 1.0)
 
 
 def kept(noise: VioNoise, dt: float) -> float:
@@ -82,11 +84,11 @@ def follow(belief: Belief, pose: VioPose, velocity: bool) -> Belief:
     """
     x, P = belief.x.copy(), belief.P
     x[at.POSITION] += x[16:19]
-    x[at.QUATERNION] = so3.quat_multiply(so3.quat_exp(x[19:22]), x[at.QUATERNION])
+    x[at.QUATERNION] = update_kernels.vios_attitude(x)
     x[at.DRIFT] = 0.0
     if velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
         own = P[at.D_VELOCITY, at.D_VELOCITY]
-        weighed = np.linalg.solve(own + _missing(pose.velocity_covariance, own), pose.v_WB - x[at.VELOCITY])
+        weighed = np.linalg.solve(own + missing(pose.velocity_covariance, own), pose.v_WB - x[at.VELOCITY])
         x[at.VELOCITY] += own @ weighed
         x[at.GYRO_BIAS] += P[at.D_GYRO_BIAS, at.D_VELOCITY] @ weighed
         x[at.ACCEL_BIAS] += P[at.D_ACCEL_BIAS, at.D_VELOCITY] @ weighed
@@ -110,35 +112,25 @@ def as_sure_as(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
         belief: after the update.
         pose: with VIO's covariances.
         doubt: what VIO's map may be off beyond its covariance, (position, rotation in W), shape (6, 6).
+
+    Raises:
+        CovarianceError: a covariance is not positive definite.
     """
     J = np.zeros((6, 6))
     J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(belief.x[at.QUATERNION]).T
-    known = [(np.r_[0:3, 6:9], J @ (pose.covariance + doubt) @ J.T)]
-    if pose.velocity_covariance is not None:
-        known.append((np.r_[at.D_VELOCITY], pose.velocity_covariance))
     P, T = belief.P.copy(), np.eye(at.ERROR_SIZE)
-    for rows, C in known:
-        block = np.ix_(rows, rows)
-        P[block] += _missing(C, P[block])
-        T[block] = _factor(C) @ np.linalg.inv(np.linalg.cholesky(P[block]))
+    definite = update_kernels.as_sure_as(P, _POSE, J @ (pose.covariance + doubt) @ J.T, T)
+    if pose.velocity_covariance is not None:
+        definite &= update_kernels.as_sure_as(P, _VELOCITY, pose.velocity_covariance, T)
+    if not definite:
+        raise CovarianceError("covariance after an update is not positive definite")
     P = T @ P @ T.T
     if pose.velocity_covariance is not None:
-        rest = np.setdiff1d(np.arange(at.ERROR_SIZE), np.r_[at.D_VELOCITY])
-        P[at.D_VELOCITY, rest] = 0.0
-        P[rest, at.D_VELOCITY] = 0.0
+        own = P[at.D_VELOCITY, at.D_VELOCITY].copy()
+        P[at.D_VELOCITY, :] = 0.0
+        P[:, at.D_VELOCITY] = 0.0
+        P[at.D_VELOCITY, at.D_VELOCITY] = own
     return dataclasses.replace(belief, P=0.5 * (P + P.T))
-
-
-def _factor(C: np.ndarray) -> np.ndarray:
-    """Cholesky factor of a covariance (n, n) that may be singular: a part in 1e6 of its variances is added."""
-    return np.linalg.cholesky(C + np.diag(1e-6 * np.diag(C) + 1e-12))
-
-
-def _missing(C: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Positive part of C - P, in units of C's own sigmas."""
-    scale = np.sqrt(np.maximum(np.diag(C), 1e-12))
-    values, vectors = np.linalg.eigh((C - P) / np.outer(scale, scale))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
 
 
 def white(noise: VioNoise) -> np.ndarray:

@@ -120,7 +120,11 @@ class Estimator:
         """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
         belief = start.before_vio(0, np.array([0.0, 0.0, 9.81]))
         row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
-        self._transform.predict(belief, row, 2_000_000)
+        prior = self._transform.predict(belief, row, 2_000_000)
+        pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), np.zeros(3), np.eye(3))
+        drift.increment(self.config.vio, pose.covariance, pose.covariance, 0.03, pose.velocity_covariance)
+        corrected = self._transform.correct(prior, self._innovate(prior, pose))
+        drift.as_sure_as(drift.follow(corrected, pose, True), pose, self._doubt)
         kernels.advance(belief.x.copy(), *map(float, row[0, 1:7]), 0.002)
 
     def _timing(self, pose: VioPose) -> VioOutcome | None:

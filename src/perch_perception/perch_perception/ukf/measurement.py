@@ -65,7 +65,7 @@ class VioPose:
         if not all(np.all(np.isfinite(n)) for n in numbers) or abs(np.linalg.norm(self.q_WB) - 1) > 1e-3:
             return VioOutcome.NOT_FINITE
         scale = np.abs(self.covariance).max()
-        if not np.allclose(self.covariance, self.covariance.T, atol=1e-6 * scale + 1e-15):
+        if np.any(np.abs(self.covariance - self.covariance.T) > 1e-5 * scale + 1e-15):
             return VioOutcome.BAD_COVARIANCE
         if np.linalg.eigvalsh(self.covariance)[0] < -1e-9 * scale - 1e-15:
             return VioOutcome.BAD_COVARIANCE

@@ -2,7 +2,7 @@
 
 Sigma points and weights are filterpy's (`MerweScaledSigmaPoints`) on the error vector; the points live on the
 manifold through `layout.plus`/`minus`. Prediction runs in `kernels.unscented_run`; without numba, in the vectorised
-form here. The equations are in docs/estimation.md, section UKF.
+form here. The update is in `update_kernels`. The equations are in docs/estimation.md, section UKF.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from perch_core import so3
 from perch_core.errors import PerchError
 from perch_core.jit import COMPILED
 from perch_core.vehicle import GRAVITY
-from perch_perception.ukf import kernels
+from perch_perception.ukf import kernels, update_kernels
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 
@@ -88,7 +88,7 @@ class UnscentedTransform:
                 raise CovarianceError(f"covariance at {belief.stamp} ns is not positive definite")
         else:
             x, P = self.predict_vectorised(belief.x, belief.P, run)
-        P += self.process_noise(run)
+        self._add_process_noise(run, P)
         return Belief(stamp, x, P)
 
     def predict_vectorised(self, x: np.ndarray, P: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -116,18 +116,13 @@ class UnscentedTransform:
         White noise of each sample: attitude sum(s_g^2 dt^2), velocity sum(s_a^2 dt^2) =: q, which the double
         integral carries into the position as q T^2/3 and q T/2. Couplings of higher order in T (40 ms) are left out.
         """
-        dt = run[:, DT]
-        T = float(dt.sum())
-        q = float(run[:, ACCEL_VARIANCE] @ (dt * dt))
         Q = np.zeros((at.ERROR_SIZE, at.ERROR_SIZE))
-        d = np.arange(3)
-        Q[d, d] = q * T * T / 3
-        Q[d, 3 + d] = Q[3 + d, d] = q * T / 2
-        Q[3 + d, 3 + d] = q
-        Q[6 + d, 6 + d] = float(run[:, GYRO_VARIANCE] @ (dt * dt))
-        Q[9 + d, 9 + d] = self.config.imu.gyro_bias_walk**2 * T
-        Q[12 + d, 12 + d] = self.config.imu.accel_bias_walk**2 * T
+        self._add_process_noise(run, Q)
         return Q
+
+    def _add_process_noise(self, run: np.ndarray, P: np.ndarray) -> None:
+        imu = self.config.imu
+        update_kernels.add_process_noise(run, imu.gyro_bias_walk**2, imu.accel_bias_walk**2, P)
 
     def innovate(self, belief: Belief, p_WB: np.ndarray, q_WB: np.ndarray, R: np.ndarray) -> Innovation:
         """Innovation and gain for a VIO pose at the belief's time.
@@ -143,18 +138,12 @@ class UnscentedTransform:
         Raises:
             CovarianceError: the covariance is not positive definite.
         """
-        E = self._sigma_points(belief.P)
-        X = at.plus(belief.x, E)
-        q_pred = so3.quat_multiply(so3.quat_exp(X[:, 19:22]), X[:, at.QUATERNION])
-        back = so3.quat_conjugate(q_pred[0])
-        Z = np.concatenate([X[:, at.POSITION] + X[:, 16:19], so3.quat_log(so3.quat_multiply(q_pred, back))], axis=1)
-        z = np.concatenate([p_WB, so3.quat_log(so3.quat_multiply(q_WB, back))])
-        mean = self.points.Wm @ Z
-        weighted = (Z - mean) * self.points.Wc[:, None]
-        S = weighted.T @ (Z - mean) + R
-        gain = np.linalg.solve(S, weighted.T @ E).T
-        residual = z - mean
-        return Innovation(residual, S, gain, float(residual @ np.linalg.solve(S, residual)))
+        residual, S, gain = np.empty(6), np.empty((6, 6)), np.empty((at.ERROR_SIZE, 6))
+        Wm, Wc = self.points.Wm, self.points.Wc
+        nis = update_kernels.innovate(belief.x, belief.P, p_WB, q_WB, R, self.scale, Wm[0], Wc[0], Wm[1], residual, S, gain)
+        if nis < 0.0:
+            raise CovarianceError("covariance is not positive definite")
+        return Innovation(residual, S, gain, nis)
 
     def correct(self, belief: Belief, innovation: Innovation) -> Belief:
         """Belief after a measurement.
@@ -162,12 +151,9 @@ class UnscentedTransform:
         After the injection the attitude error is counted from the new nominal attitude: its covariance turns by
         the right Jacobian of the correction.
         """
-        step = innovation.gain @ innovation.residual
-        P = belief.P - innovation.gain @ innovation.S @ innovation.gain.T
-        G = np.eye(at.ERROR_SIZE)
-        G[at.D_ATTITUDE, at.D_ATTITUDE] = so3.right_jacobian(step[at.D_ATTITUDE])
-        P = G @ P @ G.T
-        return Belief(belief.stamp, at.plus(belief.x, step), 0.5 * (P + P.T))
+        x, P = np.empty(at.NOMINAL_SIZE), np.empty((at.ERROR_SIZE, at.ERROR_SIZE))
+        update_kernels.correct(belief.x, belief.P, innovation.gain, innovation.S, innovation.residual, x, P)
+        return Belief(belief.stamp, x, P)
 
     def _sigma_points(self, P: np.ndarray) -> np.ndarray:
         try:
