@@ -16,6 +16,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.errors import PerchError
 
+SLOW = 1.0  # speed up to which the odometry's position is smoother than the integral of its velocity [m/s]
 MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
 
 
@@ -34,8 +35,8 @@ class BodyState:
         v_WB: velocity in W [m/s], shape (3,).
         w_WB_B: angular velocity in B [rad/s], shape (3,).
         covariance: of position and attitude, errors in the axes of W [m, rad], shape (6, 6).
-        corrected: what the odometry has moved its position by beside its velocity, since the beginning, in W [m], shape (3,): it found
-            that it was elsewhere. Without it the motion is smooth, as the vehicle's own is.
+        corrected: what the odometry has moved its position by beside its velocity at speed, since the beginning, in W [m], shape (3,):
+            it found that it was elsewhere. Without it the motion is smooth, as the vehicle's own is.
     """
 
     time: float
@@ -114,13 +115,18 @@ class PoseBuffer:
         return replace(_between(a, b, (time - a.time) / (b.time - a.time)), corrected=self._corrected[right])
 
     def _correction(self, state: BodyState) -> np.ndarray:
-        """`corrected` of a state that comes after the newest; a gap tells nothing of it."""
+        """`corrected` of a state that comes after the newest; a gap tells nothing of it.
+
+        Counted from `SLOW` on, in full from twice that: in a hover the position is held by what is seen, and the velocity's error,
+        some cm/s, would add up for as long as it lasts.
+        """
         if not self._states:
             return np.zeros(3)
         before, dt = self._states[-1], state.time - self._times[-1]
         if dt > MAX_GAP:
             return self._corrected[-1]
-        return self._corrected[-1] + state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB)
+        share = min(max(math.sqrt(state.v_WB @ state.v_WB) / SLOW - 1.0, 0.0), 1.0)
+        return self._corrected[-1] + share * (state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB))
 
 
 def _between(a: BodyState, b: BodyState, share: float) -> BodyState:
