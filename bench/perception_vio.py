@@ -1,57 +1,73 @@
-"""Speed and accuracy of VIO and UKF on rendered perches; part of `python3 scripts/bench.py perception`."""
+"""Speed and accuracy of VIO and UKF on rendered perches, one at a time on each core; part of `python3 scripts/bench.py perception`."""
 
 from __future__ import annotations
 
+import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from harness import Figure, figure, measure
 from perch_core.scenario import load_scenario
-from perch_eval import estimation_flight as flights
+from perch_eval import estimation_flight
+from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.workers import prepare_worker
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import Estimator, ImuSample, VioPose
 
 SCENARIOS = (("surface_60", "60 deg, 1.7 m"), ("surface_90", "90 deg, 1.7 m"),
              ("surface_60_far", "60 deg, 3 m"), ("surface_90_far", "90 deg, 3 m"))
+IDEAL = "surface_90_ideal"
 LATENCY = 0.040  # [s]
 
 
 def figures(quick: bool) -> list[Figure]:
     """VIO per frame, UKF per step and update; RMSE through the perch, its cost in latency."""
-    cv2.setNumThreads(1)
-    out, costs = [], []
+    ukf = _ukf(quick)  # by the wall clock: before the flights, which use every core
+    tasks = [(scenario, seed) for scenario in (*dict(SCENARIOS), IDEAL) for seed in range(1 if quick else 20)]
+    flown: dict[str, list[_Flown]] = {scenario: [] for scenario, _ in tasks}
+    progress = Progress(len(tasks), what="perches")
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker) as pool:
+        for (scenario, _), one in zip(tasks, pool.map(_fly, *zip(*tasks))):
+            flown[scenario].append(one)
+            progress.add(True)
+    progress.close()
+    costs = [cost for one in sum(flown.values(), []) for cost in one.costs]
+    out = [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="), *ukf]
     for scenario, name in SCENARIOS:
-        axes, contact, ratios = [], [], []
-        for seed in range(1 if quick else 20):
-            flight = flights.fly(load_scenario(scenario), seed)
-            steps = flights.run_vio(flight)
-            costs += [1e3 * s.cost for s in steps]
-            late = flights.run_estimator(flight, steps, latency=LATENCY)
-            prompt = flights.run_estimator(flight, steps, latency=0.0)
-            axes.append(100 * _rmse(flight, late))
-            contact.append(np.degrees(np.linalg.norm(late.errors[-1, 6:9])))
-            ratios.append(_rmse(flight, late).mean() / _rmse(flight, prompt).mean())
-        axes = np.array(axes)
+        flights = flown[scenario]
+        axes = np.array([one.rmse for one in flights])
         for axis, values in zip("xyz", axes.T):
             out.append(figure(f"estimation: RMSE {axis} through the perch, {name}", "cm", values, 3.0))
         out += [figure(f"estimation: worst axis of all runs, {name}", "cm", axes.ravel(), 8.5, "max <="),
-                figure(f"estimation: attitude at contact, {name}", "deg", contact, 1.0),
-                figure(f"estimation: RMSE with 40 ms delay over that without, {name}", "-", ratios, 1.2)]
-    return [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="),
-            *_ukf(quick), *out, *_ideal(quick)]
+                figure(f"estimation: attitude at contact, {name}", "deg", [one.attitude for one in flights], 1.0),
+                figure(f"estimation: RMSE with 40 ms delay over that without, {name}", "-", [one.delay_costs for one in flights], 1.2)]
+    return [*out, figure("estimation: RMSE of each axis, ideal, 90 deg, 1.7 m", "cm", [one.rmse for one in flown[IDEAL]], 1.5)]
 
 
-def _ideal(quick: bool) -> list[Figure]:
-    values = []
-    for seed in range(1 if quick else 20):
-        flight = flights.fly(load_scenario("surface_90_ideal"), seed)
-        values.append(100 * _rmse(flight, flights.run_estimator(flight, flights.run_vio(flight))))
-    return [figure("estimation: RMSE of each axis, ideal, 90 deg, 1.7 m", "cm", values, 1.5)]
+@dataclass(frozen=True)
+class _Flown:
+    costs: list[float]   # of each frame [ms]
+    rmse: np.ndarray     # of each axis through the perch [cm]
+    attitude: float      # error at contact [deg]
+    delay_costs: float   # RMSE with LATENCY over that without
 
 
-def _rmse(flight: flights.Flight, track: flights.EstimatorTrack) -> np.ndarray:
+def _fly(scenario: str, seed: int) -> _Flown:
+    """One rendered perch through VIO and UKF."""
+    cv2.setNumThreads(1)
+    flight = estimation_flight.fly(load_scenario(scenario), seed)
+    steps = estimation_flight.run_vio(flight)
+    late = estimation_flight.run_estimator(flight, steps, latency=LATENCY)
+    prompt = estimation_flight.run_estimator(flight, steps, latency=0.0)
+    return _Flown([1e3 * s.cost for s in steps], 100 * _rmse(flight, late), float(np.degrees(np.linalg.norm(late.errors[-1, 6:9]))),
+                  float(_rmse(flight, late).mean() / _rmse(flight, prompt).mean()))
+
+
+def _rmse(flight: estimation_flight.Flight, track: estimation_flight.EstimatorTrack) -> np.ndarray:
     perching = track.times >= flight.perch_time
     return np.sqrt((track.errors[perching, :3] ** 2).mean(axis=0))
 
