@@ -24,6 +24,7 @@ from perch_perception.line_mapping.observation import LineObservation
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
+HARDLY = 0.05          # a wire known worse than this is fitted anew, as if nothing had been known [m]
 GATE = 4.0             # widths farther off than so many sigma are not this wire's
 WIDTH_GATE = 0.08      # error of the distance, 1 sigma, before there is an earlier result [m]
 ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radius
@@ -133,6 +134,8 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     drifted = _drifted(observations, settings)
     rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
     known, newest = _before(observations, before)
+    if known > HARDLY**2:  # it would take whatever comes
+        known, newest = 0.0, -1
     for number, walk in enumerate([rigid] * rounds + [drifted] * ITERATIONS):
         walked = np.cumsum(walk)
         # an earlier result is where the wire was at its own last sighting: what came since may be off by the walk and by its error
