@@ -23,7 +23,7 @@ from perch_core.scenario import Scenario, load_scenario
 from perch_core.trajectory import rest_to_rest
 from perch_eval.demo import fly
 from perch_eval.domain import reserved_domain
-from perch_eval.nodes import ALL_NODES, programs
+from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
 from perch_eval.stack import Stack
 from perch_msgs.msg import ControllerCommand, MotorCommand, Step, Trajectory
 from rclpy.experimental import EventsExecutor
@@ -120,10 +120,15 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[Probe]:
                 probe.close()
 
 
-def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geometric") -> list[Figure]:
-    """A hover without cameras by the wall clock: rates of the 500 Hz chain, and what was missed."""
+def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geometric",
+              composed: tuple[str, ...] = CHAIN_NODES) -> list[Figure]:
+    """A hover without cameras by the wall clock: rates of the 500 Hz chain, and what was missed.
+
+    The bars are those of the layout that `demo.py --realtime` has.
+    """
+    where = f"real time, {law}" + ("" if composed else ", one process per node")
     overrides = {"vehicle": {"cameras": "none"}, "controller": {"controller.type": law}}
-    with awake(), running(scenario, folder, lockstep=False, overrides=overrides) as probe:
+    with awake(), running(scenario, folder, lockstep=False, composed=composed, overrides=overrides) as probe:
         probe.take_off()
         counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
                      ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
@@ -137,14 +142,14 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
         late = machine.share()
         after = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
         delay = float(probe.diagnostics["vehicle"]["command_us_median"])
-    out = [figure(f"real time, {law}: rate of {topic}", "Hz", samples, bar=499.0, comparison="median >=")
+    out = [figure(f"{where}: rate of {topic}", "Hz", samples, bar=499.0 if composed else None, comparison="median >=")
            for topic, samples in rates.items()]
     for (node, part, _), (old, old_all), (new, new_all) in zip(counts_of, before, after):
         share = 100.0 * (new - old) / max(1, new_all - old_all)
-        out.append(figure(f"real time, {law}: {part.replace('_', ' ')}, {node}", "% of steps", [share],
-                          bar=None if part == "commands_missed" else 0.1))
-    return [*out, figure(f"real time, {law}: bare timer beside it late by a period", "% of steps", [late]),
-            figure(f"real time, {law}: command after its IMU sample", "us", [delay])]
+        out.append(figure(f"{where}: {part.replace('_', ' ')}, {node}", "% of steps", [share],
+                          bar=0.1 if composed and part != "commands_missed" else None))
+    return [*out, figure(f"{where}: bare timer beside it late by a period", "% of steps", [late]),
+            figure(f"{where}: command after its IMU sample", "us", [delay])]
 
 
 def lockstep(scenario: Scenario, folder: Path, windows: int, composed: tuple[str, ...]) -> Figure:
@@ -173,5 +178,6 @@ def figures(quick: bool) -> list[Figure]:
                 lockstep(scenario, folder / "processes", windows, composed=()),
                 lockstep(scenario, folder / "composed", windows, composed=ALL_NODES),
                 *real_time(scenario, folder / "real_time", windows),
-                *real_time(scenario, folder / "real_time_nmpc", windows, "nmpc")]
+                *real_time(scenario, folder / "real_time_nmpc", windows, "nmpc"),
+                *real_time(scenario, folder / "real_time_processes", windows, composed=())]
 

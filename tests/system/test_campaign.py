@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from perch_eval.campaign.results import read_results
@@ -62,8 +63,10 @@ def wait_for_results(folder: Path, count: int) -> None:
 def test_a_killed_campaign_resumes_to_200_distinct_results(campaign, tmp_path):
     process = subprocess.Popen(campaign("quick", 200), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for_results(tmp_path, 37)
+    workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGKILL)
     process.wait()
+    assert workers and psutil.wait_procs(workers, timeout=30)[1] == []  # none outlives its campaign
     kept = numbers(tmp_path)
     assert 37 <= len(kept) < 200
     refused = run(campaign("quick", 200))

@@ -14,7 +14,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.scenario import Scenario, load_scenario
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
-from perch_eval.nodes import FAST_NODES, programs, sharing
+from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
 from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
 from perch_eval.report import build_report, inspection_words
 from perch_eval.stack import Stack, StackError
@@ -36,7 +36,8 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--out", type=Path, default=Path("out"), help="folder for report, recording and logs (default: ./%(default)s)")
     layout = out.add_mutually_exclusive_group()
     layout.add_argument("--composed", nargs="*", metavar="NODE",
-                        help="nodes that share a process; all without names (default: none with --realtime, else " + ", ".join(FAST_NODES) + ")")
+                        help="nodes that share a process; all without names (default: " + ", ".join(FAST_NODES) + "; with --realtime "
+                             + ", ".join(CHAIN_NODES) + ")")
     layout.add_argument("--separate", action="store_true", help="every node in a process of its own")
     out.add_argument("--realtime", action="store_true", help="paced by the wall clock instead of lockstep")
     out.add_argument("--verbose", action="store_true", help="show the nodes' output")
@@ -119,8 +120,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _composed(args: argparse.Namespace) -> Collection[str]:
-    """Real time has deadlines at 500 Hz that a neighbour's work in the same process would miss."""
-    return sharing(args.composed, otherwise=() if args.separate or args.realtime else FAST_NODES)
+    """Real time has deadlines at 500 Hz that the work of more neighbours in the same process would miss."""
+    return sharing(args.composed, otherwise=() if args.separate else CHAIN_NODES if args.realtime else FAST_NODES)
 
 
 def summary(report: dict) -> str:

@@ -19,6 +19,8 @@ Overrides = Mapping[str, Mapping[str, Any]]
 ALL_NODES = tuple(PACKAGES)
 FAST_NODES = ("vehicle", "estimator", "controller", "mission", "recorder")
 """Nodes with a little to do at many steps: between processes their messages cost more than their work."""
+CHAIN_NODES = ("vehicle", "estimator", "controller")
+"""Nodes that every step waits for: in real time they share a process, and nobody else does."""
 
 
 def sharing(names: Collection[str] | None, otherwise: Collection[str] = ()) -> Collection[str]:

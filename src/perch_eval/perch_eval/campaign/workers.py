@@ -28,6 +28,14 @@ def prepare_worker() -> None:
     end_with_parent(signal.SIGTERM)
 
 
+def _carry_out(task: Task) -> RunResult:
+    """As `carry_out`; told to stop in mid-run, the pool would take that for the run's own end, and wait for ever for another."""
+    try:
+        return carry_out(task)
+    except SystemExit:
+        os._exit(1)
+
+
 def dead(task: Task, why: str) -> RunResult:
     """The result of a run whose workers died."""
     return RunResult(task.run.number, task.run.seed, "error", "failed", why, task.run.values)
@@ -46,7 +54,7 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
             while waiting or under_way:
                 while waiting and len(under_way) < 2 * jobs:
                     task = waiting.pop()
-                    under_way[pool.submit(carry_out, task)] = task
+                    under_way[pool.submit(_carry_out, task)] = task
                 done, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in done:
                     result = future.result()
