@@ -29,6 +29,7 @@ from perch_control.ros.goal_server import GoalServer
 from perch_control.ros.planner_clients import PlannerClients, perch_message
 from perch_control.ros.powerline_map import mapped_target
 
+FEEDBACK_PERIOD = 0.1  # between messages of the goal's feedback, where nothing changes [s]
 TICK = TICK_STEPS * CONTROL_PERIOD_NS  # the mission decides at 50 Hz [ns]
 
 
@@ -46,6 +47,7 @@ class MissionNode(PerchNode[MissionParameters]):
         self._odometry: OdometryReading | None = None       # of the last tick
         self._imu: list[bytes] = []                         # since the last tick
         self._last_tick = -TICK
+        self._told = (0.0, "", "")                          # the last feedback: time [s], phase, message
         self._pending: tuple[float, Future] | None = None   # when the answer counts, and the answer
         self._deferred: int | None = None                   # stamp of a tick that waits for the planner's answer
         self._goal_handle: Any = None
@@ -158,11 +160,20 @@ class MissionNode(PerchNode[MissionParameters]):
         if outputs.query is not None:
             self._ask(now, outputs.query)
         if self._goal_handle is not None and self._machine.phase.value != "idle":
-            self._goal_handle.publish_feedback(Perch.Feedback(
-                phase=self._machine.phase.value, progress=float(self._machine.progress),
-                time_to_contact=float(self._machine.time_to_contact), message=self._machine.message))
+            self._tell(now)
         if outputs.outcome is not None:
             self._finish(now, outputs.outcome)
+
+    def _tell(self, now: float) -> None:
+        """The goal's feedback: at every change, and every `FEEDBACK_PERIOD`. (Each costs as much as what the mission does at a tick.)"""
+        machine = self._machine
+        told = (machine.phase.value, machine.message)
+        if told == self._told[1:] and now - self._told[0] < FEEDBACK_PERIOD - 1e-9:
+            return
+        self._told = (now, *told)
+        self._goal_handle.publish_feedback(Perch.Feedback(
+            phase=machine.phase.value, progress=float(machine.progress), time_to_contact=float(machine.time_to_contact),
+            message=machine.message))
 
     # -- planner -----------------------------------------------------------------------------------------------------
 
