@@ -14,9 +14,9 @@ import pytest
 import rclpy
 import yaml
 from perch_core import config
+from perch_core.ros.node import close_nodes
 from perch_core.scenario import load_scenario
 from perch_eval import demo
-from perch_eval.composed_node import close_nodes
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.node_launch import PACKAGES

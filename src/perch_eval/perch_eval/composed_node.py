@@ -11,14 +11,13 @@ import gc
 import importlib
 import json
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from perch_core.errors import PerchError
 from perch_core.ros.composition import composition
-from perch_core.ros.node import StopSignal, spin_until_stopped
+from perch_core.ros.node import StopSignal, close_nodes, spin_until_stopped
 from perch_core.ros.priority import priority
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -40,16 +39,6 @@ def create_nodes(plan: list[dict[str, Any]]) -> list[Node]:
         close_nodes(nodes)
         raise
     return nodes
-
-
-def close_nodes(nodes: list[Node]) -> None:
-    """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
-    with ExitStack() as endings:
-        for node in nodes:
-            endings.callback(node.destroy_node)
-        for node in nodes:
-            if (close := getattr(node, "close", None)) is not None:
-                endings.callback(close)
 
 
 def main() -> None:

@@ -17,10 +17,10 @@ from perch_eval.program import Program
 Overrides = Mapping[str, Mapping[str, Any]]
 
 ALL_NODES = tuple(PACKAGES)
-FAST_NODES = ("vehicle", "estimator", "controller", "mission", "recorder")
-"""Nodes with a little to do at many steps: between processes their messages cost more than their work."""
 CHAIN_NODES = ("vehicle", "estimator", "controller")
 """Nodes that every step waits for: in real time they share a process, and nobody else does."""
+FAST_NODES = (*CHAIN_NODES, "mission", "recorder")
+"""Nodes with a little to do at many steps: between processes their messages cost more than their work."""
 
 
 def sharing(names: Collection[str] | None, otherwise: Collection[str] = ()) -> Collection[str]:

@@ -14,11 +14,12 @@ import tempfile
 import time
 from pathlib import Path
 
-import perch_core.ros.node  # noqa: F401  before numpy: it limits numpy's threads
+from perch_core.ros.node import close_nodes  # before numpy: it limits numpy's threads
+
 import rclpy
 from perch_core.ros import qos
 from perch_core.scenario import load_scenario
-from perch_eval.composed_node import close_nodes, create_nodes
+from perch_eval.composed_node import create_nodes
 from perch_eval.domain import reserved_domain
 from perch_eval.in_process import Sensing, fly
 from perch_eval.nodes import ALL_NODES, programs

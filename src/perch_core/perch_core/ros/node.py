@@ -6,6 +6,7 @@ import gc
 import os
 import signal
 import sys
+from contextlib import ExitStack
 from typing import Any, Callable, Generic, Iterator, NoReturn, Sequence, TypeVar
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -128,6 +129,16 @@ def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
         executor.spin_until_future_complete(stopped, timeout_sec=LOOK)
 
 
+def close_nodes(nodes: Sequence[Node]) -> None:
+    """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
+    with ExitStack() as endings:
+        for node in nodes:
+            endings.callback(node.destroy_node)
+        for node in nodes:
+            if (close := getattr(node, "close", None)) is not None:
+                endings.callback(close)
+
+
 def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> None:
     """Run one node until SIGINT or SIGTERM; exits the process with 0, or 2 when the caller's parameters are refused."""
     stop = StopSignal()
@@ -147,10 +158,7 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
     try:
         spin_until_stopped(executor, stop)
     finally:
-        close = getattr(node, "close", None)
-        if close is not None:
-            close()
-        node.destroy_node()
+        close_nodes([node])
         rclpy.try_shutdown()
     sys.exit(0)
 

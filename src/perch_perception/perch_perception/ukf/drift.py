@@ -23,7 +23,6 @@ from perch_perception.ukf import update_kernels
 from perch_perception.ukf.config import VioNoise
 from perch_perception.ukf.measurement import VioPose
 from perch_perception.ukf.unscented import Belief, CovarianceError
-from perch_perception.ukf.update_kernels import missing
 
 _POSE, _VELOCITY = np.r_[at.D_POSITION, at.D_ATTITUDE], np.r_[at.D_VELOCITY]
 
@@ -88,7 +87,7 @@ def follow(belief: Belief, pose: VioPose, velocity: bool) -> Belief:
     x[at.DRIFT] = 0.0
     if velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
         own = P[at.D_VELOCITY, at.D_VELOCITY]
-        weighed = np.linalg.solve(own + missing(pose.velocity_covariance, own), pose.v_WB - x[at.VELOCITY])
+        weighed = np.linalg.solve(own + update_kernels.missing(pose.velocity_covariance, own), pose.v_WB - x[at.VELOCITY])
         x[at.VELOCITY] += own @ weighed
         x[at.GYRO_BIAS] += P[at.D_GYRO_BIAS, at.D_VELOCITY] @ weighed
         x[at.ACCEL_BIAS] += P[at.D_ACCEL_BIAS, at.D_VELOCITY] @ weighed

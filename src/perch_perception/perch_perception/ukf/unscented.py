@@ -21,7 +21,7 @@ from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 
 # columns of a run of IMU steps
-DT, GYRO, ACCEL, GYRO_VARIANCE, ACCEL_VARIANCE = 0, slice(1, 4), slice(4, 7), 7, 8
+DT, GYRO, ACCEL = 0, slice(1, 4), slice(4, 7)
 
 
 class CovarianceError(PerchError):
