@@ -145,6 +145,18 @@ def test_images_carry_pictures_with_the_stamps_of_their_camera_info(flights):
     assert set(stamps(images)) <= known
 
 
+def test_the_first_step_waits_for_the_processes_that_draw(flights, monkeypatch):
+    """They take a second to start; a flight that begins before would stand still at its first image."""
+    drawn = []
+    monkeypatch.setattr(vehicle_node.DrawnInProcesses, "ready", lambda self: bool(drawn))
+    flight = flights()
+    for _ in range(100):
+        flight.executor.spin_once(timeout_sec=0.01)
+    assert not seen_steps(flight)
+    drawn.append(True)
+    flight.fly(20)
+
+
 def test_vio_stand_in_counts_forty_milliseconds_after_the_exposure(flights):
     """Its results are released at the first step after exposure + latency, whenever they were published."""
     seen = flights(vio=True).fly(400)

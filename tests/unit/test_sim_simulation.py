@@ -6,6 +6,8 @@ import dataclasses
 import hashlib
 import os
 import signal
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -114,6 +116,7 @@ def test_vio_stand_in_has_its_documented_drift_and_noise():
 def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_only():
     drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
     try:
+        assert eventually(drawing.ready)
         assert images(drawing) == images(DrawnOnThreads(SCENARIO, 3, ("front",), ThreadPoolExecutor(1)))
         os.kill(drawing.process_ids["front"], signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
         assert len(images(drawing, 1)) == 1
@@ -130,6 +133,24 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
         assert camera.dropped == 2
     finally:
         drawing.close()
+
+
+def test_a_process_that_ends_before_it_has_drawn_anything_holds_nobody_up():
+    drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
+    try:
+        assert not drawing.ready()
+        os.kill(drawing.process_ids["front"], signal.SIGKILL)
+        assert eventually(drawing.ready)
+    finally:
+        drawing.close()
+
+
+def eventually(condition: Callable[[], bool]) -> bool:
+    """Whether it comes true within a minute."""
+    end = time.monotonic() + 60.0
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    return condition()
 
 
 def images(drawing: Drawing, count: int = 3) -> list[bytes]:

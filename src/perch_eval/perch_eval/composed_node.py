@@ -7,7 +7,6 @@ The plan is a list of `{"name": ..., "module": ..., "arguments": [ROS arguments]
 
 from __future__ import annotations
 
-import gc
 import importlib
 import json
 import sys
@@ -17,7 +16,7 @@ from typing import Any
 import rclpy
 from perch_core.errors import PerchError
 from perch_core.ros.composition import composition
-from perch_core.ros.node import StopSignal, close_nodes, spin_until_stopped
+from perch_core.ros.node import StopSignal, close_nodes, settle, spin_until_stopped
 from perch_core.ros.priority import priority
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -58,8 +57,7 @@ def main() -> None:
         with composition.creating():
             nodes = create_nodes(plan)
         priority.nodes = len(nodes)
-        gc.collect()
-        gc.freeze()  # as in spin_main
+        settle()
         executor = EventsExecutor()
         for node in nodes:
             executor.add_node(node)

@@ -18,14 +18,14 @@ from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from perch_core.errors import PerchError
 from perch_core.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
 """Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
-PLANNER_PATIENCE = 300.0  # [s] a planner whose sources changed compiles first
+START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
 OUTCOMES = {code: name for code, name in enumerate(
     ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed"))}
 
@@ -43,7 +43,7 @@ class FlightResult:
         message: the mission's words.
         end_time: simulation time at the end [s].
         wall_time: wall-clock time from the goal to the end [s].
-        start_time: simulation time when the goal was sent [s]; None where time had not begun.
+        start_time: simulation time when the goal was sent [s]; None where it never was.
     """
 
     outcome: str
@@ -85,7 +85,8 @@ class Pilot:
         if threading.current_thread() is threading.main_thread():
             self._handler = signal.signal(signal.SIGINT, self._interrupt)
         self._node.create_subscription(Step, "tick", self._receive_tick,
-                                       QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+                                       QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                                                  durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def _interrupt(self, *_: Any) -> None:
         self._interrupted = True
@@ -131,8 +132,9 @@ class Pilot:
         self._spin_until(self._client.server_is_ready, check, stall, "the mission's action server does not appear")
         for node, service in SERVICES.items():
             if node in scenario.nodes:
-                self._spin_until(lambda: self._node.count_services(self._node.resolve_service_name(service)) > 0, check, PLANNER_PATIENCE, f"{node} does not offer {service}")
-        began, started = time.monotonic(), self._time or None
+                self._spin_until(lambda: self._node.count_services(self._node.resolve_service_name(service)) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
+        self._spin_until(lambda: self._time > 0.0, check, START_PATIENCE, "simulation time does not begin")
+        began, started = time.monotonic(), self._time
         sent = self._client.send_goal_async(goal_of(scenario), feedback_callback=feedback)
         self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
         handle = sent.result()

@@ -25,6 +25,7 @@ from perch_sim.calibration import true_mounts
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
 
 NICE = 5             # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
+GREETING = b"ready"
 PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [B]
 
 
@@ -112,6 +113,10 @@ class DrawnInProcesses:
         """As `Drawing.draw`."""
         return self._draftsmen[camera].draw(poses, rng, target_shift)
 
+    def ready(self) -> bool:
+        """Whether every process has laid out its textures and drawn a first image, or has ended."""
+        return all(draftsman.ready() for draftsman in self._draftsmen.values())
+
     @property
     def process_ids(self) -> dict[str, int]:
         """Of each camera's process."""
@@ -139,7 +144,13 @@ class _Draftsman:
         orders.close(), images.close()  # so that the end of the process is the end of the pipe
         self._shape = (mount.camera.height, mount.camera.width, 3)[:3 if mount.colour else 2]
         self._ordered: deque[_Ordered] = deque()
-        self._ended = False
+        self._ready = self._ended = False
+
+    def ready(self) -> bool:
+        """Whether images can be ordered that come without delay, or none will come any more."""
+        if not self._ready:
+            self.receive(0.0)
+        return self._ready or self._ended
 
     def draw(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
         image = _Ordered(self)
@@ -151,7 +162,7 @@ class _Draftsman:
         return image
 
     def receive(self, timeout: float) -> bool:
-        """Take the next image, if it comes in time."""
+        """Take what comes next, an image or the greeting before the first one, if it comes in time."""
         try:
             if self._ended or not self._images.poll(timeout):
                 return False
@@ -159,7 +170,9 @@ class _Draftsman:
         except (EOFError, OSError):
             self._end()
             return False
-        self._ordered.popleft().complete(np.frombuffer(data, np.uint8).reshape(self._shape))
+        self._ready = True
+        if data != GREETING:
+            self._ordered.popleft().complete(np.frombuffer(data, np.uint8).reshape(self._shape))
         return True
 
     def _end(self) -> None:
@@ -191,7 +204,9 @@ def _draw_until_closed(orders: Connection, images: Connection, scene: Scene, mou
     give_way(0, NICE)
     cv2.setNumThreads(1)
     renderer = Renderer(scene, mount, seed)
+    renderer.render([(np.array([0.0, 0.0, 1.0]), np.eye(3))], np.random.default_rng(0))  # loads what is compiled
     with suppress(EOFError, BrokenPipeError):
+        images.send_bytes(GREETING)
         while True:
             images.send_bytes(renderer.render(*orders.recv()).ravel())
 

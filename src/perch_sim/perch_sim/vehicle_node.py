@@ -76,7 +76,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self._idle_clock = self.create_timer(CONTROL_PERIOD, self._advance, clock=steady)
             self._idle_clock.cancel()
             self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps, self._ticks],
-                                        params.lockstep_timeout, params.start_timeout)
+                                        params.lockstep_timeout, params.start_timeout, self._drawing.ready)
             self.create_subscription(StepReport, "step_report", self._receive_report, qos.GATED)
             self.create_timer(0.05, self._look_after, clock=steady)
         else:

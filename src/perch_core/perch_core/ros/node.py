@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import os
 import signal
 import sys
@@ -129,6 +130,13 @@ def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
         executor.spin_until_future_complete(stopped, timeout_sec=LOOK)
 
 
+def settle() -> None:
+    """Call when all nodes are there: does at once what would hold up a callback later."""
+    inspect.getmodule(inspect.currentframe())  # the first line of a log looks for the files of all modules: 0.1 s
+    gc.collect()
+    gc.freeze()  # what the imports left is never garbage: looking through it again takes tens of milliseconds
+
+
 def close_nodes(nodes: Sequence[Node]) -> None:
     """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
     with ExitStack() as endings:
@@ -151,8 +159,7 @@ def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> Non
     except RuntimeError as error:  # rcl refuses command lines and parameter files with this one
         _refuse(" ".join(str(error).split()))
     priority.nodes = 1
-    gc.collect()
-    gc.freeze()  # what the imports left is never garbage: looking through it again takes tens of milliseconds
+    settle()
     executor = EventsExecutor()
     executor.add_node(node)
     try:

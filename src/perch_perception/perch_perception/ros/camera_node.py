@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any, TypeVar
 
 import cv2
+import numpy as np
 from nav_msgs.msg import Odometry
 from perch_core.camera import CameraMount
 from perch_core.errors import ConfigError
@@ -49,6 +50,8 @@ class CameraNode(PerchNode[T], ABC):
 
     def begin(self) -> None:
         """Subscribe to the images and join the lockstep."""
+        rays = self._mount.camera.unproject(np.zeros((1, 2)))  # loading what is compiled takes 0.2 s: not in flight
+        self._mount.camera.project(rays), self._mount.camera.project_jacobian(rays)
         self.create_subscription(Image, f"camera_{self.params.camera}/image_raw", self._receive_image, qos.IMAGE)
         self.create_timer(LOOK, self._take_odometry, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._participant.greet()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -19,7 +19,7 @@ class LockstepWatch:
     """`LockstepMaster` with the graph and the wall clock around it."""
 
     def __init__(self, node: Node, triggers: tuple[Trigger, ...], controller: bool, publishers: Sequence[Publisher],
-                 timeout: float, start_timeout: float) -> None:
+                 timeout: float, start_timeout: float, ready: Callable[[], bool]) -> None:
         """
         Args:
             node: the vehicle.
@@ -28,10 +28,11 @@ class LockstepWatch:
             publishers: the vehicle's; all their known subscriptions must be matched before the first step.
             timeout: a participant silent for so long is dropped [s, wall clock].
             start_timeout: one that never came is dropped after so long [s, wall clock].
+            ready: whether the vehicle itself can begin: its images are drawn by processes that take a while to start.
         """
         self.triggers = triggers
         self._node, self._publishers, self._controller = node, publishers, controller
-        self._timeout, self._start_timeout = timeout, start_timeout
+        self._timeout, self._start_timeout, self._ready = timeout, start_timeout, ready
         self._master = LockstepMaster(tuple(t.node for t in triggers), controller)
         self._started, self._looks = False, 0
         self._begun = self._progress = self._named = time.monotonic()
@@ -136,8 +137,9 @@ class LockstepWatch:
 
     def _look_at_graph(self, now: float) -> None:
         missing = self._missing()
-        self.waiting = ", ".join(missing) or "subscriptions to be matched"
-        complete = not missing and self._all_matched()
+        ready = self._ready()
+        self.waiting = ", ".join(missing) or ("subscriptions to be matched" if ready else "the first images to be drawn")
+        complete = not missing and ready and self._all_matched()
         self._looks = self._looks + 1 if complete else 0
         if self._looks >= SETTLED_LOOKS:
             self._started, self._progress = True, now
