@@ -109,6 +109,36 @@ def test_perch_guess_joins_start_and_pose(s3: list[float]) -> None:
         assert b3[20, 0] < -0.1
 
 
+def test_a_guess_upside_down_leans_back_though_the_wire_is_inclined() -> None:
+    """The shortest way to a pose on a wire inclined by 1 deg is sideways, along the wire."""
+    start = hover_state(MODEL, np.array([0.0, 0, 4]), LEVEL)
+    s3 = np.array([0.0, np.sin(np.radians(1.1)), -np.cos(np.radians(1.1))])
+    states, _ = guess.perch_guess(MODEL, start, np.array([4.0, 0, 4.2]), s3, 0.85, 30)
+    b3 = so3.quat_to_matrix(states[:, 3:7])[:, :, 2]
+    np.testing.assert_allclose(b3[-1], s3, atol=1e-9)
+    assert b3[:, 0].min() < -0.95
+    assert np.abs(b3[:, 1]).max() < 0.02
+
+
+def test_guesses_turn_as_their_body_rates_say() -> None:
+    start = hover_state(MODEL, np.array([0.0, 0, 4]), so3.quat_exp([0, 0, 0.3]))
+    perch, _ = guess.perch_guess(MODEL, start, np.array([4.0, 0, 4.2]), np.array([-0.8, 0, 0.6]), 0.85, 60, aside=0.5)
+    leaving, _ = guess.recovery_guess(MODEL, perch[-1, :17], np.array([0.0, 0, 4]), 0.85, 60)
+    for states in (perch, leaving):
+        h = states[0, 17] / 60
+        turned = so3.quat_multiply(states[1:-2, 3:7], so3.quat_exp(h * 0.5 * (states[1:-2, 10:13] + states[2:-1, 10:13])))
+        assert so3.angle_between(so3.quat_to_matrix(turned)[:, :, 0], so3.quat_to_matrix(states[2:-1, 3:7])[:, :, 0]).max() < 0.03
+        assert np.linalg.norm(states[:, 10:13], axis=1).max() > 1.0
+
+
+@pytest.mark.parametrize("yaw", [-0.2, 0.2])
+def test_a_guess_with_the_line_in_view_turns_to_the_side_it_looks_to(yaw: float) -> None:
+    q_BC = so3.quat_from_matrix(VEHICLE.mounts["front"].R_BC)
+    for sense in (-1.0, 1.0):
+        side = guess.side_turn(so3.quat_exp([0, 0, yaw]), q_BC, np.array([0.0, sense, 0.1]), np.array([4.0, 0.5, 0]))
+        assert np.sign(side) == np.sign(yaw)
+
+
 @pytest.mark.parametrize(("changes", "code", "words"), [
     (dict(start=np.full(17, np.nan)), "bad_input", "start state"),
     (dict(start=np.zeros(16)), "bad_input", "shape"),

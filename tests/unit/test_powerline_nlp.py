@@ -63,6 +63,25 @@ def test_perception_cost_grows_as_the_camera_turns_away_even_past_the_line() -> 
     assert np.all(np.diff(costs[1:]) > 0.05)
 
 
+def test_gauss_newton_has_the_gradient_and_never_bends_down() -> None:
+    rng, line, weights = np.random.default_rng(4), line_parameters(LINE), [50.0, 100.0, 100.0]
+    sparsity = STAGES.hessian["see"]
+
+    def second(name: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = np.array(STAGES.functions[name](x, line, weights, 1.0)).ravel()
+        upper = np.array(ca.densify(ca.DM(sparsity, values[18:])))
+        return values[:18], np.linalg.eigvalsh(upper + upper.T - np.diag(np.diag(upper)))
+
+    least = []
+    for _ in range(30):
+        x = state(LINE.centre + rng.normal(0, 2.0, 3), so3.quat_exp(rng.normal(size=3)))
+        (exact, curvature), (gradient, never) = second("see_hess", x), second("see_gauss_newton", x)
+        np.testing.assert_allclose(gradient, exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
+        assert never.min() > -1e-9 * never.max()
+        least.append(curvature.min() / np.abs(curvature).max())
+    assert min(least) < -0.1  # the exact one does
+
+
 def test_running_cost_is_equation_15() -> None:
     x, u, N = state([0, 0, 1], w=[1.0, 2, 3]), np.array([0.1, -0.2, 0.3, 0.4]), 30
     T, rates = 2.0, 40.0 * u

@@ -140,9 +140,9 @@ def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int) -> ca.MX:
     return out.matrix()
 
 
-def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.MX, lam_g: ca.MX, perception: bool
-            ) -> tuple[ca.MX, ca.MX]:
-    """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g."""
+def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.MX, lam_g: ca.MX, perception: bool,
+            gauss_newton: bool = False) -> tuple[ca.MX, ca.MX]:
+    """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g; with `gauss_newton` the perception costs' never bends down."""
     f, path = stages.functions, path_functions(p)
     X, U = split(x, N)
     at = constraint_rows(N, len(path))
@@ -161,7 +161,7 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
     take("turn", turn, STRIDE, 0, N)
     take("run", f["run_hess"].map(N)(X[:, :N], U, 1.0 / N, p.run, lam_f), STRIDE, 0, N)
     if perception:
-        take("see", f["see_hess"].map(N)(X[:, :N], p.lines[0], p.see, lam_f), STAGE_STATES, 0, N)
+        take("see", f["see_gauss_newton" if gauss_newton else "see_hess"].map(N)(X[:, :N], p.lines[0], p.see, lam_f), STAGE_STATES, 0, N)
     for i, (name, parameter) in enumerate(path):
         values = f[f"{name}_hess"].map(N)(X[:, 1:], parameter, lam_g[(at.inner + i).tolist()].T)
         take(name, values, STAGE_STATES, 1, N)

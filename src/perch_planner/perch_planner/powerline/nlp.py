@@ -110,6 +110,7 @@ class Problem:
     barrier: float | None = None  # first barrier parameter; a small one keeps to a good guess
     push: float = 1e-2  # how far a guess is pushed off its active bounds
     max_iterations: int = 300
+    gauss_newton: bool = False  # perception costs without the curvature of their residuals: quick from afar, slow at the end
     _solver: ca.Function = field(init=False, repr=False)
     _equality: np.ndarray = field(init=False, repr=False)
     _clearances: np.ndarray = field(init=False, repr=False)
@@ -138,7 +139,8 @@ class Problem:
         self._equality[self._clearances] = self._equality[at.inner + count] = self._equality[at.turn] = False
 
         lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.shape[0])
-        gradient, H = hessian(self.stages, x, parameters, N, lam_f, lam_g, self.structure.perception)
+        gradient, H = hessian(self.stages, x, parameters, N, lam_f, lam_g, self.structure.perception,
+                              self.gauss_newton)
         jac_g = ca.Function("nlp_jac_g", [x, p], [g, jacobian(self.stages, x, parameters, N)], ["x", "p"], ["g", "jac_g_x"])
         if self.structure.solver == "fatrop":
             hess_l = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [gradient, H], ["x", "p", "lam_f", "lam_g"],

@@ -103,15 +103,17 @@ class PowerlinePlanner:
 
     def _perch(self, request: PowerlineRequest) -> _Task:
         s, pose, target = self.settings, request.perch, request.target()
-        turn = 0.0
+        turn = aside = 0.0
         if request.perception:
             q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)
-            turn = guess.facing_turn(request.start[Q], q_BC, target.closest_point(pose.p_WB) - request.start[P])
+            way = target.closest_point(pose.p_WB) - request.start[P]
+            turn = guess.facing_turn(request.start[Q], q_BC, way)
+            aside = guess.side_turn(request.start[Q], q_BC, target.direction, way)
         T0 = guess.perch_duration(request.start, pose.p_WB)
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
             return guess.perch_guess(self.solver.model, request.start, pose.p_WB, pose.s3_W, s.height_min + 0.05, intervals,
-                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn)
+                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn, aside)
 
         approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,

@@ -80,14 +80,13 @@ def _run(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, weights: Ve
     return weights[0] * dot(impulse, impulse) + weights[1] * dot(x[W], x[W]) + weights[3] * dot(half, half)
 
 
-def _hinge_squared(h: Scalar) -> Scalar:
-    """Penalty of a soft constraint h > 0: exactly what a slack with a quadratic cost gives, without the slack."""
-    violated = ca.fmax(0, -h)
-    return violated * violated
+def _violated(h: Scalar) -> Scalar:
+    """By how much a soft constraint h > 0 is violated; squared, exactly what a slack with a quadratic cost gives."""
+    return ca.fmax(0, -h)
 
 
-def _see(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
-    """Perception cost and soft constraints of the target line. [P:eq9, P:eq12, P:eq13, P:eq14h, P:eq14i]
+def _sight(model: StageModel, x: Vector, line: Vector) -> Vector:
+    """What the perception cost weighs and squares: reprojection, cheirality, segment visibility. [P:eq9, P:eq12, P:eq13]
 
     [P:eq13] is a quotient with a pole where the camera looks along the line, and its arctan (the authors' remedy) has
     no slope there, so that a solver started so never turns. With s the place of the centred point along the line, in
@@ -100,9 +99,12 @@ def _see(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
     in_front = lines.cheirality(n_I, l_I)
     along = (dot(p2D, l_I) - in_front * dot(o_C, l_I)) / line[7]  # = d3D_z s, for |l_C| = 1
     beside = ca.fabs(ca.atan2(along, SEGMENT_AIM * in_front)) - np.pi / 4
-    error = lines.reprojection_error(n_I)
-    return (weights[0] * error * error + weights[1] * _hinge_squared(in_front)
-            + weights[2] * _hinge_squared(-beside))
+    return lines.reprojection_error(n_I), _violated(in_front), _violated(-beside)
+
+
+def _see(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
+    """Perception cost and soft constraints of the target line. [P:eq9, P:eq12, P:eq13, P:eq14h, P:eq14i]"""
+    return sum(weight * value * value for weight, value in zip(weights, _sight(model, x, line), strict=True))
 
 
 def _end(model: StageModel, x: Vector, reference: Vector, weights: Vector) -> Scalar:
@@ -163,6 +165,7 @@ class StageFunctions:
             `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint, with x of 18 values (17 states, T) and u
             of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f
             and then the nonzeros of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
+            `see_gauss_newton` is `see_hess` without the curvature of what is squared: never negative.
         jacobian, hessian: sparsity of these nonzeros by base name; the Hessian's is an upper triangle.
     """
 
@@ -207,6 +210,11 @@ def stage_functions(model: StageModel) -> StageFunctions:
         functions[f"{name}_hess"] = ca.Function(f"{name}_hess", [*inputs, lam],
                                                 ca.cse([ca.vertcat(ca.densify(gradient), _nonzeros(H))]))
         jacobian[name], hessian[name] = J.sparsity(), H.sparsity()
+    lam, residuals = ca.SX.sym("lam"), ca.vertcat(*_sight(model, xs, ls))
+    J = ca.jacobian(residuals, x)
+    gradient, H = (2 * lam * J.T @ (ca.diag(see) @ right) for right in (residuals, J))
+    functions["see_gauss_newton"] = ca.Function("see_gauss_newton", [x, line, see, lam], [
+        ca.cse(ca.vertcat(ca.densify(gradient), _nonzeros(ca.project(ca.triu(H), hessian["see"]))))])
     return StageFunctions(functions, jacobian, hessian)
 
 
