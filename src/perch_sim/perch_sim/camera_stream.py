@@ -86,7 +86,7 @@ class CameraStream:
 
     def _draw(self, frame: Frame, history: StateHistory) -> ImageToCome:
         instants = np.linspace(frame.start, frame.end, POSES)
-        states = [history.at(int(t)) for t in instants]
-        poses = [(s.p_WB, so3.quat_to_matrix(s.q_WB)) for s in states]
+        p_WB, q_WB = history.poses([int(t) for t in instants])
+        poses = list(zip(p_WB, so3.quat_to_matrix(q_WB)))
         shift = self._velocity * (frame.middle - self._start) * 1e-9
         return self._begin(poses, self._noise.spawn(1)[0], shift)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,19 +37,38 @@ class StateHistory:
         Raises:
             LookupError: the time lies outside the history.
         """
+        a, b, s = self._around(time)
+        p, q = _between([(a, b, s)])
+        return TrueState(time, p[0], q[0], a.v_WB + s * (b.v_WB - a.v_WB), a.w_WB_B + s * (b.w_WB_B - a.w_WB_B))
+
+    def poses(self, times: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (n, 3) [m] and attitudes xyzw (n, 4) at n times [ns], as `at` has them, in a fraction of its time.
+
+        Raises:
+            LookupError: a time lies outside the history.
+        """
+        return _between([self._around(time) for time in times])
+
+    def _around(self, time: int) -> tuple[TrueState, TrueState, float]:
+        """The states before and after a time [ns], and the share of the way from one to the other."""
         states = self._states
         if not states or not states[0].time <= time <= states[-1].time:
             span = f"[{states[0].time}, {states[-1].time}]" if states else "an empty history"
             raise LookupError(f"time {time} ns is outside {span} ns")
+        if len(states) == 1:
+            return states[0], states[0], 0.0
         upper = len(states) - 1
         while upper > 1 and states[upper - 1].time >= time:
             upper -= 1
-        if len(states) == 1:
-            return states[0]
         a, b = states[upper - 1], states[upper]
-        h = (b.time - a.time) * 1e-9
-        s = (time - a.time) / (b.time - a.time)
-        p = ((1 + 2 * s) * (1 - s) ** 2 * a.p_WB + s * s * (3 - 2 * s) * b.p_WB
-             + h * s * (1 - s) * ((1 - s) * a.v_WB - s * b.v_WB))
-        return TrueState(time, p, so3.quat_slerp(a.q_WB, b.q_WB, s), a.v_WB + s * (b.v_WB - a.v_WB),
-                         a.w_WB_B + s * (b.w_WB_B - a.w_WB_B))
+        return a, b, (time - a.time) / (b.time - a.time)
+
+
+def _between(places: list[tuple[TrueState, TrueState, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) and attitudes (n, 4) at shares of the way between states."""
+    # The weights in plain floats: the same bits for one time and for many.
+    weights = np.array([((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), (b.time - a.time) * 1e-9 * s * (1 - s), 1 - s, s)
+                        for a, b, s in places]).T[..., None]
+    before, after = ([np.array([getattr(place[k], name) for place in places]) for name in ("p_WB", "v_WB", "q_WB")] for k in (0, 1))
+    p = weights[0] * before[0] + weights[1] * after[0] + weights[2] * (weights[3] * before[1] - weights[4] * after[1])
+    return p, so3.quat_slerp(before[2], after[2], weights[4, :, 0])
