@@ -110,18 +110,19 @@ def rate_coarse_bound(force, force2, jerk, yaw, duration):
 
 
 @compiled
+def spin_rate(f_x, f_y, f_z, x_x, x_y, yaw, yaw_rate):
+    """w_z for components of f and x = f x j [rad/s]; large where f lies along b2_des, which leaves b3 without a heading."""
+    specific = sqrt(max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12))
+    d_x, d_y = -sin(yaw), cos(yaw)
+    lean = d_x * f_x + d_y * f_y
+    across = max(specific * specific - lean * lean, 1e-12)
+    return (yaw_rate * f_z * specific + lean * (d_x * x_x + d_y * x_y) / specific) / across
+
+
+@compiled
 def _squared_rate(parts):
     """|omega|^2 where the parts begin."""
-    f_z, yaw, yaw_rate = parts[5, 0], parts[9, 0], parts[10, 0]
-    f2 = max(parts[2, 0], 1e-30)
-    specific = sqrt(f2)
-    dx, dy = -sin(yaw), cos(yaw)
-    along = dx * parts[3, 0] + dy * parts[4, 0]
-    turning = dx * parts[6, 0] + dy * parts[7, 0]
-    across = f2 - along * along
-    if across < 1e-12:
-        return np.inf
-    spin = (yaw_rate * f_z * specific + along * turning / specific) / across
+    spin = spin_rate(parts[3, 0], parts[4, 0], parts[5, 0], parts[6, 0], parts[7, 0], parts[9, 0], parts[10, 0])
     return parts[1, 0] / max(parts[0, 0], 1e-60) + spin * spin
 
 

@@ -12,30 +12,21 @@ from math import cos, sin
 import numpy as np
 
 from perch_core.jit import compiled
-from perch_core.vector3 import dot
+from perch_core.vector3 import cross, dot
 from perch_core.vehicle import GRAVITY
-from perch_planner.bounds import derivatives_at
-from perch_planner.linear_bounds import Bounds
+from perch_planner.body_rate_bound import spin_rate
+from perch_planner.bounds import derivative, derivatives_at, value
+from perch_planner.linear_bounds import Bounds, no_bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 from perch_planner.rotor_thrusts import linear_bounds
 
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
-_KEEP_AHEAD = 0.985  # of the limit, for cuts that are set ahead
-_PREVENTED = ((-1, 0.7), (-1, 0.8), (-1, 0.9), (0, 0.0))  # segments from the last, places
-_LEANS = ((1.0, 0.0), (0.980, 0.199))  # the thrust is upright or leans 11 degrees back where it is greatest
-_RIM_ROOM = 1.1     # times the rim's reach at the present tilt, as the tilt changes with the cut
-_LEAN_AHEAD = 0.05  # [rad] that the thrust leans back from upright where the rotation begins
+RIM_ROOM = 1.1     # times the rim's reach at the present tilt, as the tilt changes with the cut
+_KEEP_RATE = 0.95   # of the body rate's limit
 _RAISE = 1.02       # cuts of the thrust from below
-_HEIGHT_ROOM = 2e-3  # [m]
+HEIGHT_ROOM = 2e-3  # [m]
 _BESIDE = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
 _FLAT = 0.97        # of the limit; a peak is cut beside its place where the thrust is above this share
-
-
-@compiled
-def _empty(terms, rows):
-    """Arrays of `Bounds`, without bounds yet: one term of weight zero each."""
-    return (np.zeros(terms, np.int64), np.zeros(terms, np.int64), np.zeros(terms), np.full(terms, 2), np.zeros((terms, 3)),
-            np.full(rows, -np.inf), np.full(rows, np.inf))
 
 
 @compiled
@@ -63,7 +54,7 @@ def thrust_cuts(coefficients, durations, extrema, low, high, side):
     most = 0
     for i in range(len(durations)):
         most += 3 * (extrema[i, 4] > high) + (extrema[i, 1] < low)
-    owner, segments, places, orders, direction, lower, upper = _empty(most, most)
+    owner, segments, places, orders, direction, lower, upper = no_bounds(most, most)
     r = 0
     for i in range(len(durations)):
         if extrema[i, 4] > high:
@@ -90,67 +81,24 @@ def thrust_cuts(coefficients, durations, extrema, low, high, side):
     return owner[:r], segments[:r], places[:r], orders[:r], direction[:r], lower[:r], upper[:r]
 
 
-@compiled
-def preventive_cuts(durations, given, high, side, p_S, v_S, s3, extension, clearance):
-    """Bounds where a perch nearly always needs them, before the first program is solved. [M:eq16]
-
-    From above on the thrust, early in the run-up and the rotation: they hold for every plan that keeps the bound, whatever
-    the direction. And from below on the distance from the surface where the rotation begins, if that place is free: there
-    the rim comes nearest, while the thrust still leans a little back from upright. Both save a round in most plans.
-
-    Args:
-        durations: of the segments [s], shape (f,), f > 1.
-        given: number of knots after the start whose positions are given, contact among them.
-        high: limit of the specific thrust [m/s^2].
-        side: of `turning_side`, shape (3,).
-        p_S, v_S, s3, extension, clearance: as for `plan_checks.check`.
-
-    Returns:
-        Fields of `Bounds`.
-    """
-    last = len(durations) - 1
-    most = len(_LEANS) * len(_PREVENTED) + 1
-    owner, segments, at, orders, direction, lower, upper = _empty(most, most)
-    r = 0
-    for segment, place in _PREVENTED:
-        for up, back in _LEANS:
-            owner[r], segments[r], at[r] = r, last + segment, place
-            for d in range(3):
-                direction[r, d] = back * side[d]
-            direction[r, 2] += up
-            upper[r] = _KEEP_AHEAD * high - direction[r, 2] * GRAVITY
-            r += 1
-    if last >= given:
-        owner[r], segments[r], orders[r] = r, last, 0
-        time, plane = durations[:last].sum(), 0.0
-        for d in range(3):
-            direction[r, d] = s3[d]
-            plane += s3[d] * (p_S[d] + time * v_S[d])
-        upright = np.arccos(min(max(s3[2], -1.0), 1.0))
-        tilt = np.sin(min(upright + _LEAN_AHEAD, 0.5 * np.pi) if upright < 0.5 * np.pi else upright)
-        lower[r] = plane + clearance + _RIM_ROOM * extension * tilt + _HEIGHT_ROOM
-        r += 1
-    return owner[:r], segments[:r], at[:r], orders[:r], direction[:r], lower[:r], upper[:r]
-
-
 def turning_side(heading: float) -> np.ndarray:
     """Direction over which the thrust turns from up to s3: against the heading of the approach [rad], shape (3,)."""
     return np.array([-cos(heading), -sin(heading), 0.0])
 
 
 @compiled
-def limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
+def limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
     """Cuts where speed, height, clearance or body rate could not be proved.
 
     Args:
         where: of `plan_checks.check`.
-        coefficients, durations: the plan.
+        coefficients, yaw, durations: the plan.
         p_S, v_S, s3, low_height, high_height, speed, rate, extension: as for `plan_checks.check`.
 
     Returns:
         Fields of `Bounds`.
     """
-    owner, segments, places, orders, direction, lower, upper = _empty(9, 6)
+    owner, segments, places, orders, direction, lower, upper = no_bounds(9, 6)
     t = r = 0
     for row in (SPEED, HEIGHT, CLEARANCE, BODY_RATE):
         if where[row, 0] < 0.0:
@@ -172,21 +120,26 @@ def limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_he
                     direction[t, d] = x[1, d] / norm
             elif row == HEIGHT:
                 orders[t], direction[t, 2] = 0, 1.0
-                lower[r], upper[r] = low_height + _HEIGHT_ROOM, high_height - _HEIGHT_ROOM
+                lower[r], upper[r] = low_height + HEIGHT_ROOM, high_height - HEIGHT_ROOM
             elif row == CLEARANCE:
                 # The rim's distance at the present tilt: right to first order where the tilt does not change.
                 tilt = np.sqrt(max(1.0 - dot(f, s3) ** 2 / squared, 0.0))
                 time = durations[:i].sum() + s * durations[i]
                 orders[t] = 0
-                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + _RIM_ROOM * extension * tilt + _HEIGHT_ROOM
+                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + RIM_ROOM * extension * tilt + HEIGHT_ROOM
                 for d in range(3):
                     direction[t, d] = s3[d]
             else:
-                # |j across f| <= W |f|, linear in both at the present directions.
-                share, norm, along = 0.95 * rate, np.sqrt(squared), dot(f, j) / squared
+                # |j across f| <= u |f|, linear in both at the present directions.
+                norm, along = np.sqrt(squared), dot(f, j) / squared
                 across = np.sqrt(max(dot(j, j) - along * dot(f, j), 0.0))
                 if across <= 1e-6:
                     continue
+                # The spin falls with the tilt's rate: what is left for the tilt is its present share of the whole.
+                turning = cross(f, j)
+                spin = spin_rate(f[0], f[1], f[2], turning[0], turning[1], value(yaw[i], s),
+                                 value(derivative(yaw[i], 1), s) / durations[i])
+                share = _KEEP_RATE * rate / np.sqrt(1.0 + (spin * norm / across) ** 2)
                 owner[t + 1], segments[t + 1], places[t + 1] = r, i, s
                 orders[t] = 3
                 upper[r] = share * f[2] / norm * GRAVITY

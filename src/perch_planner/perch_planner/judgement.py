@@ -113,5 +113,5 @@ def judge(coefficients, yaw, durations, question, patient, later):
     thrust = thrust_cuts(coefficients, durations, extrema, low if cut else -np.inf, high if cut else np.inf, side)
     if not cut:
         where[:] = -1.0
-    other = limit_cuts(where, coefficients, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension)
+    other = limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension)
     return extrema, results, (least, most, checked, holds, stretch), thrust, other

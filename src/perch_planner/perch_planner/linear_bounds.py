@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.jit import compiled
+
 
 class Bounds(NamedTuple):
     """Linear bounds at single places of the plan: lower <= sum of direction . (order-th derivative) <= upper.
@@ -32,3 +34,10 @@ class Bounds(NamedTuple):
 NONE = Bounds(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64), np.empty((0, 3)), np.empty(0),
               np.empty(0))
 """No bounds."""
+
+
+@compiled
+def no_bounds(terms, rows):
+    """Arrays of `Bounds` to be filled in: so many terms of weight zero, so many rows without bounds."""
+    return (np.zeros(terms, np.int64), np.zeros(terms, np.int64), np.zeros(terms), np.full(terms, 2), np.zeros((terms, 3)),
+            np.full(rows, -np.inf), np.full(rows, np.inf))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from math import cos, sin, sqrt
+from math import sqrt
 
 import numpy as np
 
 from perch_core import bernstein
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
-from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound
+from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound, spin_rate
 from perch_planner.bounds import magnitude, maximum, smallest, squared, time_derivative
 from perch_planner.clearance_bound import prove_clearance, surface_distance
 
@@ -116,10 +116,7 @@ def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
         if here < gap:
             gap, gap_at = here, k / (count - 1)
         x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
-        d_x, d_y = -sin(heading[0, k]), cos(heading[0, k])
-        lean = d_x * f_x + d_y * f_y
-        across = max(f2 - lean * lean, 1e-12)
-        spin = (turn[0, k] * f_z * sqrt(f2) + lean * (d_x * x_x + d_y * x_y) / sqrt(f2)) / across
+        spin = spin_rate(f_x, f_y, f_z, x_x, x_y, heading[0, k], turn[0, k])
         here = (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
         if here > rate:
             rate, rate_at_ = here, k / (count - 1)

@@ -9,7 +9,7 @@ import numpy as np
 from perch_core.jit import compiled
 from perch_planner import full_qp, reduced_qp, solvers
 from perch_planner.contact_constraints import Contact, conditions_kernel
-from perch_planner.cutting import preventive_cuts
+from perch_planner.cuts_ahead import cuts_ahead
 from perch_planner.judgement import NOTHING, Judgement, Question, judge
 from perch_planner.linear_bounds import Bounds
 from perch_planner.problem import PerchSettings
@@ -43,9 +43,9 @@ class SegmentProgram(Protocol):
 
 @compiled
 def _ahead(durations, given, question):
-    """`preventive_cuts` for the fields of a `Question`."""
-    p_S, v_S, s3, side, _, high, _, _, _, extension, clearance, _, _, _, _ = question
-    return preventive_cuts(durations, given, high, side, p_S, v_S, s3, extension, clearance)
+    """`cuts_ahead` for the fields of a `Question`."""
+    p_S, v_S, s3, side, low, high, _, _, _, extension, clearance, rate, _, _, _ = question
+    return cuts_ahead(durations, given, low, high, side, p_S, v_S, s3, extension, clearance, rate)
 
 
 @compiled
