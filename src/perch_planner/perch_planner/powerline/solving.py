@@ -25,7 +25,7 @@ from perch_planner.powerline.stage_functions import StageFunctions, StageModel, 
 # "sight" is the first phase of a problem with perception costs.
 PHASES = {
     "first": {"tolerance": 1e-2},
-    "sight": {"tolerance": 1e-2, "max_iterations": 14, "gauss_newton": True},
+    "sight": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
     "second": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
     "polish": {"tolerance": 1e-5, "barrier": 1e-5, "push": 1e-7},
 }
