@@ -65,20 +65,24 @@ class CameraStream:
                 image = self._draw(frame, history)
             self._coming.append(Delivery(frame, image))
 
-    def due(self, time: int, wait: float = 0.0) -> Delivery | None:
-        """The oldest frame, if it has arrived by `time` [ns]; it stays until `take`. Waits for its image up to `wait` [s]."""
+    def due(self, time: int) -> Delivery | None:
+        """The oldest frame, if it has arrived by `time` [ns]; it stays until `take`."""
         if not self._coming or self._coming[0].frame.arrival > time:
             return None
         frame, image = self._coming[0]
-        if image is not None and image.done(wait) and image.result() is None:
+        if image is not None and image.done() and image.result() is None:
             self._coming[0] = Delivery(frame, None)
-            self.dropped += 1
-            self.broken = True
+            self.give_up()
         return self._coming[0]
 
     def take(self) -> Delivery:
         """Remove the oldest frame."""
         return self._coming.popleft()
+
+    def give_up(self) -> None:
+        """An image will never come."""
+        self.dropped += 1
+        self.broken = True
 
     def _overloaded(self) -> bool:
         waiting = sum(d.image is not None and not d.image.done() for d in self._coming)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import multiprocessing
+import select
 import signal
 from collections import deque
 from collections.abc import Collection, Sequence
@@ -142,6 +143,8 @@ class _Draftsman:
         self.process = spawn.Process(target=_draw_until_closed, args=(orders, images, scene, mount, seed), daemon=True)
         self.process.start()
         orders.close(), images.close()  # so that the end of the process is the end of the pipe
+        self._poll = select.poll()  # Connection.poll makes one for every call, which takes 0.1 ms
+        self._poll.register(self._images.fileno(), select.POLLIN)
         self._shape = (mount.camera.height, mount.camera.width, 3)[:3 if mount.colour else 2]
         self._ordered: deque[_Ordered] = deque()
         self._ready = self._ended = False
@@ -164,7 +167,7 @@ class _Draftsman:
     def receive(self, timeout: float) -> bool:
         """Take what comes next, an image or the greeting before the first one, if it comes in time."""
         try:
-            if self._ended or not self._images.poll(timeout):
+            if self._ended or not self._poll.poll(1e3 * timeout):
                 return False
             data = self._images.recv_bytes()
         except (EOFError, OSError):

@@ -80,6 +80,11 @@ class LockstepMaster:
         if not slow.dropped:
             slow.due.append((trigger, due))
 
+    def cancel(self, node: str, trigger: int) -> None:
+        """Expect no result of work that cannot be done: its image is lost."""
+        slow = self._slow[node]
+        slow.due = deque(entry for entry in slow.due if entry[0] != trigger)
+
     # -- steps -------------------------------------------------------------------------------------------------------
 
     def missing_greetings(self) -> tuple[str, ...]:

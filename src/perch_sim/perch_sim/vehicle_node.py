@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Collection
 from typing import Any
 
 import cv2
@@ -26,12 +27,13 @@ from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.motors import MotorCommandError
 from perch_sim.pacing import Pacing
 from perch_sim.parameters import CAMERAS, VehicleParameters
-from perch_sim.participants import CONTROLLER, triggers
+from perch_sim.participants import CONTROLLER, Trigger, triggers
 from perch_sim.phase_times import PhaseTimes
 from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 from perch_sim.ros.vehicle_topics import VehicleTopics
 
 MOST_WAITING = 2        # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
+MOST_UNDRAWN = 2        # frames per camera that have arrived before their images, in lockstep
 DRAWING_WAIT = 0.02      # for an image without which nobody can go on; then the next look after the flight [s]
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
@@ -59,6 +61,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._ticks = self.create_publisher(Step, "tick", qos.STEP)
         self._released: dict[str, int] = {}    # since the last tick
         self._output: Output | None = None     # of the step that is to be published next
+        self._undrawn: list[tuple[str, Delivery]] = []  # frames that have arrived, oldest first; their images are being drawn
         self._index = 0
         self._times = PhaseTimes()
         self._last_command = 0
@@ -131,19 +134,18 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self._times.end("waiting")
             self._output = self._simulation.advance()
             self._times.end("physics")
+            self._take_arrived()
         stamp = self._output.time
-        frames = self._arrived(stamp)
-        if frames is None or not watch.may_publish(stamp):
-            return False
-        for name, delivery in frames:
-            for trigger in watch.triggers:
-                if trigger.camera == name and (delivery.image is not None or not trigger.needs_image):
-                    due = max(delivery.frame.middle + round(trigger.latency * 1e9), stamp + CONTROL_PERIOD_NS)
-                    watch.trigger(trigger.node, delivery.frame.stamp, due)
+        missing = watch.missing(stamp)
+        awaited = self._crowded() | {trigger.camera for trigger in watch.triggers if trigger.node in missing}
+        if awaited:
+            self._publish_drawn(awaited)
+            return not missing and not self._crowded()
         for trigger in watch.triggers:
             if trigger.period and self._index % trigger.period == 0:
                 watch.trigger(trigger.node, stamp, stamp + round(trigger.latency * 1e9))
-        self._publish(frames, watch.begin(stamp))
+        self._publish(watch.begin(stamp))
+        self._publish_drawn()
         return True
 
     def _in_time(self) -> bool:
@@ -163,19 +165,49 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._allowance -= 1
         return True
 
-    def _arrived(self, stamp: int) -> list[tuple[str, Delivery]] | None:
-        """Frames that arrive at this step; None while one of them is still being drawn."""
-        frames = []
+    def _take_arrived(self) -> None:
+        """Trigger the work that begins with the frames that arrive at this step.
+
+        Their images may come later, while they are still being drawn: it is the results of that work that have a time.
+        """
+        stamp = self._output.time
         for name, camera in self._simulation.cameras.items():
-            delivery = camera.due(stamp, DRAWING_WAIT)
-            if delivery is None:
+            if camera.due(stamp) is None:
                 continue
             if camera.broken:
                 self.get_logger().error(f"camera_{name}: the process that draws its images has ended: no images any more", once=True)
-            if delivery.image is not None and not delivery.image.done():
-                return None
-            frames.append((name, delivery))
-        return frames
+            delivery = camera.take()
+            self._undrawn.append((name, delivery))
+            for trigger in self._triggered_by(name, delivery):
+                due = max(delivery.frame.middle + round(trigger.latency * 1e9), stamp + CONTROL_PERIOD_NS)
+                self._watch.trigger(trigger.node, delivery.frame.stamp, due)
+
+    def _crowded(self) -> set[str]:
+        """Cameras whose frames arrive faster than they are drawn: the flight waits for them even where nobody else does."""
+        names = [name for name, _ in self._undrawn]
+        return {name for name in names if names.count(name) > MOST_UNDRAWN}
+
+    def _triggered_by(self, name: str, delivery: Delivery) -> list[Trigger]:
+        return [trigger for trigger in self._watch.triggers
+                if trigger.camera == name and (delivery.image is not None or not trigger.needs_image)]
+
+    def _publish_drawn(self, awaited: Collection[str | None] = ()) -> None:
+        """Publish frames whose image has been drawn, each camera's in order; wait a moment for one of a camera that is awaited."""
+        drawn, coming, behind = [], [], set()
+        for name, delivery in self._undrawn:
+            if name in behind or not (delivery.image is None or delivery.image.done(DRAWING_WAIT if name in awaited else 0.0)):
+                behind.add(name)
+                coming.append((name, delivery))
+            else:
+                drawn.append((name, delivery))
+        self._undrawn = coming
+        for name, delivery in drawn:
+            if delivery.image is not None and delivery.image.result() is None:
+                for trigger in self._triggered_by(name, delivery):
+                    if trigger.needs_image:
+                        self._watch.cancel(trigger.node, delivery.frame.stamp)
+                self._simulation.cameras[name].give_up()
+        self._publish_frames(drawn)
 
     # -- real time ---------------------------------------------------------------------------------------------------
 
@@ -196,14 +228,15 @@ class VehicleNode(PerchNode[VehicleParameters]):
                 if delivery is None:
                     continue
                 if delivery.image is None or delivery.image.done():
-                    frames.append((name, delivery))
+                    frames.append((name, camera.take()))
                 else:
                     self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
-            self._publish(frames, {})
+            self._publish({})
+            self._publish_frames(frames)
 
     # -- output ------------------------------------------------------------------------------------------------------
 
-    def _publish(self, frames: list[tuple[str, Delivery]], released: dict[str, int]) -> None:
+    def _publish(self, released: dict[str, int]) -> None:
         """Publish this step and what it shows: first what the control loop waits for, which then works meanwhile."""
         output, topics, index = self._output, self._topics, self._index
         topics.publish_imu(output.time, output.imu)
@@ -226,13 +259,17 @@ class VehicleNode(PerchNode[VehicleParameters]):
         if index % ROTOR_STEPS == 0:
             plant = self._simulation.plant
             topics.publish_rotors(output.time, plant.rotor_speed, plant.rotor_thrust)
-        if frames:
-            composition.flush()
-        for name, delivery in frames:
-            self._simulation.cameras[name].take()
-            topics.cameras[name].publish(delivery.frame.stamp, delivery.image.result() if delivery.image else None)
         self._index, self._output = index + 1, None
         self._times.count_step()
+        self._times.end("publishing")
+
+    def _publish_frames(self, frames: list[tuple[str, Delivery]]) -> None:
+        """Publish camera_info and image of frames; those who use them then know everything that came before."""
+        if not frames:
+            return
+        composition.flush()
+        for name, delivery in frames:
+            self._topics.cameras[name].publish(delivery.frame.stamp, delivery.image.result() if delivery.image else None)
         self._times.end("publishing")
 
     def _step(self, released: dict[str, int]) -> bytes:

@@ -68,6 +68,10 @@ class LockstepWatch:
         """A participant has been given work."""
         self._master.trigger(node, trigger, due)
 
+    def cancel(self, node: str, trigger: int) -> None:
+        """Work that was given to a participant cannot be done."""
+        self._master.cancel(node, trigger)
+
     def begin(self, stamp: int) -> dict[str, int]:
         """Begin a step; returns what it releases."""
         self._progress = time.monotonic()
@@ -84,9 +88,9 @@ class LockstepWatch:
         """Whether physics may go on to the next step."""
         return self._started and not self._master.missing_command
 
-    def may_publish(self, stamp: int) -> bool:
-        """Whether everything that is due at the step has come."""
-        return not self._master.missing_results(stamp)
+    def missing(self, stamp: int) -> tuple[str, ...]:
+        """Participants whose result is due at the step and has not come."""
+        return self._master.missing_results(stamp)
 
     # -- the silent --------------------------------------------------------------------------------------------------
 
