@@ -18,7 +18,7 @@ from perch_planner.refusals import PerchRefusal
 from perch_planner.verifier import verify
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
-from random_perches import random_problem, requirements  # noqa: E402
+from random_perches import paper_like_problem, random_problem, requirements  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 HOVER = StartState((0.0, 0.0, 1.5))
@@ -232,6 +232,13 @@ def test_the_rim_clears_the_surface_from_the_first_program_on(inclination):
     """Where the rotation begins the rim comes nearest; without the row that is set ahead these take two programs."""
     planned = checked(PerchProblem(HOVER, surface(inclination), (Waypoint((0.6, 0.1, 1.5)),)))
     assert planned.iterations == 1
+
+
+@pytest.mark.parametrize("waypoints", [3, 10])
+def test_what_is_set_ahead_makes_one_program_enough(waypoints):
+    """Of thrust, rim and body rate; without it a fifth (3 waypoints) and nineteen twentieths (10) take more."""
+    plans = [plan(paper_like_problem(np.random.default_rng(seed), waypoints), PerchSettings(), VEHICLE) for seed in range(60)]
+    assert sum(planned.iterations == 1 for planned in plans) >= 54
 
 
 def test_the_row_ahead_leaves_a_surface_without_clearance_alone():

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from perch_core import bernstein
+from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_planner import full_qp, reference_element, solvers
+from perch_planner import full_qp, plan_checks, reference_element, solvers
 from perch_planner.contact_constraints import Contact, tube_bounds, tube_times
+from perch_planner.cutting import limit_cuts
 from perch_planner.linear_bounds import Bounds
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.segment_program import FullSegments, ReducedSegments
@@ -186,3 +188,20 @@ def test_yaw_meets_both_ends_smoothly_by_the_shorter_turn(order, degree):
     for k in range(4):
         left = bernstein.evaluate(bernstein.derivative(rows[0], k), 1.0) / 0.6**k
         assert left == pytest.approx(float(bernstein.evaluate(bernstein.derivative(rows[1], k), 0.0)) / 0.3**k, abs=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_cut_of_a_body_rate_removes_the_plan_also_where_it_spins(seed):
+    """Whatever share of the rate is spin: the cut at the limit's place must not hold for the plan that breaks the limit."""
+    rng = np.random.default_rng(seed)
+    coefficients, yaw, durations = rng.normal(0.0, 0.6, (1, 3, 15)), rng.normal(0.0, 2.0, (1, 15)), np.array([1.2])
+    at = [bernstein.evaluate(bernstein.derivative(coefficients[0], k), 0.4) / durations[0]**k for k in range(5)]
+    turn = [float(bernstein.evaluate(bernstein.derivative(yaw, k), 0.4)[0]) / durations[0]**k for k in range(3)]
+    rate = 0.99 * np.linalg.norm(flat_to_state(*at, *turn, 0.25).w_WB_B)
+    where = np.full((5, 2), -1.0)
+    where[plan_checks.BODY_RATE] = 0.0, 0.4
+    zero = np.zeros(3)
+    cut = Bounds(*limit_cuts(where, coefficients, yaw, durations, zero, zero, np.array([0.0, 0.0, 1.0]), 0.0, 9.0, 9.0, rate, 0.1))
+    terms = cut.places == 0.4
+    value = sum(d @ at[order] for d, order in zip(cut.direction[terms], cut.orders[terms]))
+    assert value > cut.upper[cut.owner[terms][0]]
