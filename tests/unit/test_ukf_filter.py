@@ -226,7 +226,10 @@ def test_pose_and_velocity_are_as_sure_as_vios(size):
     J = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), R]])
     rows = np.r_[0:3, 6:9]
     np.testing.assert_allclose(J @ P[np.ix_(rows, rows)] @ J.T, pose.covariance, rtol=1e-3, atol=1e-5 * size**2)
-    np.testing.assert_allclose(P[at.D_VELOCITY, at.D_VELOCITY], pose.velocity_covariance, rtol=1e-3, atol=1e-5 * size**2)
+    turned = np.zeros((3, 21))  # of the velocity in B, without what the attitude's error makes of it in W
+    turned[:, at.D_VELOCITY], turned[:, at.D_ATTITUDE] = np.eye(3), so3.hat(belief.x[at.VELOCITY]) @ R
+    np.testing.assert_allclose(turned @ P @ turned.T, pose.velocity_covariance, rtol=1e-3, atol=1e-5 * size**2)
+    np.testing.assert_allclose(turned @ P[:, at.D_ACCEL_BIAS], 0.0, atol=1e-9)
     np.testing.assert_allclose(P[9:15, 9:15], belief.P[9:15, 9:15])
     assert np.linalg.eigvalsh(P)[0] > 0
 

@@ -112,7 +112,7 @@ def test_nees_of_the_filter_on_simulated_tracks():
     values = []
     for seed in range(5):
         run = Run(seed + 10, VioConfig(), start=3.4)
-        run.tracks.noise, run.tracks.slide = 0.1, dataclasses.replace(VioConfig().filter, slide_turn=1.5, slide_zoom=2.0)
+        run.tracks.noise, run.tracks.slide = 0.1, dataclasses.replace(VioConfig().filter, slide_turn=1.2, slide_zoom=0.0)
         for _, error in run.frames():
             pass
         P = run.filter.state.P[:9, :9]

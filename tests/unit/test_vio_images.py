@@ -49,6 +49,34 @@ def assert_sane(steps):
             assert np.linalg.eigvalsh(e.pose_covariance)[0] > 0
 
 
+# -- tracks --------------------------------------------------------------------------------------------------------------
+
+
+def pulled(flatten):
+    """How far tracks lie from where they should be, mean over them [px]: a faint texture moves under a lens that darkens."""
+    rng, camera = np.random.default_rng(4), flight().mount.camera
+    texture = cv2.GaussianBlur(rng.normal(0.0, 1.0, (camera.height + 200, camera.width + 200)), (0, 0), 4.0)
+    texture *= 6.0 / texture.std()
+    y, x = np.mgrid[:camera.height, :camera.width]
+    vignette = 1.0 - 0.5 * ((x - camera.width / 2) ** 2 + (y - camera.height / 2) ** 2) / (camera.width / 2) ** 2
+    tracker, first, shift = Tracker(replace(VioConfig().tracker, flatten=flatten, reference_change=0.0), camera), {}, 3
+    for k in range(13):
+        scene = 110.0 + texture[100:100 + camera.height, k * shift:k * shift + camera.width]
+        image = np.clip(scene * vignette + rng.normal(0.0, 2.0, vignette.shape), 0, 255).astype(np.uint8)
+        seen = tracker.track(image, np.eye(3))
+        for i, pixel in zip(seen.ids, seen.pixels):
+            first.setdefault(i, (k, pixel))
+    moved = [pixel[0] - first[i][1][0] + (12 - first[i][0]) * shift for i, pixel in zip(seen.ids, seen.pixels) if first[i][0] == 0]
+    assert len(moved) > 20
+    return float(np.mean(moved))
+
+
+def test_vignetting_does_not_hold_the_tracks_back():
+    """It stands still in the image, and what stands still pulls."""
+    assert pulled(0.0) > 0.5
+    assert abs(pulled(VioConfig().tracker.flatten)) < 0.2
+
+
 # -- the whole perch -----------------------------------------------------------------------------------------------------
 
 

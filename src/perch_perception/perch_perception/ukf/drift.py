@@ -24,7 +24,7 @@ from perch_perception.ukf.config import VioNoise
 from perch_perception.ukf.measurement import VioPose
 from perch_perception.ukf.unscented import Belief, CovarianceError
 
-_POSE, _VELOCITY = np.r_[at.D_POSITION, at.D_ATTITUDE], np.r_[at.D_VELOCITY]
+_POSE = np.r_[at.D_POSITION, at.D_ATTITUDE]
 
 
 def least_growth(noise: VioNoise, dt: float) -> np.ndarray:
@@ -78,34 +78,48 @@ def follow(belief: Belief, pose: VioPose, velocity: bool) -> Belief:
 
     Given all that VIO has used, its errors have mean zero, and it has used the IMU samples of this filter, and the images
     besides. What this filter believes to know of the drift is the same samples with fewer facts. (White noise stays out: the
-    pose is p + d after the update.) Of the velocity, VIO's covariance C decides: v moves by P (P + max(0, C - P))^-1 of the
-    difference, which is all of it unless VIO has just started anew; the biases follow as they are correlated with v.
+    pose is p + d after the update.) Velocities are compared in B, where VIO measures them and both turn with the same attitude:
+    the error of v less what the attitude makes of it, u = dv - A theta (see `as_sure_as`). Of it VIO's covariance C decides: u
+    moves by P_uu (P_uu + max(0, C - P_uu))^-1 of the difference, which is all of it unless VIO has just started anew; the biases
+    follow as they are correlated with u.
     """
     x, P = belief.x.copy(), belief.P
     x[at.POSITION] += x[16:19]
     x[at.QUATERNION] = update_kernels.vios_attitude(x)
     x[at.DRIFT] = 0.0
     if velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
-        own = P[at.D_VELOCITY, at.D_VELOCITY]
+        U = _beside_attitude(x)
+        P_u = U @ P
+        own = P_u @ U.T
         weighed = np.linalg.solve(own + update_kernels.missing(pose.velocity_covariance, own), pose.v_WB - x[at.VELOCITY])
         x[at.VELOCITY] += own @ weighed
-        x[at.GYRO_BIAS] += P[at.D_GYRO_BIAS, at.D_VELOCITY] @ weighed
-        x[at.ACCEL_BIAS] += P[at.D_ACCEL_BIAS, at.D_VELOCITY] @ weighed
+        x[at.GYRO_BIAS] += weighed @ P_u[:, at.D_GYRO_BIAS]
+        x[at.ACCEL_BIAS] += weighed @ P_u[:, at.D_ACCEL_BIAS]
     return dataclasses.replace(belief, x=x)
+
+
+def _beside_attitude(x: np.ndarray) -> np.ndarray:
+    """U, shape (3, 21), for the velocity's error beside what the attitude's makes of it, u = dv - A theta, A = -[v]x R."""
+    U = np.zeros((3, at.ERROR_SIZE))
+    U[:, at.D_VELOCITY] = np.eye(3)
+    U[:, at.D_ATTITUDE] = so3.hat(x[at.VELOCITY]) @ so3.quat_to_matrix(x[at.QUATERNION])
+    return U
 
 
 def as_sure_as(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
     """Belief whose pose and velocity are as sure as VIO's.
 
-    VIO has used the very IMU samples that this filter integrates, and the images besides: its covariance C of the pose, and of the
-    velocity where it comes with one, is what is known of these. Where P is smaller in some direction, the difference is added, as
-    an error of its own; where it is larger, it shrinks, and correlations stay. The biases keep their covariance: that VIO is
-    surer is no news of them, and pose after pose would be counted again. For x = pose and x = velocity:
+    VIO has used the very IMU samples that this filter integrates, and the images besides: its covariance C of the pose is what is
+    known of it. Where P is smaller in some direction, the difference is added, as an error of its own; where it is larger, it
+    shrinks, and correlations stay. The biases keep their covariance: that VIO is surer is no news of them, and pose after pose
+    would be counted again. For x = pose:
 
         P_xx := P_xx + max(0, C - P_xx);   P' = T P T^T,   T_xx = L(C) L(P_xx)^-1,   C = L(C) L(C)^T.
 
-    VIO does not say how its velocity hangs together with its pose, and its velocity's error is not this filter's: with the rest it
-    is taken as uncorrelated, so that e^T P^-1 e of both together has the right mean, whatever the truth is.
+    Of the velocity VIO speaks in B, where the camera measures it: in W it is as wrong, besides, as the attitude that turns it,
+    v = R v_B, and so hangs together with it and with all that the attitude does. With C_v of v_B in W's axes:
+
+        dv = A theta + n,   A = -[v]x R,   P_v. := A P_theta.,   P_vv := A P_theta,theta A^T + C_v
 
     Args:
         belief: after the update.
@@ -115,20 +129,18 @@ def as_sure_as(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
     Raises:
         CovarianceError: a covariance is not positive definite.
     """
+    R_WB = so3.quat_to_matrix(belief.x[at.QUATERNION])
     J = np.zeros((6, 6))
-    J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(belief.x[at.QUATERNION]).T
+    J[:3, :3], J[3:, 3:] = np.eye(3), R_WB.T
     P, T = belief.P.copy(), np.eye(at.ERROR_SIZE)
-    definite = update_kernels.as_sure_as(P, _POSE, J @ (pose.covariance + doubt) @ J.T, T)
-    if pose.velocity_covariance is not None:
-        definite &= update_kernels.as_sure_as(P, _VELOCITY, pose.velocity_covariance, T)
-    if not definite:
+    if not update_kernels.as_sure_as(P, _POSE, J @ (pose.covariance + doubt) @ J.T, T):
         raise CovarianceError("covariance after an update is not positive definite")
     P = T @ P @ T.T
     if pose.velocity_covariance is not None:
-        own = P[at.D_VELOCITY, at.D_VELOCITY].copy()
-        P[at.D_VELOCITY, :] = 0.0
-        P[:, at.D_VELOCITY] = 0.0
-        P[at.D_VELOCITY, at.D_VELOCITY] = own
+        A = -_beside_attitude(belief.x)[:, at.D_ATTITUDE]
+        P[at.D_VELOCITY, :] = A @ P[at.D_ATTITUDE, :]
+        P[:, at.D_VELOCITY] = P[at.D_VELOCITY, :].T
+        P[at.D_VELOCITY, at.D_VELOCITY] = A @ P[at.D_ATTITUDE, at.D_ATTITUDE] @ A.T + pose.velocity_covariance
     return dataclasses.replace(belief, P=0.5 * (P + P.T))
 
 

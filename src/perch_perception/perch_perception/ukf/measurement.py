@@ -49,7 +49,8 @@ class VioPose:
         q_WB: attitude xyzw, shape (4,).
         covariance: of (position [m], rotation about W's axes [rad]), shape (6, 6).
         v_WB: velocity in W [m/s], shape (3,), or None.
-        velocity_covariance: of v_WB, in W, shape (3, 3), or None.
+        velocity_covariance: of the velocity in B, turned into W's axes, shape (3, 3), or None; what the attitude's error makes
+            of v_WB is not in it.
     """
 
     stamp: int
@@ -64,12 +65,14 @@ class VioPose:
         numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_WB, self.velocity_covariance) if n is not None]
         if not all(np.all(np.isfinite(n)) for n in numbers) or abs(np.linalg.norm(self.q_WB) - 1) > 1e-3:
             return VioOutcome.NOT_FINITE
-        scale = np.abs(self.covariance).max()
-        if np.any(np.abs(self.covariance - self.covariance.T) > 1e-5 * scale + 1e-15):
-            return VioOutcome.BAD_COVARIANCE
-        if np.linalg.eigvalsh(self.covariance)[0] < -1e-9 * scale - 1e-15:
-            return VioOutcome.BAD_COVARIANCE
-        return None
+        covariances = [C for C in (self.covariance, self.velocity_covariance) if C is not None]
+        return None if all(_is_covariance(C) for C in covariances) else VioOutcome.BAD_COVARIANCE
+
+
+def _is_covariance(C: np.ndarray) -> bool:
+    """Whether a matrix is symmetric and has no negative eigenvalue, up to rounding."""
+    scale = np.abs(C).max()
+    return bool(np.all(np.abs(C - C.T) <= 1e-5 * scale + 1e-15) and np.linalg.eigvalsh(C)[0] >= -1e-9 * scale - 1e-15)
 
 
 @dataclass(frozen=True)

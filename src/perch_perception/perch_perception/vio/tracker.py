@@ -3,6 +3,10 @@
 Following a patch from frame to frame adds up its errors: in a hover the map turned by 0.1 deg/s. So a *reference* frame is kept
 while the view changes little, and each feature is found again by the patch it had there.
 
+What stays where it is in the image while the scene moves, the lens's vignetting above all, pulls every track towards standing
+still: over a floor of low contrast by pixels, all of them the same way. Patches are therefore compared without their
+surroundings' brightness (`flattened`).
+
 Outliers are found with the known rotation: two tracks then give the direction of translation, and RANSAC over pairs needs
 only a few draws.
 """
@@ -24,6 +28,7 @@ _HALVING = 1.0  # sigma of the smoothing in cv2.pyrDown [px]
 # strength (least eigenvalue over 3 x 3 px, as OpenCV scales it) of the corners that unit white noise makes in an image of half
 # the size, smoothed with sigma = 1.5 px before: measured on 640 x 480 images of 5 grey levels of noise
 _NOISE_CORNER = 2.3e-6
+_FLAT_STEP, _MID_GREY = 8, 128.0  # the average is taken in an image of 1 / step the size
 
 
 def _noise(image: np.ndarray) -> float:
@@ -31,6 +36,13 @@ def _noise(image: np.ndarray) -> float:
     rows = image[::16].astype(np.int16)
     second = 2 * rows[:, 1:-1] - rows[:, :-2] - rows[:, 2:]
     return float(np.median(np.abs(second))) / (0.6745 * np.sqrt(6.0))
+
+
+def flattened(image: np.ndarray, scale: float) -> np.ndarray:
+    """An image less its brightness averaged over `scale` [px, 1 sigma], about mid-grey; uint8 (height, width)."""
+    small = cv2.resize(image, None, fx=1 / _FLAT_STEP, fy=1 / _FLAT_STEP, interpolation=cv2.INTER_AREA)
+    surroundings = cv2.resize(cv2.GaussianBlur(small, (0, 0), scale / _FLAT_STEP), image.shape[::-1])
+    return cv2.addWeighted(image, 1.0, surroundings, -1.0, _MID_GREY)
 
 
 @dataclass(frozen=True)
@@ -80,6 +92,8 @@ class Tracker:
             image: grey, uint8 (height, width).
             R_now_before: rotation of the camera since the frame before, takes rays of then into C of now, (3, 3).
         """
+        if self.config.flatten > 0.0:
+            image = flattened(image, self.config.flatten)
         disparity = np.inf
         if self._previous is not None and len(self._pixels):
             disparity = self._follow(image, R_now_before)
