@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,7 +19,10 @@ import numpy as np
 from perch_core.scenario import load_scenario
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
+from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.workers import prepare_worker
 from perch_eval.consistency import Consistency
+from perch_eval.estimation_flight import EstimatorTrack
 from perch_eval.target_sightings import Sightings, see_target
 
 GROUPS = {"estimator: all 15 states": slice(0, 15), "estimator: position": slice(0, 3), "estimator: velocity": slice(3, 6),
@@ -25,8 +31,22 @@ AIRBORNE_AFTER = 0.4  # from the first thrust until the vehicle is clear of the 
 LOOK = (-1.5, 0.4)    # the pad is looked at from the hover until it leaves the view, relative to the perch's begin [s]
 
 
+@dataclass(frozen=True)
+class _Run:
+    """One flight: the estimator along it, VIO's NEES at its poses, the pad as it was seen."""
+
+    track: EstimatorTrack
+    perch_time: float
+    airborne: float
+    end: float
+    vio_times: np.ndarray
+    vio_nees: np.ndarray
+    vio_nis: float  # over its dimension
+    sightings: Sightings
+
+
 def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Consistency], dict[str, object]]:
-    """Fly, estimate and judge.
+    """Fly, estimate and judge, one flight at a time on each core.
 
     Args:
         scenario_name: in config/scenarios.
@@ -36,39 +56,45 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     Returns:
         NEES of estimator, VIO and target over time, and a summary with RMSE through the perch and mean NIS.
     """
-    scenario, tracks, vio_nees, rmse, nis, vio_nis, sightings = load_scenario(scenario_name), [], [], [], [], [], []
-    grid = None
-    for seed in range(first_seed, first_seed + runs):
-        flight = flights.fly(scenario, seed)
-        steps = flights.run_vio(flight)
-        airborne = flight.motion.settings.ground + AIRBORNE_AFTER
-        track = flights.run_estimator(flight, steps, begin=airborne)
-        tracks.append(track)
-        sightings.append(see_target(scenario, flight, track, seed, flight.perch_time + LOOK[0], flight.perch_time + LOOK[1]))
-        perching = track.times >= flight.perch_time
-        rmse.append(np.sqrt((track.errors[perching, :3] ** 2).mean(axis=0)))
-        nis.append(track.nis)
-        seen = [s for s in steps if s.error is not None and s.result.nis_dimension]
-        vio_nis.append(sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen))
-        posed = [s for s in steps if s.error is not None]
-        values = [consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed]
-        if grid is None:
-            grid = np.arange(airborne, flight.motion.duration - 0.1, 1 / 30)
-        vio_nees.append(np.interp(grid, [s.time for s in posed], values))
-    n = min(len(t.times) for t in tracks)
-    errors = np.array([t.errors[:n] for t in tracks])
-    covariances = np.array([t.covariances[:n] for t in tracks])
-    results = [consistency.judge(name, tracks[0].times[:n], consistency.nees(errors[..., s], covariances[..., s, s]), s.stop - s.start)
+    flown, progress = [], Progress(runs, what="perches")
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker) as pool:
+        for one in pool.map(_fly, [scenario_name] * runs, range(first_seed, first_seed + runs)):
+            flown.append(one)
+            progress.add(True)
+    progress.close()
+    n = min(len(one.track.times) for one in flown)
+    times = flown[0].track.times[:n]
+    errors = np.array([one.track.errors[:n] for one in flown])
+    covariances = np.array([one.track.covariances[:n] for one in flown])
+    results = [consistency.judge(name, times, consistency.nees(errors[..., s], covariances[..., s, s]), s.stop - s.start)
                for name, s in GROUPS.items()]
-    results.append(consistency.judge("vio: pose", grid, np.array(vio_nees), 6))
-    results += _judge_target(sightings)
-    rmse = 100 * np.array(rmse)
+    grid = np.arange(flown[0].airborne, flown[0].end - 0.1, 1 / 30)
+    results.append(consistency.judge("vio: pose", grid, np.array([np.interp(grid, one.vio_times, one.vio_nees) for one in flown]), 6))
+    results += _judge_target([one.sightings for one in flown])
+    rmse = 100 * np.array([np.sqrt((one.track.errors[one.track.times >= one.perch_time, :3] ** 2).mean(axis=0)) for one in flown])
     summary = {"scenario": scenario_name, "runs": runs, "rmse_cm_median": np.median(rmse, axis=0).tolist(),
-               "rmse_cm_worst": rmse.max(axis=0).tolist(), "estimator_nis_over_6": float(np.concatenate(nis).mean() / 6),
-               "vio_nis_over_dimension": float(np.mean(vio_nis)),
+               "rmse_cm_worst": rmse.max(axis=0).tolist(),
+               "estimator_nis_over_6": float(np.concatenate([one.track.nis for one in flown]).mean() / 6),
+               "vio_nis_over_dimension": float(np.mean([one.vio_nis for one in flown])),
                "nees": {r.name: {"inside": r.inside, "above": r.above, "mean_over_dimension": float(r.mean.mean() / r.dimension)}
                         for r in results}}
     return results, summary
+
+
+def _fly(scenario_name: str, seed: int) -> _Run:
+    """One flight of `run`."""
+    cv2.setNumThreads(1)
+    scenario = load_scenario(scenario_name)
+    flight = flights.fly(scenario, seed)
+    steps = flights.run_vio(flight)
+    airborne = flight.motion.settings.ground + AIRBORNE_AFTER
+    track = flights.run_estimator(flight, steps, begin=airborne)
+    posed = [s for s in steps if s.error is not None]
+    seen = [s for s in posed if s.result.nis_dimension]
+    return _Run(track, flight.perch_time, airborne, flight.motion.duration, np.array([s.time for s in posed]),
+                np.array([consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed]),
+                sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen),
+                see_target(scenario, flight, track, seed, flight.perch_time + LOOK[0], flight.perch_time + LOOK[1]))
 
 
 def _judge_target(sightings: list[Sightings]) -> list[Consistency]:
@@ -87,7 +113,6 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--out", type=Path, default=Path("out/consistency"))
     arguments = parser.parse_args()
-    cv2.setNumThreads(1)
     results, summary = run(arguments.scenario, arguments.runs)
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "consistency.json").write_text(json.dumps(summary, indent=2))
