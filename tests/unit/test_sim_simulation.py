@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.scenario import Wind, load_scenario
+from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
+from perch_sim.body import make_body
 from perch_sim.drawing import Drawing, DrawnInProcesses, DrawnOnThreads
+from perch_sim.plant import resting_state
 from perch_sim.simulation import SECOND, Simulation
 from perch_sim.vio_model import VioModel, VioModelParameters
 
@@ -183,3 +186,12 @@ def test_a_slow_machine_gives_up_images_in_real_time_and_none_in_lockstep(limit,
     while flight.time < SECOND + 5 * SECOND // 30:  # five exposures
         flight.advance()
     assert camera.dropped == given_up
+
+
+@pytest.mark.parametrize("scenario, within", [("line_80", 1e-4), ("surface_90", 1.3e-3)])  # the snapdragon's felt gives way by 1.2 mm
+def test_a_vehicle_stands_as_high_as_its_file_says(scenario, within):
+    """The odometry starts from there, and takes its scale from the camera's height above the ground."""
+    scenario = load_scenario(scenario)
+    vehicle = load_vehicle(scenario.vehicle)
+    height = resting_state(scenario, make_body(vehicle))[2] - scenario.start.position[2]
+    assert height == pytest.approx(vehicle.standing_height, abs=within)

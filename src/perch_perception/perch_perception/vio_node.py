@@ -58,7 +58,7 @@ class VioNode(PerchNode[VioNodeConfig]):
             self.destroy_node()
             raise
         self._mount = vehicle.mounts[self.params.camera]
-        standing = np.array(self.params.start_position) + [0.0, 0.0, vehicle.perch_offset]
+        standing = np.array(self.params.start_position) + [0.0, 0.0, vehicle.standing_height]
         self._vio = VisualInertialOdometry(self.params, self._mount, standing, float(np.radians(self.params.start_yaw_deg)),
                                          float(self.params.start_position[2]))
         self._waiting: deque[Image] = deque()

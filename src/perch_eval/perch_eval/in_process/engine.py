@@ -87,7 +87,7 @@ class _Flight:
         if sensing.vio == "model":
             self.vio = ModelledVio(params.of("vio_model", VioModelParameters), down)
         else:
-            self.vio = RenderedVio(params.of("vio", VioNodeConfig), down, vehicle.perch_offset)
+            self.vio = RenderedVio(params.of("vio", VioNodeConfig), down, vehicle.standing_height)
         if powerline:
             self.target = LineSource(params.of("powerline_mapper", PowerlineMapperConfig), front)
         else:

@@ -50,8 +50,8 @@ class ModelledVio:
 class RenderedVio:
     """Mirrors `perch_perception.vio_node` on the images of the downward camera."""
 
-    def __init__(self, params: VioConfig, mount: CameraMount, perch_offset: float) -> None:
-        standing = np.array(params.start_position) + [0.0, 0.0, perch_offset]
+    def __init__(self, params: VioConfig, mount: CameraMount, standing_height: float) -> None:
+        standing = np.array(params.start_position) + [0.0, 0.0, standing_height]
         self._vio = VisualInertialOdometry(params, mount, standing, float(np.radians(params.start_yaw_deg)),
                                          float(params.start_position[2]))
         self._wire = Wire()
