@@ -24,7 +24,7 @@ class Flight:
         self.renderer, self.rng = renderer, np.random.default_rng(seed)
         self.drift = np.array([0.005, 0.005, 0.005]) * self.rng.standard_normal(3)
         self.turn = so3.exp(np.radians(0.2) * self.rng.standard_normal(3))
-        self.mapper = LineMapper(MapperConfig(radius=0.012))
+        self.mapper = LineMapper(MapperConfig(triangulation=TriangulationConfig(radius=0.012)))
         self.maps = []
 
     def fly(self, start, end, images):

@@ -133,6 +133,19 @@ def test_a_wire_is_as_near_as_it_is_wide():
     assert error[0.03] < 0.025 and found.radius == pytest.approx(0.03, rel=0.02), (error, found.radius)
 
 
+def test_a_wire_of_known_radius_needs_no_parallax():
+    """Seen from 3 m along 20 cm of motion across it."""
+    wire, error = WireCurve(np.array([4.0, 0.0, 2.0]), np.array([0.0, 1.0, 0.0])), {0.0: [], 0.01: []}
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        seen = [observe(rng, wire, np.array([1.0, 0.0, 1.5 + 0.02 * k]), 5e-4, time=0.1 * k, radius=0.03) for k in range(11)]
+        for sigma, errors in error.items():
+            found = triangulate(seen, TriangulationConfig(min_ratio=0.01, radius=0.0303, radius_sigma=sigma))
+            errors.append(float(np.linalg.norm((found.curve.point - wire.point)[[0, 2]])))
+    unknown, known = (float(np.median(errors)) for errors in error.values())
+    assert known < 0.05 and known < 0.5 * unknown, (known, unknown)
+
+
 def test_a_wire_that_comes_back_after_a_gap_is_taken_where_it_is_seen():
     """The odometry has drifted by 7 cm while the wire was out of sight; one look from 0.7 m, then another, put it right."""
     wire, rng = WireCurve(np.array([5.0, 0.0, 3.8]), np.array([0.0, 1.0, 0.0])), np.random.default_rng(6)

@@ -36,7 +36,6 @@ class MapperConfig:
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     straightness: float = config.quantity(0.02, unit="m", above=0.0, high=1.0,
                                           doc="a sagging wire is cut into chords that stay within this")
-    radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5, doc="radius of a wire too thin to be measured")
     rotation_sigma: float = config.quantity(0.29, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis, 1 sigma")
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
     association: AssociationConfig = config.part(AssociationConfig)
@@ -215,7 +214,7 @@ class LineMapper:
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
         # chords of a parabola leave it by their share of its sag; half of it once they are moved to its middle
         pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * self.settings.straightness)))))
-        radius = estimate.radius if np.isfinite(estimate.radius) else self.settings.radius
+        radius = estimate.radius if np.isfinite(estimate.radius) else self.settings.triangulation.radius
         lines = []
         for k in range(pieces):
             a, b = low + length * k / pieces, low + length * (k + 1) / pieces

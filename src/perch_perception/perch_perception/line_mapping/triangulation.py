@@ -45,6 +45,9 @@ class TriangulationConfig:
     mount_rotation: float = config.quantity(0.3, unit="deg", above=0.0, high=10.0,
                                             doc="error of the camera's attitude on the body, per axis, 1 sigma: the same in all sightings")
     width: float = config.quantity(0.01, above=0.0, high=1.0, doc="error of a wire's width in an image, beside that of its edges: share of it")
+    radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5,
+                                    doc="radius of the wires, where it is known; else of one too thin to be measured")
+    radius_sigma: float = config.quantity(0.0, low=0.0, high=1.0, doc="how well it is known, 1 sigma, as a share of it; 0: not at all")
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
                                  doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
 
@@ -67,7 +70,7 @@ class WireEstimate:
         ratio: sigma2/sigma1 of the baseline.
         used: sightings that agree with it, shape (n,).
         mount: error of the camera's attitude on the body that fits them best, in C [rad], shape (3,).
-        radius: of the wire [m]; nan where it was never wide enough in an image.
+        radius: of the wire [m]; nan where it is not known and was never wide enough in an image.
         time: of the last sighting: there the wire is where `curve` has it [s].
     """
 
@@ -129,7 +132,8 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     curve, mount = (line, np.zeros(3)) if before is None else (before.curve, before.mount)
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
-    size = _log_radius(curve, observations)  # their median anew: widths of crossing wires may have come first
+    # the median of all widths anew: those of crossing wires may have come first
+    size = _log_radius(curve, observations) if settings.radius_sigma == 0.0 else np.log(settings.radius)
     used = np.ones(len(observations), bool)
     drifted = _drifted(observations, settings)
     rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
@@ -146,7 +150,7 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
         information, gradient = _wandering(
             _normal_equations(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight),
-            _normal_equations(*_widths(curve, size, observations, settings, apart if known > 0.0 else apart + WIDTH_GATE**2), weight), walk, settings, curve.curvature, mount)
+            _normal_equations(*_widths(curve, size, observations, settings, apart if known > 0.0 else apart + WIDTH_GATE**2), weight), walk, settings, curve.curvature, mount, size)
         step = -np.linalg.solve(information, gradient)
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
@@ -177,7 +181,7 @@ def _normal_equations(residual, jacobian, weight):
     return np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian), np.einsum("n,nki,nk->ni", weight, jacobian, residual)
 
 
-def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
+def _wandering(by_rays, by_widths, walk, settings, curvature, mount, size):
     """Information (9, 9) and gradient (9,) of the wire where it is after the last sighting, of the camera's mount and the radius.
 
     A filter in information form from the oldest sighting to the newest: before each, the wire's two offsets lose what the
@@ -185,8 +189,9 @@ def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
     together they know the wire's place no better than that, however many they are.
     """
     parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
-    tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [1e-6]])
-    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [0.0]])
+    by_radius, misfit = (settings.radius_sigma**-2, size - np.log(settings.radius)) if settings.radius_sigma > 0.0 else (1e-6, 0.0)
+    tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [by_radius]])
+    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [misfit]])
     for part, slope, variance in zip(parts, slopes, walk):
         if variance > 0.0:
             a, b, c = information[0, 0] + 1.0 / variance, information[1, 1] + 1.0 / variance, information[0, 1]
