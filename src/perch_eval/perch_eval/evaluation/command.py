@@ -13,7 +13,7 @@ from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 
 EXAMPLES = """examples:
-  python3 scripts/evaluate.py                       --quick: both papers, 5 seeds a condition
+  python3 scripts/evaluate.py                       --quick: both papers, 5 seeds a condition, 1 on lines
   python3 scripts/evaluate.py --full --jobs 2       100 seeds, and what goes beyond the papers; interrupted, the same command goes on
   python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_flights, p_inspection,
                                                     p_cable, c_faults, c_comparison)
@@ -81,8 +81,8 @@ def parser() -> argparse.ArgumentParser:
     out = argparse.ArgumentParser(prog="evaluate.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     size = out.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="both papers, 5 seeds a condition (default)")
-    size.add_argument("--full", action="store_true", help="every part, 100 seeds a condition; resumable")
+    size.add_argument("--quick", action="store_true", help="both papers, 5 seeds a condition, 1 on lines (default)")
+    size.add_argument("--full", action="store_true", help="every part, 100 seeds a condition, 10 on lines; resumable")
     out.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")

@@ -135,16 +135,16 @@ def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, li
     results = Results(effort.state / f"line_flights_{digest[:12]}.sqlite", "line flights", digest, resume=True)
     try:
         tasks = []
-        for number, (seed, case) in enumerate((seed, case) for seed in range(1, effort.line_seeds + 1) for case in cases):
+        for number, (seed, case) in enumerate((seed, case) for seed in effort.seeds_on_lines for case in cases):
             mapping: dict[str, Any] = config.read_yaml(config.find("scenarios", case))
             tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, RENDERED))
         known = {r.number for r in results.all()}
         progress = Progress(len(tasks), len(known), what="line flights")
-        for result in in_pool([t for t in tasks if t.run.number not in known], 1):
+        for result in in_pool([t for t in tasks if t.run.number not in known], effort.jobs):
             results.add(result)
             progress.add(result.cause == SUCCESS)
         progress.close()
         found = results.all()
     finally:
         results.close()
-    return {case: [r for r in found if r.values["scenario"] == case and r.seed <= effort.line_seeds] for case in cases}
+    return {case: [r for r in found if r.values["scenario"] == case and r.seed in effort.seeds_on_lines] for case in cases}
