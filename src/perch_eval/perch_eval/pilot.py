@@ -18,9 +18,9 @@ from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from perch_core.errors import PerchError
+from perch_core.ros import qos
 from perch_core.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
@@ -84,9 +84,7 @@ class Pilot:
         self._interrupted, self._handler = False, None
         if threading.current_thread() is threading.main_thread():
             self._handler = signal.signal(signal.SIGINT, self._interrupt)
-        self._node.create_subscription(Step, "tick", self._receive_tick,
-                                       QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                                                  durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self._node.create_subscription(Step, "tick", self._receive_tick, qos.LATCHED)
 
     def _interrupt(self, *_: Any) -> None:
         self._interrupted = True

@@ -129,9 +129,8 @@ def as_sure_as(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
     Raises:
         CovarianceError: a covariance is not positive definite.
     """
-    R_WB = so3.quat_to_matrix(belief.x[at.QUATERNION])
     J = np.zeros((6, 6))
-    J[:3, :3], J[3:, 3:] = np.eye(3), R_WB.T
+    J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(belief.x[at.QUATERNION]).T
     P, T = belief.P.copy(), np.eye(at.ERROR_SIZE)
     if not update_kernels.as_sure_as(P, _POSE, J @ (pose.covariance + doubt) @ J.T, T):
         raise CovarianceError("covariance after an update is not positive definite")
