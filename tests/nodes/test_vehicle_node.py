@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,9 +9,7 @@ import sys
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
+from nodes.vehicle_flight import seen_steps, stamps
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.conversions import nanoseconds, odometry_arrays, pose_arrays
@@ -20,87 +17,8 @@ from perch_core.ros.lockstep import Participant
 from perch_core.scenario import load_scenario
 from perch_core.timing import TICK_STEPS
 from perch_core.vehicle import load_vehicle
-from perch_msgs.msg import Contact, MotorCommand, RotorState, Step
-from perch_sim import vehicle_node, vio_model_node
+from perch_msgs.msg import Contact, MotorCommand, Step
 from rclpy.experimental import EventsExecutor
-from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image, Imu
-
-HOVER = float(np.sqrt(load_vehicle("snapdragon").hover_thrust / 4 / load_vehicle("snapdragon").thrust_coefficient))
-TOPICS = {"imu/data_raw": Imu, "ground_truth/odometry": Odometry, "ground_truth/target": PoseStamped,
-          "rotor_state": RotorState, "contact": Contact, "step": Step, "/clock": Clock, "/diagnostics": DiagnosticArray,
-          "camera_front/image_raw": Image, "camera_front/camera_info": CameraInfo, "camera_down/camera_info": CameraInfo,
-          "vio/odometry": Odometry}
-
-
-class Flight:
-    """A vehicle, a scripted controller and an observer in one process, until a step."""
-
-    def __init__(self, domain: int, vio: bool = False, silent_after: int | None = None, **parameters):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.executor = EventsExecutor(context=self.context)
-        self.seen = {topic: [] for topic in TOPICS}
-        self.observer = rclpy.create_node("observer", context=self.context)
-        for topic, kind in TOPICS.items():
-            profile = qos.IMAGE if kind is Image else qos.LATCHED if topic == "ground_truth/target" else qos.CHAIN
-            if topic in ("/clock", "/diagnostics"):
-                profile = qos.STATUS
-            self.observer.create_subscription(kind, topic, self.seen[topic].append, profile)
-        self.controller = rclpy.create_node("controller", context=self.context)
-        self.commands = self.controller.create_publisher(MotorCommand, "motor_command", qos.CHAIN)
-        self.silent_after, self.answered = silent_after, 0
-        Participant(self.controller).chain(Imu, "imu/data_raw", self.answer)
-        parameters = {"cameras": "none", "participants": ["controller"] + ["vio_model"] * vio} | parameters
-        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-        self.nodes = [self.observer, self.controller]
-        if vio:
-            self.nodes.append(vio_model_node.create(context=self.context))
-        self.vehicle = vehicle_node.create(context=self.context, parameter_overrides=overrides)
-        for node in (*self.nodes, self.vehicle):
-            self.executor.add_node(node)
-
-    def answer(self, imu: Imu) -> None:
-        if self.silent_after is not None and self.answered >= self.silent_after:
-            return
-        self.answered += 1
-        msg = MotorCommand(armed=True, rotor_speed=[1.05 * HOVER] * 4)
-        msg.header.stamp = imu.header.stamp
-        self.commands.publish(msg)
-
-    def fly(self, steps: int) -> dict[str, list]:
-        for _ in range(200_000):
-            if min(len(self.seen["step"]), len(self.seen["ground_truth/odometry"])) >= steps:  # the step itself comes first
-                return self.seen
-            self.executor.spin_once(timeout_sec=0.05)
-        raise AssertionError(f"only {len(self.seen['step'])} of {steps} steps came")
-
-    def close(self) -> None:
-        if self.context.ok():
-            self.vehicle.close()
-            for node in (*self.nodes, self.vehicle):
-                self.executor.remove_node(node)
-                node.destroy_node()
-            self.executor.shutdown()
-            rclpy.shutdown(context=self.context)
-
-
-@pytest.fixture
-def flights(ros_domain):
-    opened = []
-
-    def start(**arguments) -> Flight:
-        opened.append(Flight(ros_domain, **arguments))
-        return opened[-1]
-
-    yield start
-    for flight in opened:
-        flight.close()
-
-
-def stamps(messages):
-    return np.array([nanoseconds(m.header.stamp) for m in messages])
 
 
 def test_publishes_every_topic_at_its_rate_and_flies_on_commands(flights):
@@ -129,85 +47,6 @@ def test_truth_gives_its_twist_in_the_body_frame(flights):
     v = np.array([odometry_arrays(m)[2] for m in seen])
     np.testing.assert_allclose((p[251] - p[249]) / 0.004, v[250], atol=2e-3)
     assert (seen[0].header.frame_id, seen[0].child_frame_id) == ("map", "base_link")
-
-
-def test_images_carry_pictures_with_the_stamps_of_their_camera_info(flights):
-    flight = flights(cameras="front")
-    seen = flight.fly(120)
-    images = seen["camera_front/image_raw"]
-    for _ in range(20_000):  # the flight may be two images ahead of those who draw
-        if len(images) >= 6:
-            break
-        flight.executor.spin_once(timeout_sec=0.02)
-    assert 6 <= len(images) <= 30.0 * 0.002 * len(seen["step"])
-    pixels = np.frombuffer(images[0].data, np.uint8).reshape(images[0].height, images[0].width)
-    assert (images[0].encoding, pixels.shape) == ("mono8", (480, 640)) and pixels.std() > 5.0
-    known = set(stamps(seen["camera_front/camera_info"]))
-    assert set(stamps(images)) <= known
-
-
-def test_the_first_step_waits_for_the_processes_that_draw(flights, monkeypatch):
-    """They take a second to start; a flight that begins before would stand still at its first image."""
-    drawn = []
-    monkeypatch.setattr(vehicle_node.DrawnInProcesses, "ready", lambda self: bool(drawn))
-    flight = flights()
-    for _ in range(100):
-        flight.executor.spin_once(timeout_sec=0.01)
-    assert not seen_steps(flight)
-    drawn.append(True)
-    flight.fly(20)
-
-
-def with_localizer(flights):
-    """A flight with front images and someone who reports each of them."""
-    flight = flights(cameras="front", participants=["controller", "target_localizer"])
-    node = rclpy.create_node("target_localizer", context=flight.context)
-    flight.nodes.append(node)
-    side = Participant(node, every=TICK_STEPS)
-    node.create_subscription(Image, "camera_front/image_raw", lambda msg: side.report(msg.header.stamp), qos.IMAGE)
-    flight.executor.add_node(node)
-    side.greet()
-    return flight
-
-
-def test_an_image_may_be_drawn_until_its_result_is_due(flights, monkeypatch):
-    """The flight goes on past the image's arrival, and stands still where the result would count."""
-    draw, finished = vehicle_node.DrawnInProcesses.draw, []
-
-    class Slow:
-        def __init__(self, image):
-            self.image = image
-
-        def done(self, timeout=0.0):
-            return bool(finished) and self.image.done(timeout)
-
-        def result(self):
-            return self.image.result()
-
-    monkeypatch.setattr(vehicle_node.DrawnInProcesses, "draw", lambda self, *order: Slow(draw(self, *order)))
-    flight = with_localizer(flights)
-    flight.fly(20)
-    stands = -1
-    while stands != len(seen_steps(flight)):  # one call handles one message
-        stands = len(seen_steps(flight))
-        for _ in range(300):
-            flight.executor.spin_once(timeout_sec=0.002)
-    assert not flight.seen["camera_front/image_raw"]
-    finished.append(True)
-    flight.fly(100)
-    frame = stamps(flight.seen["camera_front/image_raw"])[0]
-    exposed = frame - load_vehicle("snapdragon").mounts["front"].stamp_offset * 1e9
-    due = exposed + load_scenario("surface_90").latency.target_localizer * 1e9
-    assert abs(nanoseconds(seen_steps(flight)[stands].stamp) - due) < 8e6  # the board's offset is known to 4 ms
-
-
-def test_a_flight_goes_on_without_the_images_of_a_process_that_has_ended(flights, capfd):
-    flight = with_localizer(flights)
-    flight.fly(80)
-    os.kill(flight.vehicle._drawing.process_ids["front"], signal.SIGKILL)
-    seen = flight.fly(300)
-    assert len(seen["camera_front/camera_info"]) > len(seen["camera_front/image_raw"])
-    assert "the process that draws its images has ended" in capfd.readouterr().err
 
 
 def test_vio_stand_in_counts_forty_milliseconds_after_the_exposure(flights):
@@ -274,10 +113,6 @@ def test_the_flight_waits_for_the_first_report_of_a_participant_that_lives(fligh
         if len(seen_steps(flight)) >= 15:
             break
     assert len(seen_steps(flight)) == 15
-
-
-def seen_steps(flight):
-    return flight.seen["step"]
 
 
 def test_commands_that_are_no_numbers_are_refused(flights, capfd):
