@@ -9,7 +9,11 @@ from perch_core.ros.conversions import to_point, to_stamp
 from perch_core.ros.trajectories import sampled_message
 from perch_core.scenario import Cable, Mission, Scenario, World
 from perch_core.trajectory import SampledTrajectory
+from perch_eval.campaign.results import RunResult
+from perch_eval.evaluation import powerline_flights
+from perch_eval.evaluation.powerline import flown_sections
 from perch_eval.evaluation.powerline_flights import mapping_errors, perching_errors
+from perch_eval.evaluation.sections import FAILS, HOLDS, Effort
 from perch_eval.flight import Flight, States
 
 OFFSET, TILT = np.array([0.01, -0.02, 0.02]), np.radians(4.0)  # of the flown from the planned: 3 cm, 4 deg
@@ -86,3 +90,41 @@ def test_a_crash_on_the_way_is_no_error_at_the_perch():
     flight = Flown(12.8)
     flight._raw["contact"] = [(1.0, Contact(state=4)), (2.0, Contact(state=0)), (11.6, Contact(state=3))]
     assert set(perching_errors(flight, scenario(), 0.15).values()) == {None}
+
+
+def effort(tmp_path, seeds: int) -> Effort:
+    return Effort(full=True, jobs=1, out=tmp_path, state=tmp_path, line_seeds=seeds)
+
+
+def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):
+    handed = []
+
+    def pool(tasks, jobs):
+        for task in tasks:
+            handed.append(task)
+            yield RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values)
+
+    monkeypatch.setattr(powerline_flights, "in_pool", pool)
+    found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"), "digest")
+    assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
+        ("line_80_pa", True): [1, 2], ("line_80_pa", False): [], ("line_180", True): [1, 2], ("line_180", False): [1, 2]}
+    assert all(task.scenario.get("grip", {}).get("enabled", True) == task.run.values["grips"] for task in handed)
+    found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"), "digest")
+    assert [r.seed for r in found["line_180", False]] == [1, 2, 3] and [r.seed for r in found["line_180", True]] == [1, 2, 3, 4, 5]
+    assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
+
+
+@pytest.mark.parametrize("outcome, message, verdict", [("missed", "no adhesion; recovered to a hover", HOLDS),
+                                                       ("failed", "crashed: a cable in the rotors", FAILS)])
+def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outcome, message, verdict):
+    def pool(tasks, jobs):
+        for task in tasks:
+            end = ("perched", "perched", "") if task.run.values["grips"] else ("missed_pad", outcome, message)
+            yield RunResult(task.run.number, task.run.seed, *end, task.run.values, {"perching_position_m": 0.01, "perching_tilt_deg": 1.0})
+
+    monkeypatch.setattr(powerline_flights, "in_pool", pool)
+    [section] = flown_sections(effort(tmp_path, 1))
+    rows = {row.name: row for row in section.rows}
+    assert rows["180 deg, grip switched off: recoveries to a hover"].verdict == verdict
+    assert rows["180 deg: gripped the cable"].ours.startswith("1/1")
+    assert "80 deg, perception-aware, grip switched off: recoveries to a hover" not in rows

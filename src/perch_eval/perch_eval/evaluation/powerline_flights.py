@@ -26,6 +26,8 @@ from perch_sim.cable_contact import CableLine
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = {"vio": "rendered", "target": "rendered"}
+WITHOUT_GRIP = ("line_80", "line_20", "line_180")  # are flown with a gripper that never closes, too: all must recover
+SEEDS_WITHOUT_GRIP = 3
 AROUND = 1.5  # the map is judged within this of the target point [m]
 
 
@@ -129,22 +131,38 @@ def _distance(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     return float(np.linalg.norm(a + np.clip((p - a) @ along / (along @ along), 0.0, 1.0) * along - p))
 
 
-def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[str, list[RunResult]]:
-    """Flights of each case; finished ones of the same code are not flown again."""
+def recovered(run: RunResult) -> bool:
+    """Whether a flight that did not grip came to a hover."""
+    return run.outcome == "missed" and run.message.endswith("hover")
+
+
+def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[tuple[str, bool], list[RunResult]]:
+    """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
     effort.state.mkdir(parents=True, exist_ok=True)
     results = Results(effort.state / f"line_flights_{digest[:12]}.sqlite", "line flights", digest, resume=True)
     try:
         tasks = []
-        for number, (seed, case) in enumerate((seed, case) for seed in effort.seeds_on_lines for case in cases):
+        for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):
             mapping: dict[str, Any] = config.read_yaml(config.find("scenarios", case))
-            tasks.append(Task(Run(number, seed, {"scenario": case}), mapping, ENGINE, RENDERED))
+            if not grips:
+                mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
+            tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))
         known = {r.number for r in results.all()}
         progress = Progress(len(tasks), len(known), what="line flights")
         for result in in_pool([t for t in tasks if t.run.number not in known], effort.jobs):
             results.add(result)
-            progress.add(result.cause == SUCCESS)
+            progress.add(result.cause == SUCCESS if result.values["grips"] else recovered(result))
         progress.close()
-        found = results.all()
+        found = [r for r in results.all() if r.seed in effort.seeds_on_lines]
     finally:
         results.close()
-    return {case: [r for r in found if r.values["scenario"] == case and r.seed in effort.seeds_on_lines] for case in cases}
+    return {(case, grips): [r for r in found if r.values == {"scenario": case, "grips": grips}] for case in cases for grips in (True, False)}
+
+
+def _flown(seeds: range, cases: tuple[str, ...]) -> list[tuple[int, str, bool]]:
+    """Seed, case and whether the gripper works, of every flight: a flight keeps its number when seeds are added."""
+    flown = []
+    for seed in seeds:
+        flown += [(seed, case, True) for case in cases]
+        flown += [(seed, case, False) for case in cases if case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]
+    return flown
