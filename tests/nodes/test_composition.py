@@ -140,6 +140,23 @@ def test_what_leaves_waits_for_the_neighbours_unless_it_is_flushed(process):
     assert order == ["handled 1", "handled 2", "sent 1", "sent 2", "sent 3", "handled 3"]
 
 
+def test_what_has_time_is_done_when_the_neighbours_have_no_more_to_say(process):
+    order = []
+
+    def answer(number: int) -> None:
+        process.composition.later(lambda: order.append(f"after {number}"))
+        order.append(number)
+        if number < 3:
+            process.fast.publish(message(number + 1))
+
+    process.on_message = answer
+    process.fast.publish(message(1))
+    process.until(lambda: len(order) == 6)
+    assert order == [1, 2, 3, "after 1", "after 2", "after 3"]
+    process.composition.later(lambda: order.append("at once"))
+    assert order[-1] == "at once"
+
+
 def test_an_error_ends_the_program(process):
     def fail(number: int) -> None:
         raise ZeroDivisionError(f"message {number}")

@@ -38,6 +38,7 @@ from perch_core.vehicle import load_vehicle
 STATUS_STEPS = 10        # 50 Hz: the mission takes controller/status at every tenth step
 ESTIMATOR_STEPS = 50     # 10 Hz: estimator/status
 DIAGNOSTICS_STEPS = 500  # 1 Hz
+DIAGNOSTICS_PHASE = 333  # not with the status, nor with the estimator's diagnostics
 
 
 class ControllerNode(PerchNode[ControllerParameters]):
@@ -149,7 +150,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._unanswered = None
         self._receive_imu(data)
         stamp = stamp_of(data)
-        self._answer(stamp, self._flight.step_blind(seconds(stamp)))
+        self._answer(stamp, self._flight.step_blind(seconds(stamp)), blind=True)
 
     def _receive_odometry(self, data: bytes) -> None:
         begin = time.perf_counter()
@@ -158,13 +159,17 @@ class ControllerNode(PerchNode[ControllerParameters]):
         result = self._flight.step(seconds(stamp), (*p, *v, *q, *w))
         self._costs.append(time.perf_counter() - begin)
         self._answer(stamp, result)
-        if self._participant.lockstep is False:
-            self._deadlines.answered(stamp, time.monotonic_ns())
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
-    def _answer(self, stamp: int, result: StepResult) -> None:
+    def _answer(self, stamp: int, result: StepResult, blind: bool = False) -> None:
         self._motors.publish(self._command.fill(stamp, result.armed, result.rotor_speed))
+        if not blind and self._participant.lockstep is False:
+            self._deadlines.answered(stamp, time.monotonic_ns())
+        self._participant.later(lambda: self._show(stamp, result))
+
+    def _show(self, stamp: int, result: StepResult) -> None:
+        """Log and publish what people and the mission want to know of a step."""
         if result.event:
             self.get_logger().info(result.event)
         # In lockstep the vehicle counts steps; the same steps carry the status in every run.
@@ -174,7 +179,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
             self._publish_status(to_stamp(stamp))
         if result.setpoint is not None and index % self.params.controller.reference_period == 0:
             self._publish_reference(to_stamp(stamp), result)
-        if index % DIAGNOSTICS_STEPS == 0:
+        if index % DIAGNOSTICS_STEPS == DIAGNOSTICS_PHASE:
             self._publish_diagnostics(seconds(stamp))
         self._steps += 1
 

@@ -24,6 +24,7 @@ from perch_perception.ukf.odometry import covariances
 
 STATUS_PERIOD = 50       # steps: 10 Hz
 DIAGNOSTICS_PERIOD = 500  # steps: 1 Hz
+DIAGNOSTICS_PHASE = 167  # not with the status, nor with the controller's diagnostics
 
 
 class EstimatorNode(PerchNode[UkfConfig]):
@@ -48,7 +49,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, backlog=True)
 
     def _receive_vio(self, msg: Odometry) -> None:
-        """In real time the update, which takes a whole period, waits until the present sample has been answered."""
+        """In real time the update, which takes half a period, waits until the next sample's command has left, and the replay
+        until the one after that."""
         if self._participant.lockstep is False:
             self._unused_vio.append(msg)
         else:
@@ -63,9 +65,15 @@ class EstimatorNode(PerchNode[UkfConfig]):
             R_WB = so3.quat_to_matrix(q)
             velocity_covariance = R_WB @ np.array(msg.twist.covariance).reshape(6, 6)[:3, :3] @ R_WB.T
         v = v if msg.twist.covariance[0] >= 0 else None  # -1: no velocity in this message
-        self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance))
+        self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance),
+                                catch_up=self._participant.lockstep is not False)
         self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs.append(time.perf_counter() - begin)
+
+    def _catch_up(self) -> None:
+        begin = time.perf_counter()
+        self._estimator.catch_up()
+        self._update_costs[-1] += time.perf_counter() - begin
 
     def _receive_imu(self, data: bytes) -> None:
         sample = ImuSample(*read_imu(data))
@@ -77,12 +85,15 @@ class EstimatorNode(PerchNode[UkfConfig]):
         # a sample that was refused still gets its answer: the controller waits for this stamp
         self._publish(sample.stamp)
         if self._steps % STATUS_PERIOD == 0:
-            self._publish_status(sample.stamp)
-        if self._steps % DIAGNOSTICS_PERIOD == 0:
-            self._publish_costs(sample.stamp * 1e-9)
+            self._participant.later(lambda: self._publish_status(sample.stamp))
+        if self._steps % DIAGNOSTICS_PERIOD == DIAGNOSTICS_PHASE:
+            self._participant.later(lambda: self._publish_costs(sample.stamp * 1e-9))
         self._steps += 1
-        if self._unused_vio:
-            self._use_vio(self._unused_vio.popleft())
+        if self._estimator.behind:
+            self._participant.later(self._catch_up)
+        elif self._unused_vio:
+            msg = self._unused_vio.popleft()
+            self._participant.later(lambda: self._use_vio(msg))
 
     def _publish(self, stamp: int) -> None:
         estimate = self._estimator.estimate

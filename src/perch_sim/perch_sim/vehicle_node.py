@@ -232,20 +232,34 @@ class VehicleNode(PerchNode[VehicleParameters]):
                 else:
                     self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
             self._publish({})
-            self._publish_frames(frames)
+            if frames:
+                composition.later(lambda frames=frames: self._publish_frames(frames))
 
     # -- output ------------------------------------------------------------------------------------------------------
 
     def _publish(self, released: dict[str, int]) -> None:
-        """Publish this step and what it shows: first what the control loop waits for, which then works meanwhile."""
-        output, topics, index = self._output, self._topics, self._index
-        topics.publish_imu(output.time, output.imu)
-        self._steps.publish(self._step(released))
+        """Publish this step and what it shows: first what the control loop waits for, which in real time goes on before the rest."""
+        output, index = self._output, self._index
+        self._topics.publish_imu(output.time, output.imu)
+        self._steps.publish(self._step(output.time, index, released))
         self._published = time.perf_counter()
         self._released |= released
+        self._index, self._output = index + 1, None
+        self._times.count_step()
+        if self._watch is not None:
+            self._show(output, index)
+        else:
+            self._times.end("publishing")
+            composition.later(lambda: self._show(output, index))
+
+    def _show(self, output: Output, index: int) -> None:
+        """Publish the tick, the clock, and what has happened in a step."""
+        topics = self._topics
+        if self._watch is None:
+            self._times.end("waiting")
         if index % TICK_STEPS == 0:
             composition.flush()
-            self._ticks.publish(self._step(self._released))
+            self._ticks.publish(self._step(output.time, index, self._released))
             self._released = {}
         if index % CLOCK_STEPS == 0:
             topics.publish_clock(output.time)
@@ -259,8 +273,6 @@ class VehicleNode(PerchNode[VehicleParameters]):
         if index % ROTOR_STEPS == 0:
             plant = self._simulation.plant
             topics.publish_rotors(output.time, plant.rotor_speed, plant.rotor_thrust)
-        self._index, self._output = index + 1, None
-        self._times.count_step()
         self._times.end("publishing")
 
     def _publish_frames(self, frames: list[tuple[str, Delivery]]) -> None:
@@ -272,8 +284,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self._topics.cameras[name].publish(delivery.frame.stamp, delivery.image.result() if delivery.image else None)
         self._times.end("publishing")
 
-    def _step(self, released: dict[str, int]) -> bytes:
-        return write_step(StepReading(self._output.time, self._index, self._watch is not None, tuple(released.items())))
+    def _step(self, stamp: int, index: int, released: dict[str, int]) -> bytes:
+        return write_step(StepReading(stamp, index, self._watch is not None, tuple(released.items())))
 
     def _log_contact(self, event: Any) -> None:
         self.get_logger().info(f"t = {event.time:.3f} s: {event.body}: {event.state.name.lower()}"

@@ -67,6 +67,7 @@ class Composition:
         self._subscriptions: list[tuple[str, Receive, Callable[[], Any]]] = []
         self._messages: deque[tuple[Receive, bytes]] = deque()  # the one under way is the first
         self._leaving: list[tuple[Publisher, bytes]] = []
+        self._later: list[Callable[[], None]] = []
         self._executor: EventsExecutor | None = None
 
     # -- wiring ------------------------------------------------------------------------------------------------------
@@ -122,6 +123,13 @@ class Composition:
         for publisher, data in leaving:
             publisher.publish(data)
 
+    def later(self, work: Callable[[], None]) -> None:
+        """Do what nobody waits for: when the neighbours have no more to say to each other, and at once where none speaks."""
+        if self._messages:
+            self._later.append(work)
+        else:
+            work()
+
     def _send(self, publisher: Publisher, data: bytes) -> None:
         """Send a message to other processes: at once, or when the neighbours have no more to say to each other."""
         if self._messages:
@@ -145,7 +153,7 @@ class Composition:
             next(iter(self._executor.get_nodes())).create_timer(0.0, fail, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _hand_on_burst(self) -> None:
-        """Hand on waiting messages in the order in which they were published, and those that follow from them."""
+        """Hand on waiting messages in the order in which they were published, and those that follow from them; then what has time."""
         messages = self._messages
         for _ in range(BURST):
             receive, data = messages[0]
@@ -158,6 +166,10 @@ class Composition:
         else:
             self._executor.create_task(self._hand_on)
         self.flush()
+        if not messages:
+            later, self._later = self._later, []
+            for work in later:
+                work()
 
 
 composition = Composition()

@@ -156,6 +156,14 @@ class Participant:
             node=self._node.get_name(), trigger=to_stamp(trigger) if isinstance(trigger, int) else trigger,
             published=[Release(topic=p.topic, count=p.count) for p in self._publishers]))
 
+    def later(self, work: Callable[[], None]) -> None:
+        """Do what the control loop does not wait for: in real time after the step's command, in lockstep at once, as it belongs
+        to the step."""
+        if self.lockstep is False:
+            composition.later(work)
+        else:
+            work()
+
     def _repeat_greeting(self) -> None:
         if self.lockstep is None:
             self.report(Time())

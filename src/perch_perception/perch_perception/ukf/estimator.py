@@ -39,6 +39,7 @@ class Estimator:
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
         self._lag = 0
+        self._behind = False  # the live state does not go on from the base yet
         self._waiting: list[VioPose] = []
         self._refused_in_row = 0
         self._accepted = self._rejected = 0
@@ -64,12 +65,17 @@ class Estimator:
             self.add_vio(self._waiting.pop(0))
         return outcome
 
-    def add_vio(self, pose: VioPose) -> VioOutcome:
-        """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done."""
+    def add_vio(self, pose: VioPose, catch_up: bool = True) -> VioOutcome:
+        """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done.
+
+        Without `catch_up` the replay is left to the method of that name: half of the work, for who has to be on time.
+        """
         outcome = pose.problem() or self._timing(pose)
         if outcome is None:
             try:
                 outcome = self._apply(pose) if self._base is not None else self._begin(pose)
+                if catch_up or self._live is None:
+                    self._catch_up()
             except CovarianceError as error:
                 self._break(str(error))
                 return VioOutcome.GATED
@@ -80,6 +86,18 @@ class Estimator:
         if outcome not in (VioOutcome.APPLIED, VioOutcome.WAITING):
             self._message = f"VIO pose at {pose.stamp} ns {outcome.value}"
         return outcome
+
+    @property
+    def behind(self) -> bool:
+        """Whether a VIO pose has been applied whose replay is still to be done."""
+        return self._behind
+
+    def catch_up(self) -> None:
+        """Replay the IMU since the last VIO pose, if that is still to be done."""
+        try:
+            self._catch_up()
+        except CovarianceError as error:
+            self._break(str(error))
 
     @property
     def estimate(self) -> Estimate | None:
@@ -188,11 +206,16 @@ class Estimator:
         return dataclasses.replace(prior, P=prior.P + np.diag(extra))
 
     def _settle(self, belief: Belief, pose: VioPose) -> None:
-        """Make a belief at a pose's stamp the new base, and bring the live state up to now."""
+        """Make a belief at a pose's stamp the new base, which the live state is to catch up with."""
         self._base, self._covariance, self._refused_in_row = belief, pose.covariance, 0
-        now = self._imu.last.stamp
-        self._live = self._transform.predict(belief, self._imu.run(belief.stamp, now), now)
-        self._x, self._lag, self._anchors = self._live.x.copy(), 0, [belief]
+        self._anchors, self._behind = [belief], True
+
+    def _catch_up(self) -> None:
+        """Bring the live state from the base up to now, where that is still to be done."""
+        if self._behind:
+            now = self._imu.last.stamp
+            self._live = self._transform.predict(self._base, self._imu.run(self._base.stamp, now), now)
+            self._x, self._lag, self._behind = self._live.x.copy(), 0, False
 
     def _refresh(self) -> None:
         """Bring the published covariance up to now, and keep a belief from which the kept IMU steps can be replayed."""
@@ -213,5 +236,5 @@ class Estimator:
     def _break(self, why: str) -> None:
         """Start again with the next VIO pose."""
         self._base = self._live = self._covariance = None
-        self._anchors = []
+        self._anchors, self._behind = [], False
         self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"
