@@ -22,3 +22,10 @@ def test_reservations_differ_and_end(tmp_path):
 def test_domains_keep_below_the_ephemeral_ports():
     # DDS: port = 7400 + 250 * domain + 2 * participant + offset; Linux hands out ports from 32768 on
     assert 7400 + 250 * max(USABLE) + 250 <= 32_900 and min(USABLE) > 0
+
+
+def test_a_process_does_not_use_a_domain_twice_in_a_row():
+    with reserved_domain() as first:
+        pass
+    with reserved_domain() as second:
+        assert second != first

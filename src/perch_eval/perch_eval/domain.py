@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import fcntl
+import itertools
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -14,6 +15,7 @@ from perch_core.errors import PerchError
 
 USABLE = range(43, 102)
 """Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
+_reservations = itertools.count()
 
 
 @contextlib.contextmanager
@@ -50,6 +52,7 @@ def free_domain() -> int:
 
 
 def _spread() -> list[int]:
-    """The usable ids, from another one on in each process: people who choose by hand begin with the small ones."""
-    start = os.getpid() % len(USABLE)
+    """The usable ids, from another one on in each process: people who choose by hand begin with the small ones. And from another
+    one on each time: nodes that have been destroyed are in the graph for a while."""
+    start = (os.getpid() + next(_reservations)) % len(USABLE)
     return [*USABLE[start:], *USABLE[:start]]
