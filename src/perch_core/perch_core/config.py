@@ -22,6 +22,7 @@ import yaml
 from perch_core.errors import ConfigError
 
 T = TypeVar("T")
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's, where there is one, is ten times as fast
 
 
 def quantity(default: Any = MISSING, *, unit: str = "", low: float | None = None, high: float | None = None,
@@ -157,7 +158,7 @@ def read_yaml(path: Path | str) -> Any:
         ConfigError: the file is missing or is not YAML.
     """
     try:
-        return yaml.safe_load(Path(path).read_text())
+        return yaml.load(Path(path).read_text(), _LOADER)
     except OSError as error:
         raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from None
     except yaml.YAMLError as error:

@@ -96,7 +96,7 @@ class Renderer:
         (p0, R0), (p1, R1) = (self.mount.pose(*pose) for pose in (poses[0], poses[-1]))
         depth = np.maximum(np.abs((self._faces.centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
         turn = 2.0 * np.arcsin(min(np.linalg.norm(R1 - R0) / np.sqrt(8.0), 1.0))
-        motion = self.mount.camera.fx * (turn + np.linalg.norm(p1 - p0) / np.median(np.sort(depth)[:3]))
+        motion = self.mount.camera.fx * (turn + np.linalg.norm(p1 - p0) / np.sort(depth)[1])  # the second nearest
         return int(np.clip(np.ceil(motion / BLUR_STEP), 1, MAX_SUBFRAMES))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
@@ -12,6 +14,7 @@ SCALES = (0.007, 0.025, 0.09, 0.35)  # sizes of the blobs [m]: some are trackabl
 WEIGHTS = (0.8, 1.0, 1.0, 0.8)
 EDGE = np.clip(np.rint(128 + 100 * np.tanh((np.arange(256) - 128) / 22.0)), 0, 255).astype(np.uint8)  # blobs get edges
 WHITE, BLACK, VELCRO = 235, 20, 45  # paper, ink, hook-and-loop tape
+OVERSAMPLING = 4  # of what is printed, in each direction: edges that fall between texels get their share of both
 
 
 def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast: float) -> np.ndarray:
@@ -53,13 +56,24 @@ def pad(board: TagBoard, texel: float, rng: np.random.Generator) -> np.ndarray:
     Returns:
         uint8, shape (rows, cols): rows run along -s1, columns along -s2.
     """
-    oversampling = 4  # edges that fall between texels get their share of both
-    extent = np.array(board.pad_size)
-    rows, cols = np.maximum(np.rint(extent / texel).astype(int), 8)
+    rows, cols = np.maximum(np.rint(np.array(board.pad_size) / texel).astype(int), 8)
     fleece = cv2.GaussianBlur(rng.normal(0, 60, (rows, cols)).astype(np.float32), (0, 0), 4.0)
-    image = np.clip(VELCRO + fleece, 0, 255).astype(np.uint8)
-    image = cv2.resize(image, (cols * oversampling, rows * oversampling), interpolation=cv2.INTER_NEAREST)
-    scale = np.array([cols, rows]) * oversampling / extent[::-1]  # texels per metre along u and v
+    velcro = np.clip(VELCRO + fleece, 0, 255).astype(np.uint8)
+    printed, bare = _print(board, int(rows), int(cols))
+    return np.rint((printed + bare * velcro) / np.float32(OVERSAMPLING**2)).astype(np.uint8)
+
+
+@lru_cache(maxsize=4)
+def _print(board: TagBoard, rows: int, cols: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the tags put on a pad, the same in every flight.
+
+    Returns:
+        Grey levels summed over the samples of each texel that tags cover, and the number of those that they leave bare,
+        uint16 (rows, cols).
+    """
+    extent, shape = np.array(board.pad_size), (rows * OVERSAMPLING, cols * OVERSAMPLING)
+    image, bare = np.zeros(shape, np.uint8), np.ones(shape, np.uint8)
+    scale = np.array(shape[::-1]) / extent[::-1]  # samples per metre along u and v
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     for tag, corners_S in zip(board.tags, board.corners_S):
         marker = cv2.aruco.generateImageMarker(dictionary, tag.id, 8)  # one texel per module
@@ -68,7 +82,8 @@ def pad(board: TagBoard, texel: float, rng: np.random.Generator) -> np.ndarray:
         corners = ((extent[::-1] / 2 - corners_S[:, [1, 0]]) * scale - 0.5).astype(np.float32)
         black_border = np.array([[0.5, 0.5], [8.5, 0.5], [8.5, 8.5], [0.5, 8.5]], np.float32)
         warp = cv2.getPerspectiveTransform(black_border, corners)
-        size = image.shape[::-1]
-        mask = cv2.warpPerspective(np.full_like(print_, 255), warp, size, flags=cv2.INTER_NEAREST)
-        cv2.copyTo(cv2.warpPerspective(print_, warp, size, flags=cv2.INTER_NEAREST), mask, image)
-    return cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)
+        mask = cv2.warpPerspective(np.full_like(print_, 255), warp, shape[::-1], flags=cv2.INTER_NEAREST)
+        cv2.copyTo(cv2.warpPerspective(print_, warp, shape[::-1], flags=cv2.INTER_NEAREST), mask, image)
+        bare[mask > 0] = 0
+    return tuple(sum(samples[a::OVERSAMPLING, b::OVERSAMPLING].astype(np.uint16)
+                     for a in range(OVERSAMPLING) for b in range(OVERSAMPLING)) for samples in (image, bare))
