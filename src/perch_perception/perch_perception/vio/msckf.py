@@ -271,38 +271,37 @@ class Msckf:
         place = {c.frame: j for j, c in enumerate(s.clones)}
         R, p = s.window()
         R_first, p_first = s.first_window()
-        centres, R_WC = p + R @ s.p_BC, R @ s.R_BC
-        found, which = [], []
-        for number, track in enumerate(tracks):
-            seen = [k for k, f in enumerate(track.frames) if f in place]
-            if len(seen) < 4:
-                continue
-            js = np.array([place[track.frames[k]] for k in seen])
-            bearings = track.bearings(seen)
-            rays = np.einsum("nij,nj->ni", R_WC[js], corrected(bearings, s.focal))
-            X = triangulate(centres[js], rays, np.radians(limits.least_parallax_deg), self.sliding.spread(bearings.b_C))
-            if X is not None:
-                found.append((X, js, bearings))
-                which.append(number)
+        seen = [[k for k, f in enumerate(track.frames) if f in place] for track in tracks]
+        chosen = [(n, track, ks) for n, (track, ks) in enumerate(zip(tracks, seen)) if len(ks) >= 4]
         out: list[tuple | None] = [None] * len(tracks)
-        if not found:
+        if not chosen:
             return out
-        js = np.concatenate([f[1] for f in found])
-        X = np.repeat(np.array([f[0] for f in found]), [len(f[1]) for f in found], axis=0)
-        bearings = Bearings(np.concatenate([f[2].b_C for f in found]), np.concatenate([f[2].by_focal for f in found]))
+        js = np.array([place[track.frames[k]] for _, track, ks in chosen for k in ks])
+        bearings = Bearings(np.array([track.b_C[k] for _, track, ks in chosen for k in ks]),
+                            np.array([track.by_focal[k] for _, track, ks in chosen for k in ks]))
+        centres = (p + R @ s.p_BC)[js]
+        rays = np.einsum("nij,nj->ni", (R @ s.R_BC)[js], corrected(bearings, s.focal))
+        X, parts, begin = np.zeros((len(js), 3)), [], 0
+        for number, _, ks in chosen:
+            rows = slice(begin, begin + len(ks))
+            begin = rows.stop
+            X_W = triangulate(centres[rows], rays[rows], np.radians(limits.least_parallax_deg), self.sliding.spread(bearings.b_C[rows]))
+            if X_W is not None:
+                X[rows] = X_W
+                parts.append((number, X_W, rows))
+        if not parts:
+            return out
         now = self._residuals(R[js], p[js], X, bearings)
         first = self._residuals(R_first[js], p_first[js], X, bearings)
-        begin = 0
-        for number, (X_W, js, _) in zip(which, found):
-            m, rows = len(js), slice(begin, begin + len(js))
-            J = first.J[rows]
+        walk = self.sliding.steps(bearings.b_C[:-1], bearings.b_C[1:], now.distance[:-1], now.distance[1:])
+        for number, X_W, rows in parts:
+            m = rows.stop - rows.start
             A = np.zeros((m, 2, 8 + at.CLONE_SIZE * len(s.clones) + 4))
-            A[:, :, :8] = J[:, :, :8]
-            A[:, :, 8:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js] = J[:, :, 8:14]
-            A[:, :, -4:-1], A[:, :, -1] = J[:, :, POINT], now.r[rows]
-            A = self.sliding.whitened(bearings.b_C[rows], now.distance[rows], A.reshape(m, -1)).reshape(2 * m, -1)
+            A[:, :, :8] = first.J[rows, :, :8]
+            A[:, :, 8:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = first.J[rows, :, 8:14]
+            A[:, :, -4:-1], A[:, :, -1] = first.J[rows, :, POINT], now.r[rows]
+            A = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1)).reshape(2 * m, -1)
             out[number] = X_W, A[:, :-4], A[:, -4:-1], A[:, -1]
-            begin += m
         return out
 
     def _window_columns(self) -> np.ndarray:

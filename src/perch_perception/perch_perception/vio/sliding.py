@@ -12,7 +12,7 @@ observations get the covariance sigma^2 I + walk, counted back from the last one
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import lapack
 
 from perch_perception.vio.config import FilterConfig
 
@@ -49,18 +49,19 @@ class Sliding:
         q = self.steps(b_before, b_now, d_before, d_now) * d_now**2
         return q[:, None, None] * (np.eye(3) - u[:, :, None] * u[:, None, :])
 
-    def whitened(self, b_C: np.ndarray, distance: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def whitened(self, steps: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Rows of one track's observations, transformed so that their noise is white with the variance sigma^2.
 
         Args:
-            b_C: bearings of the track, shape (m, 3).
-            distance: from the camera [m], shape (m,).
+            steps: variance of the walk between neighbouring observations, see `steps` [rad^2], shape (m - 1,).
             rows: one row for each observation, shape (m, k).
         """
-        q = self.steps(b_C[:-1], b_C[1:], distance[:-1], distance[1:]) / self._sigma**2
-        to_end = np.concatenate([np.cumsum(q[::-1])[::-1], [0.0]])
-        factor = np.linalg.cholesky(np.eye(len(b_C)) + np.minimum(to_end[:, None], to_end))
-        return solve_triangular(factor, rows, lower=True, check_finite=False)
+        to_end = np.zeros(len(rows))
+        to_end[-2::-1] = np.cumsum(steps[::-1] / self._sigma**2)
+        covariance = np.minimum(to_end[:, None], to_end)
+        covariance.flat[:: len(rows) + 1] += 1.0
+        factor, _ = lapack.dpotrf(covariance, lower=1, clean=0)
+        return lapack.dtrtrs(factor, rows, lower=1)[0]
 
     def spread(self, b_C: np.ndarray) -> float:
         """1 sigma of a track's bearings (m, 3) about one point [rad], as far as the bearings tell."""
