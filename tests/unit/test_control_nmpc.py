@@ -19,11 +19,13 @@ from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import StageLayout, stage
 from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
 from perch_control.reference import FlatReference, SampledReference
+from perch_control.rotor_lag import approached, lag_behind, leading_command
 from perch_control.settings import GeometricGains
 from perch_core import rigid_body, so3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
 from perch_core.scenario import load_scenario
+from perch_core.timing import CONTROL_PERIOD
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
@@ -57,17 +59,17 @@ def test_dynamics_of_a_stage_are_the_rigid_bodys(states):
     z[states + 4 + 17:states + 4 + 23] = rng.normal(size=6) * 0.5
     following = np.array(stage(SNAPDRAGON, step, layout)(z)[0]).ravel()
     p, R, v, w = z[0:3], Rotation.from_quat(z[3:7]), z[7:10], z[10:13]
-    u, d = z[states:states + 4], z[states + 21:states + 27]
+    u, change, d = z[states:states + 4], z[states + 17:states + 21], z[states + 21:states + 27]
     n = 4000
     for k in range(n):
         h = step / n
-        f = z[13:17] + u * step * (k + 0.5) / n if states == 17 else u
+        f = z[13:17] + u * step * (k + 0.5) / n if states == 17 else u + change * (k + 0.5) / n
         drag = -np.array(SNAPDRAGON.drag) * R.inv().apply(v)
         a, dw = rigid_body.accelerations(SNAPDRAGON, R.as_matrix(), w, f, drag)
         a, dw = a + d[:3], dw + d[3:]
         p, v, R, w = p + v * h + a * h * h / 2, v + a * h, R * Rotation.from_rotvec((w + dw * h / 2) * h), w + dw * h
-    np.testing.assert_allclose(following[0:3], p, atol=1e-4)
-    np.testing.assert_allclose(following[7:10], v, atol=2e-3)
+    np.testing.assert_allclose(following[0:3], p, atol=2e-4)  # of a thrust that changes by its own size
+    np.testing.assert_allclose(following[7:10], v, atol=5e-3)
     np.testing.assert_allclose(following[10:13], w, atol=1e-2)
     q = following[3:7] / np.linalg.norm(following[3:7])
     assert (Rotation.from_quat(q).inv() * R).magnitude() < 1e-3
@@ -125,11 +127,13 @@ def test_a_reference_keeps_the_attitude_that_it_carries():
 
 
 def test_a_powerline_perch_in_closed_loop_stops_its_rotation_at_the_wire():
-    """With the weights of the scenario and the true state: within what the paper flew, 6.9 cm and 3.0 deg with an optical tracking
-    system; the moment that stops 4.9 rad/s acts within the last 60 ms."""
+    """With the weights and margins of the scenario and the true state: a fraction of what the paper flew, 6.9 cm and 3.0 deg with an
+    optical tracking system; the moment that stops 4.9 rad/s acts within the last 60 ms."""
     settings = load_scenario("line_180").parameters["controller"]
     law = predictive(RPG, **{key.removeprefix("nmpc."): tuple(v) if isinstance(v, list) else v for key, v in settings.items() if key.startswith("nmpc.")})
-    planned = problem.plan(problem.load("powerline_line_180"))
+    kept = load_scenario("line_180").parameters["powerline_planner"]["margins.thrust"]
+    setup = problem.load("powerline_line_180")
+    planned = problem.plan(replace(setup, settings=replace(setup.settings, margins=replace(setup.settings.margins, thrust=kept))))
     loop = make_loop(RPG, law=law)
     loop.begin_in_hover(planned.request.start[:3])
     plan = planned.plan
@@ -139,7 +143,22 @@ def test_a_powerline_perch_in_closed_loop_stops_its_rotation_at_the_wire():
     loop.run(0.04 + plan.perch.duration)
     off = np.linalg.norm(loop.plant.p - plan.perch.states[-1, :3])
     tilt = np.degrees(so3.angle_between(so3.quat_to_matrix(loop.plant.state[6:10])[:, 2], np.array([0.0, 0.0, -1.0])))
-    assert off < 0.5 * 0.069 and tilt < 3.0, (off, tilt)
+    assert off < 0.01 and tilt < 1.5, (off, tilt)
+
+
+@pytest.mark.parametrize("vehicle", [SNAPDRAGON, RPG])
+def test_rotors_that_are_led_anew_in_every_period_are_late_by_less_than_the_lead(vehicle):
+    """The lag model, run on its own, under thrusts that the rotors' speeds can follow at a steady rate."""
+    tau, lead, rate, speed = vehicle.motor_time_constant, 0.02, 1000.0, (800.0,) * 4
+    share, step = 1.0 - np.exp(-lead / tau), 1.0 - np.exp(-CONTROL_PERIOD / tau)
+    for k in range(100):
+        wanted = 800.0 + rate * k * CONTROL_PERIOD
+        thrust = (vehicle.thrust_coefficient * wanted**2,) * 4
+        command = leading_command(speed, thrust, vehicle.thrust_coefficient, share, vehicle.speed_min, vehicle.speed_max)
+        behind = (wanted - speed[0]) / rate
+        speed = approached(speed, command, step)
+    assert behind == pytest.approx(lag_behind(tau, lead, CONTROL_PERIOD), rel=1e-3) and behind < lead
+    assert lag_behind(0.0, lead, CONTROL_PERIOD) == CONTROL_PERIOD, "without a lag: what is commanded now"
 
 
 def test_perch_with_estimation_errors():

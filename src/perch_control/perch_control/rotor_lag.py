@@ -56,6 +56,17 @@ def leading_command(speed, thrust, coefficient, share, speed_min, speed_max):
     )
 
 
+def lag_behind(time_constant: float, lead: float, period: float) -> float:
+    """How late rotors follow wanted speeds that change steadily, where every period brings a new `leading_command` [s].
+
+    Such rotors go the share a = (1 - exp(-period / tau)) / (1 - exp(-lead / tau)) of the way in each period, and are period / a behind:
+    less than `lead`, which is when they would get there if the command stayed.
+    """
+    if time_constant <= 0.0:
+        return period
+    return period * (1.0 - exp(-lead / time_constant)) / (1.0 - exp(-period / time_constant))
+
+
 @dataclass(frozen=True)
 class RotorEstimate:
     """Rotor speeds as the controller believes them to be: the lag model run on its own commands, or the measured ones.

@@ -15,7 +15,7 @@ from perch_core.jit import compiled
 
 
 @compiled
-def begin(state, speed, command, compensation, lead, vehicle, R, X, U, start, target, z):
+def begin(state, speed, command, compensation, lead, vehicle, R, ramps, X, U, start, target, z):
     """Initial state of the horizon, and the arguments of the linearisation.
 
     With 13 states it is predicted to where the rotors have answered; with 17 it is the present one with the present thrusts.
@@ -24,9 +24,10 @@ def begin(state, speed, command, compensation, lead, vehicle, R, X, U, start, ta
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B now, 13 floats.
         speed, command: rotor speeds now and what they are following [rad/s], 4 floats each.
         compensation: what makes up for disturbances, 6 floats.
-        lead: [s].
+        lead: from now to there [s].
         vehicle: constants (see `packed_vehicle`).
         R: reference of the nodes, shape (N + 1, 17).
+        ramps: the inputs change over their intervals as the reference's thrusts do; 13 states alone.
         X, U: iterate, shapes (N + 1, n), (N, 4); its quaternions are brought to the side of the state's.
         start: result: the initial state, shape (n,).
         target: result: what the inputs' cost is measured from, shape (N, 4); stays zero for 17 states.
@@ -61,6 +62,9 @@ def begin(state, speed, command, compensation, lead, vehicle, R, X, U, start, ta
                     target[k, a] = R[k, 13 + a]
         for i in range(REFERENCE):
             z[k, n + INPUTS + i] = R[k, i]
+        if n == 13:
+            for i in range(13, REFERENCE):
+                z[k, n + INPUTS + i] = R[k + 1, i] - R[k, i] if ramps and k < nodes - 1 else 0.0
         for i in range(DISTURBANCE):
             z[k, n + INPUTS + REFERENCE + i] = -compensation[i]
 

@@ -1,7 +1,7 @@
 """One stage of the predictive controller as a CasADi function: dynamics, their Jacobians, Gauss-Newton cost. [P:VI, P:eq1]
 
-With 13 states the rotor thrusts are the inputs, held over the interval; with 17 they are states and their rates are the
-inputs (`perch_core.rotor_model`). To the rotor model come rotor drag and a constant disturbance (force and moment, from
+With 13 states the rotor thrusts are the inputs: an input is that at the node, and may change over the interval as the reference's
+thrusts do; with 17 they are states and their rates are the inputs (`perch_core.rotor_model`). To the rotor model come rotor drag and a constant disturbance (force and moment, from
 the L1 augmentation). The optional line terms are those of the powerline planner (`perch_core.lines`).
 """
 
@@ -18,7 +18,7 @@ from perch_core.so3 import quat_from_matrix
 from perch_core.vehicle import Vehicle
 
 INPUTS = 4
-REFERENCE = 17      # p, q, v, w and rotor thrusts wanted at the node
+REFERENCE = 17      # p, q, v, w wanted at the node, and rotor thrusts there (17 states) or their change to the next node (13)
 DISTURBANCE = 6     # acceleration in W [m/s^2], angular acceleration in B [rad/s^2]
 WEIGHTS = 13        # position 3, velocity 3, attitude 3, rate 3, thrust
 LINE = 8            # centre 3, direction 3, half length, radius
@@ -53,13 +53,14 @@ def _rate(model: RotorModel, drag: Vector, x: Vector, u: Vector, disturbance: Ve
 
 
 def _rk4(f, x: Vector, step: float) -> Vector:
+    """One step of x' = f(x, share of the step)."""
     def moved(k: Vector, h: float) -> Vector:
         return tuple(a + h * b for a, b in zip(x, k, strict=True))
 
-    k1 = f(x)
-    k2 = f(moved(k1, step / 2))
-    k3 = f(moved(k2, step / 2))
-    k4 = f(moved(k3, step))
+    k1 = f(x, 0.0)
+    k2 = f(moved(k1, step / 2), 0.5)
+    k3 = f(moved(k2, step / 2), 0.5)
+    k4 = f(moved(k3, step), 1.0)
     return tuple(a + step / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in zip(x, k1, k2, k3, k4, strict=True))
 
 
@@ -130,7 +131,12 @@ def stage(vehicle: Vehicle, step: float, layout: StageLayout) -> ca.Function:
     x, u, reference, disturbance, weights, line_parameters = parts
     model, thrust_states = RotorModel.of(vehicle), n == STATES
     drag = tuple(float(d) for d in vehicle.drag)
-    following = ca.vertcat(*_rk4(lambda s: _rate(model, drag, s, u, disturbance, thrust_states), x, step))
+    change = (0.0,) * INPUTS if thrust_states else reference[13:17]
+
+    def rate(s: Vector, share: float) -> Vector:
+        return _rate(model, drag, s, tuple(a + share * b for a, b in zip(u, change, strict=True)), disturbance, thrust_states)
+
+    following = ca.vertcat(*_rk4(rate, x, step))
     w = tuple(ca.sqrt(value) for value in weights)
     residuals = [w[i] * (x[i] - reference[i]) for i in range(3)]
     residuals += [w[3 + i] * (x[7 + i] - reference[7 + i]) for i in range(3)]
