@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import binomtest, kstest
@@ -10,10 +11,11 @@ from perch_core.errors import ConfigError
 from perch_core.scenario import Adhesion
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.distributions import parse
+from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.figures import Axis
 from perch_eval.campaign.ranking import worst
 from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results
-from perch_eval.campaign.specification import load_campaign, scenario_of
+from perch_eval.campaign.specification import Run, load_campaign, scenario_of
 from perch_eval.statistics import Rate, Spread
 from perch_sim.contact_event import ContactEvent, ContactState
 
@@ -162,3 +164,13 @@ def test_spread_leaves_out_what_is_no_number():
     spread = Spread.of([3.0, None, 1.0, float("nan"), 2.0])
     assert (spread.median, spread.low, spread.high, spread.count) == (2.0, 1.0, 3.0, 3)
     assert Spread.of([]).words() == "-"
+
+
+def test_a_run_leaves_the_other_cores_to_other_runs():
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(2)
+        result = carry_out(Task(Run(0, 1, {}), {}, "no_such_engine", {}))
+        assert (result.outcome, cv2.getNumThreads()) == ("failed", 1)
+    finally:
+        cv2.setNumThreads(before)

@@ -75,12 +75,13 @@ def fly_in_process(task: Task) -> RunResult:
     from perch_eval.in_process import Sensing, fly
     from perch_eval.in_process.recording import TracedFlight, write
     from perch_eval.metrics import flight_metrics
-    from perch_eval.report import build_report
 
     scenario = scenario_of(task.scenario, f"run {task.run.number}")
     trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5 if task.keep else 0.0)
     metrics = flight_metrics(TracedFlight(trace), load_vehicle(scenario.vehicle), trace.end_time)
     if task.keep:
+        from perch_eval.report import build_report  # and with it matplotlib: most workers keep no flight
+
         folder = Path(task.keep)
         folder.mkdir(parents=True, exist_ok=True)
         write(trace, folder / "flight.mcap")

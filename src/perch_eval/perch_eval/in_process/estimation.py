@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_eval.in_process.wire import Wire
+from perch_eval.in_process.wire import received_velocity
 from perch_perception.pose_buffer import BodyState
 from perch_perception.ukf import Estimate, Estimator, ImuSample, Status, UkfConfig, VioPose
 from perch_perception.ukf.odometry import covariances
@@ -46,7 +46,7 @@ class Estimation:
     def __init__(self, config: UkfConfig) -> None:
         self._config, self._estimator = config, Estimator(config)
         self._steps, self._covariance_step = 0, -config.covariance_stride
-        self._covariance, self._wire = np.zeros((6, 6)), Wire()
+        self._covariance = np.zeros((6, 6))
 
     def add_vio(self, pose: VioPose) -> None:
         """A VIO pose that counts from this step on."""
@@ -61,8 +61,7 @@ class Estimation:
             self._covariance, _ = covariances(estimate, self._config.imu.gyro_noise)
             self._covariance_step = self._steps
         self._steps += 1
-        v_WB = self._wire.velocity(estimate.p_WB, estimate.q_WB, estimate.v_WB, estimate.w_WB_B)
-        return Odometry(estimate, self._covariance, v_WB)
+        return Odometry(estimate, self._covariance, received_velocity(estimate.q_WB, estimate.v_WB))
 
     @property
     def status(self) -> Status:

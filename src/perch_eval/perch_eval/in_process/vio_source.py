@@ -6,7 +6,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.camera import CameraMount
-from perch_eval.in_process.wire import Wire
+from perch_eval.in_process.wire import received_velocity
 from perch_perception.ukf import ImuSample, VioPose
 from perch_perception.vio import VioConfig, VisualInertialOdometry
 from perch_sim import seeding
@@ -24,13 +24,12 @@ class ModelledVio:
         self._offset = round(mount.stamp_offset * 1e9)
         self._model = VioModel(params, seeding.stream(params.seed, "vio_model"))
         self._history = StateHistory(MEMORY)
-        self._newest, self._wire = 0, Wire()
+        self._newest = 0
 
     def see(self, state: TrueState, imu: ImuSample) -> None:
         """Take in what one step shows."""
         self._newest = state.time
-        v_WB = self._wire.velocity(state.p_WB, state.q_WB, state.v_WB, state.w_WB_B)
-        self._history.append(state._replace(v_WB=v_WB))
+        self._history.append(state._replace(v_WB=received_velocity(state.q_WB, state.v_WB)))
 
     def covers(self, delivery: Delivery) -> bool:
         """Whether a frame's exposure has passed on the board's clock."""
@@ -43,8 +42,7 @@ class ModelledVio:
         except LookupError:
             return None
         e = self._model.degrade(state.time * 1e-9, state.p_WB, state.q_WB, state.v_WB)
-        return _received(self._wire, state.time, e.p_WB, e.q_WB, np.diag(e.pose_variance), e.v_WB, state.w_WB_B,
-                         e.velocity_variance * np.eye(3))
+        return _received(state.time, e.p_WB, e.q_WB, np.diag(e.pose_variance), e.v_WB, e.velocity_variance * np.eye(3))
 
 
 class RenderedVio:
@@ -54,7 +52,6 @@ class RenderedVio:
         standing = np.array(params.start_position) + [0.0, 0.0, standing_height]
         self._vio = VisualInertialOdometry(params, mount, standing, float(np.radians(params.start_yaw_deg)),
                                          float(params.start_position[2]))
-        self._wire = Wire()
 
     def see(self, state: TrueState, imu: ImuSample) -> None:
         """Take in what one step shows."""
@@ -70,13 +67,11 @@ class RenderedVio:
         e = result.estimate
         if e is None:
             return None
-        return _received(self._wire, e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.pose_covariance, e.v_WB, e.w_WB_B,
-                         e.velocity_covariance)
+        return _received(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.pose_covariance, e.v_WB, e.velocity_covariance)
 
 
-def _received(wire: Wire, stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray,
-              w_WB_B: np.ndarray, velocity_covariance_B: np.ndarray) -> VioPose:
+def _received(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray,
+              velocity_covariance_B: np.ndarray) -> VioPose:
     """A pose as the estimator takes it from `vio/odometry`."""
     R_WB = so3.quat_to_matrix(q_WB)
-    return VioPose(stamp, p_WB, q_WB, covariance, wire.velocity(p_WB, q_WB, v_WB, w_WB_B),
-                   R_WB @ velocity_covariance_B @ R_WB.T)
+    return VioPose(stamp, p_WB, q_WB, covariance, received_velocity(q_WB, v_WB), R_WB @ velocity_covariance_B @ R_WB.T)
