@@ -10,7 +10,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from perch_core import so3
 from perch_core.vehicle import GRAVITY
 from perch_eval.perch_motion import PerchMotion
-from perch_perception.ukf import UkfConfig, VioNoise, VioPose, drift, kernels, start
+from perch_perception.ukf import UkfConfig, VioNoise, VioPose, drift, kernels, start, tracklet
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.unscented import Belief, CovarianceError, UnscentedTransform
 
@@ -214,24 +214,81 @@ def test_drift_step_stays_positive_when_vios_covariance_shrinks():
     assert np.linalg.eigvalsh(W)[0] > 0
 
 
+def test_a_correction_of_vios_is_expected_as_large_as_what_its_covariance_loses():
+    """Its first sight after a blind take-off moves VIO by centimetres; a gate that expected the floor alone refused it for half a second."""
+    W = drift.increment(VioNoise(), np.diag([1e-4] * 6), np.diag([1e-5] * 6), 1 / 30)
+    assert (np.diag(W) > 0.9 * (1e-4 - 1e-5)).all()
+
+
+def vio_pose(rng, size):
+    A, B = rng.normal(size=(6, 6)) * size, rng.normal(size=(3, 3)) * size
+    q = so3.quat_exp(rng.normal(0, 0.5, 3))
+    return VioPose(0, rng.normal(0, 0.1, 3), q, A @ A.T, rng.normal(0, 0.1, 3), B @ B.T)
+
+
+def beside_attitude(x):
+    """Of the velocity in B, without what the attitude's error makes of it in W, (3, 21)."""
+    U = np.zeros((3, 21))
+    U[:, at.D_VELOCITY], U[:, at.D_ATTITUDE] = np.eye(3), so3.hat(x[at.VELOCITY]) @ so3.quat_to_matrix(x[at.QUATERNION])
+    return U
+
+
 @pytest.mark.parametrize("size", [1e-3, 0.3])
 def test_pose_and_velocity_are_as_sure_as_vios(size):
-    """Whether the filter was surer or more doubtful; what it knows of the biases does not get better by that."""
+    """Whether the filter was surer or more doubtful."""
     rng = np.random.default_rng(12)
-    belief = random_belief(rng)
-    A, B = rng.normal(size=(6, 6)) * size, rng.normal(size=(3, 3)) * size
-    pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), A @ A.T, np.zeros(3), B @ B.T)
-    P = drift.as_sure_as(belief, pose, np.zeros((6, 6))).P
-    R = so3.quat_to_matrix(belief.x[at.QUATERNION])
-    J = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), R]])
+    pose = vio_pose(rng, size)
+    followed = drift.follow(random_belief(rng), pose, np.zeros((6, 6)))
+    joined = tracklet.join(followed, pose)
+    J = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), so3.quat_to_matrix(followed.x[at.QUATERNION])]])
     rows = np.r_[0:3, 6:9]
-    np.testing.assert_allclose(J @ P[np.ix_(rows, rows)] @ J.T, pose.covariance, rtol=1e-3, atol=1e-5 * size**2)
-    turned = np.zeros((3, 21))  # of the velocity in B, without what the attitude's error makes of it in W
-    turned[:, at.D_VELOCITY], turned[:, at.D_ATTITUDE] = np.eye(3), so3.hat(belief.x[at.VELOCITY]) @ R
-    np.testing.assert_allclose(turned @ P @ turned.T, pose.velocity_covariance, rtol=1e-3, atol=1e-5 * size**2)
-    np.testing.assert_allclose(turned @ P[:, at.D_ACCEL_BIAS], 0.0, atol=1e-9)
-    np.testing.assert_allclose(P[9:15, 9:15], belief.P[9:15, 9:15])
-    assert np.linalg.eigvalsh(P)[0] > 0
+    for belief in (followed, joined):
+        np.testing.assert_allclose(J @ belief.P[np.ix_(rows, rows)] @ J.T, pose.covariance, rtol=1e-3, atol=1e-5 * size**2)
+        assert np.linalg.eigvalsh(belief.P)[0] > 0
+    U = beside_attitude(followed.x)
+    np.testing.assert_allclose(U @ joined.P @ U.T, pose.velocity_covariance, rtol=1e-3, atol=1e-5 * size**2)
+
+
+def test_a_specific_force_stays_known_when_the_attitude_becomes_as_vague_as_vios():
+    """b_a = B theta + c: what c is known to does not change with the pose, and the bias's mean goes with the attitude's."""
+    rng = np.random.default_rng(14)
+    belief, pose = random_belief(rng), vio_pose(rng, 0.03)
+    theta, bias = at.D_ATTITUDE, at.D_ACCEL_BIAS
+    B = belief.P[bias, theta] @ np.linalg.inv(belief.P[theta, theta])
+    after = drift.follow(belief, pose, np.zeros((6, 6)))
+    beside = np.zeros((3, 21))
+    beside[:, bias], beside[:, theta] = np.eye(3), -B
+    np.testing.assert_allclose(beside @ after.P @ beside.T, beside @ belief.P @ beside.T, rtol=1e-9, atol=1e-12)
+    moved = at.minus(after.x, belief.x)
+    np.testing.assert_allclose(moved[bias], B @ moved[theta], atol=1e-12)
+
+
+def test_a_velocity_tells_the_biases_what_the_measurement_behind_it_would():
+    """VIO measures the velocity itself and passes its estimate on: the filter ends where that measurement would have taken it."""
+    rng = np.random.default_rng(15)
+    belief = random_belief(rng)
+    belief.x[at.VELOCITY] = 0.0  # so that the attitude's error makes nothing of it
+    H = np.zeros((3, 21))
+    H[:, at.D_VELOCITY] = np.eye(3)
+    z, R = rng.normal(0, 0.01, 3), np.diag([1e-4, 4e-4, 9e-4])
+    K = belief.P @ H.T @ np.linalg.inv(H @ belief.P @ H.T + R)
+    P = belief.P - K @ H @ belief.P
+    pose = VioPose(0, belief.x[:3], belief.x[at.QUATERNION], np.eye(6), (K @ z)[at.D_VELOCITY], P[3:6, 3:6])
+    joined = tracklet.join(belief, pose)
+    rows = np.r_[3:6, 9:15]
+    np.testing.assert_allclose(at.minus(joined.x, belief.x)[rows], (K @ z)[rows], atol=1e-12)
+    np.testing.assert_allclose(joined.P[np.ix_(rows, rows)], P[np.ix_(rows, rows)], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(joined.P[3:6, :], P[3:6, :], rtol=1e-6, atol=1e-12)
+
+
+def test_an_echo_of_the_same_samples_tells_the_biases_nothing():
+    """Blind, VIO's velocity is as sure as the filter's own prediction."""
+    belief = random_belief(np.random.default_rng(16))
+    U = beside_attitude(belief.x)
+    pose = VioPose(0, belief.x[:3], belief.x[at.QUATERNION], np.eye(6), belief.x[at.VELOCITY].copy(), U @ belief.P @ U.T)
+    joined = tracklet.join(belief, pose)
+    np.testing.assert_allclose(joined.P, belief.P, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(joined.x, belief.x)
 
 
 def test_at_rest_tilt_and_accelerometer_bias_are_one_unknown():

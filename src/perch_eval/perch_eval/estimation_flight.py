@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from perch_core import so3
@@ -37,6 +37,7 @@ class Flight:
         mount: the camera as calibrated, what VIO is told.
         frames: (middle of the exposure [s], stamp [ns], image), in order.
         perch_time: when the perching trajectory begins [s].
+        told_wrong: by how much position [m] and yaw [rad] are wrong that VIO is told at its start, shape (4,).
     """
 
     motion: PerchMotion
@@ -45,6 +46,7 @@ class Flight:
     mount: CameraMount
     frames: tuple[tuple[float, int, np.ndarray], ...]
     perch_time: float
+    told_wrong: np.ndarray = field(default_factory=lambda: np.zeros(4))
 
     def sample(self, k: int) -> ImuSample:
         """IMU sample k."""
@@ -85,7 +87,13 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
     return Flight(motion, truth, read_imu(truth, vehicle.imu, rng), mount, tuple(frames),
-                  motion.duration - motion.settings.perch)
+                  motion.duration - motion.settings.perch, _told_wrong(seed))
+
+
+def _told_wrong(seed: int) -> np.ndarray:
+    """A start is told as well as VIO believes it: a covariance cannot be judged on an error that was never made."""
+    s = VioConfig().start
+    return np.random.default_rng([seed, 9]).standard_normal(4) * [*[s.position_sigma] * 3, s.yaw_sigma]
 
 
 @dataclass(frozen=True)
@@ -115,10 +123,10 @@ def run_vio(flight: Flight, config: VioConfig = VioConfig(),
         config: VIO's settings.
         tamper: turns a frame (time, stamp, image) into those that arrive: none, others, several.
         tamper_imu: turns an IMU sample into the one that arrives, or None.
-        begin: VIO is switched on there [s], and told the pose of that moment.
+        begin: VIO is switched on there [s], and told the pose of that moment, as wrong as the flight has it.
     """
     start = flight.motion.sample(np.array([begin]))
-    vio = VisualInertialOdometry(config, flight.mount, start.p_WB[0], 0.0)
+    vio = VisualInertialOdometry(config, flight.mount, start.p_WB[0] + flight.told_wrong[:3], float(flight.told_wrong[3]))
     steps, k = [], int(np.searchsorted(flight.truth.times, begin))
     for time_, stamp, image in flight.frames:
         if time_ < begin:

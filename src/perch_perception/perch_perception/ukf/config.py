@@ -12,12 +12,12 @@ class ImuNoise:
     """What the filter assumes of the IMU: noise of one sample, bias walks, ranges."""
 
     rate: float = quantity(500.0, unit="Hz", above=0.0, doc="nominal sample rate")
-    accel_noise: float = quantity(0.32, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
-    gyro_noise: float = quantity(0.0102, unit="rad/s", above=0.0, doc="1 sigma of one sample")
-    accel_bias_walk: float = quantity(0.004, unit="m/s^2/sqrt(s)", above=0.0)
-    gyro_bias_walk: float = quantity(0.0003, unit="rad/s/sqrt(s)", above=0.0)
+    accel_noise: float = quantity(0.316, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
+    gyro_noise: float = quantity(0.01, unit="rad/s", above=0.0, doc="1 sigma of one sample")
+    accel_bias_walk: float = quantity(0.002, unit="m/s^2/sqrt(s)", above=0.0)
+    gyro_bias_walk: float = quantity(0.0002, unit="rad/s/sqrt(s)", above=0.0)
     accel_bias_init: float = quantity(0.05, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
-    gyro_bias_init: float = quantity(0.01, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
+    gyro_bias_init: float = quantity(0.005, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
     accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, doc="saturation of one axis")
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, doc="saturation of one axis")
     integration: str = choice("mean", options=("mean", "instant"), doc=(

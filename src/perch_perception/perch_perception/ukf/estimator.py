@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from scipy.stats import chi2
 
-from perch_perception.ukf import drift, kernels, start
+from perch_perception.ukf import drift, kernels, start, tracklet
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
@@ -142,7 +142,8 @@ class Estimator:
         pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), np.zeros(3), np.eye(3))
         drift.increment(self.config.vio, pose.covariance, pose.covariance, 0.03, pose.velocity_covariance)
         corrected = self._transform.correct(prior, self._innovate(prior, pose))
-        drift.as_sure_as(drift.follow(corrected, pose, True), pose, self._doubt)
+        drift.follow(corrected, pose, self._doubt)
+        tracklet.join(prior, pose)
         kernels.advance(belief.x.copy(), *map(float, row[0, 1:7]), 0.002)
 
     def _timing(self, pose: VioPose) -> VioOutcome | None:
@@ -186,8 +187,10 @@ class Estimator:
                 return VioOutcome.GATED
             prior = self._jumped(prior, innovation)
             innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
-        belief = drift.follow(self._transform.correct(prior, innovation), pose, self.config.use_velocity)
-        self._settle(drift.as_sure_as(belief, pose, self._doubt), pose)
+        belief = drift.follow(self._transform.correct(prior, innovation), pose, self._doubt)
+        if self.config.use_velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
+            belief = tracklet.join(belief, pose)
+        self._settle(belief, pose)
         return outcome
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:

@@ -15,7 +15,7 @@ from perch_perception.vio import state as at
 from perch_perception.vio.config import StartConfig
 from perch_perception.vio.msckf import Msckf
 
-_HOLD = 0.0005  # 1 sigma of "the pose has not changed": [m] and [rad]
+_HOLD = 0.0002  # 1 sigma of "the pose has not changed": [m] and [rad]
 
 
 def looks_at_rest(config: StartConfig, steps: np.ndarray, gyro_bias: np.ndarray, accel: np.ndarray | None) -> bool:
