@@ -98,8 +98,9 @@ def test_motion_along_the_wires_is_called_degenerate(wires):
     assert "baseline ratio" in result.message and "move across" in result.message
 
 
-def test_sightings_that_could_be_either_wire_change_nothing():
-    """Two wires that coincide from where the camera is: the sighting is left alone."""
+@pytest.mark.parametrize("radius, counted", [(0.0, None), (0.03, 0)], ids=["width unknown", "width measured"])
+def test_a_sighting_of_wires_in_line_counts_only_where_its_width_tells_which_it_is(radius, counted):
+    """Two wires that coincide from where the camera is: the nearer one covers the other, and looks twice as wide."""
     rng = np.random.default_rng(8)
     near, far = WireCurve(np.array([2.0, 0.0, 2.0]), np.array([0.0, 1.0, 0.0])), \
         WireCurve(np.array([4.0, 0.0, 2.02]), np.array([0.0, 1.0, 0.0]))
@@ -107,13 +108,13 @@ def test_sightings_that_could_be_either_wire_change_nothing():
     for k in range(12):
         centre = np.array([0.0, 0.0, 1.0 + 0.08 * k])
         body = BodyState(0.1 * k, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
-        mapper.update(0.1 * k, body, [observe(rng, w, centre, 2e-4, time=0.1 * k) for w in (near, far)])
+        mapper.update(0.1 * k, body, [observe(rng, w, centre, 2e-4, time=0.1 * k, radius=radius) for w in (near, far)])
     before = mapper.map(1.2)
     assert len(before.lines) == 2
     centre = np.array([0.0, 0.0, 2.0])
     body = BodyState(1.3, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
-    after = mapper.update(1.3, body, [observe(rng, near, centre, 2e-4, time=1.3)])
-    assert [line.observations for line in after.lines] == [line.observations for line in before.lines]
+    after = mapper.update(1.3, body, [observe(rng, near, centre, 2e-4, time=1.3, radius=radius)])
+    assert [a.observations - b.observations for a, b in zip(after.lines, before.lines, strict=True)] == [int(k == counted) for k in (0, 1)]
 
 
 def test_false_sightings_are_forgotten():

@@ -20,6 +20,8 @@ class AssociationConfig:
     followed_gate: float = config.quantity(5.0, unit="deg", above=0.0, high=45.0,
                                            doc="to the last sighting of a wire that is not triangulated yet")
     distinct: float = config.quantity(2.0, low=1.0, high=10.0, doc="the second-best wire must be so many times worse")
+    width_ratio: float = config.quantity(1.4, low=1.0, high=10.0,
+                                         doc="of wires in line, the sighting is of those that look as wide as it, up to this factor")
     reach: float = config.quantity(1.5, unit="m", low=0.0, high=20.0, doc="how far a wire may go on beyond what was seen")
 
 
@@ -69,12 +71,25 @@ def _score_followed(last: LineObservation, seen: LineObservation) -> float:
     return offset
 
 
+def _as_wide(track: Track, seen: LineObservation, settings: AssociationConfig) -> bool:
+    """Whether a wire looks about as wide as a sighting: of wires in line it is the nearest that is seen, and it is the widest."""
+    if track.estimate is None or seen.width <= 0.0:
+        return False
+    ratio = seen.width / track.estimate.width_from(seen.p_WC)
+    return bool(1.0 / settings.width_ratio < ratio < settings.width_ratio)
+
+
 def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings: AssociationConfig) -> list[int | None]:
     """For each sighting the index of its wire, -1 for a new one, or None where it could be one of several.
 
     A triangulated wire may be seen in several pieces at once; one that is only followed, in one.
     """
     scores = np.array([[score(track, one, settings) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
+    for i, one in enumerate(seen):
+        near = np.flatnonzero(scores[i] <= 1.0)
+        as_wide = [_as_wide(tracks[j], one, settings) for j in near]
+        if len(near) > 1 and any(as_wide):
+            scores[i, near[~np.array(as_wide)]] = np.inf
     answer: list[int | None] = [-1] * len(seen)
     taken: set[int] = set()
     order = sorted(((scores[i, j], i, j) for i in range(len(seen)) for j in range(len(tracks)) if scores[i, j] <= 1.0))

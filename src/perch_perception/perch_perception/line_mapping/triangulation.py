@@ -45,6 +45,7 @@ class TriangulationConfig:
     mount_rotation: float = config.quantity(0.3, unit="deg", above=0.0, high=10.0,
                                             doc="error of the camera's attitude on the body, per axis, 1 sigma: the same in all sightings")
     width: float = config.quantity(0.01, above=0.0, high=1.0, doc="error of a wire's width in an image, beside that of its edges: share of it")
+    width_edges: float = config.quantity(0.3, above=0.0, high=2.0, doc="error of a wire's edges in an image beside that of its rays: share of it")
     radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5,
                                     doc="radius of the wires, where it is known; else of one too thin to be measured")
     radius_sigma: float = config.quantity(0.0, low=0.0, high=1.0, doc="how well it is known, 1 sigma, as a share of it; 0: not at all")
@@ -81,6 +82,12 @@ class WireEstimate:
     mount: np.ndarray
     radius: float
     time: float = 0.0
+
+    def width_from(self, p_WC: np.ndarray) -> float:
+        """How wide it looks from a place (3,) [rad]; nan where its radius is not known."""
+        to = self.curve.point - p_WC
+        distance = np.linalg.norm(to - (to @ self.curve.direction) * self.curve.direction)
+        return float(2.0 * np.arcsin(min(self.radius / max(distance, 1e-3), 1.0)))
 
     def point_covariance(self, s: float) -> np.ndarray:
         """Covariance of the point at s in W [m^2], shape (3, 3); across the wire only."""
@@ -232,7 +239,7 @@ def _widths(curve, size, observations, settings, apart):
     to, s = _feet(curve, [observations[k] for k in seen])
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     misfit = np.log(np.sin(0.5 * width) * distance) - size
-    sigma = np.sqrt(settings.width**2 + (ray / width) ** 2 + (settings.pose_position / distance) ** 2)
+    sigma = np.sqrt(settings.width**2 + (settings.width_edges * ray / width) ** 2 + (settings.pose_position / distance) ** 2)
     x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
     zero = np.zeros_like(s)
     rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]
