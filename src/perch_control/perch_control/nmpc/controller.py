@@ -75,7 +75,7 @@ class NmpcController:
         s, n = self.settings, self._layout.states
         self._rate_max = s.rate_max or _RATE_RESERVE * self.vehicle.body_rate_max
         self._thrust_rate_max = s.thrust_rate_max or _thrust_rate(self.vehicle)
-        self._ahead = lag_behind(self.vehicle.motor_time_constant, s.lead, CONTROL_PERIOD)
+        self._lag = lag_behind(self.vehicle.motor_time_constant, s.lead, CONTROL_PERIOD)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
@@ -124,12 +124,13 @@ class NmpcController:
         if getattr(reference.source, "by_state", False):
             self._warm = False
             return self.fallback.control(state, reference, rotors, compensation, time_to_contact)
-        begins = reference.elapsed + (0.0 if self.settings.thrust_states else self._ahead)
-        self._rows.fill(reference.source, begins, self._spacing, self._R)
-        # At the end of a reference its thrusts jump: beyond it lies the contact.
-        ramps = reference.source.duration - begins >= self.settings.nodes * self._dt
+        # At a reference's end its thrusts jump.
+        left = reference.source.duration - reference.elapsed - self.settings.lead
+        ramps = self.settings.ramps and left >= self.settings.nodes * self._dt
+        ahead = 0.0 if self.settings.thrust_states else self._lag if ramps else self.settings.lead
+        self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
         try:
-            speed, wrench, reached = self._iterate(state, rotors, compensation, ramps)
+            speed, wrench, reached = self._iterate(state, rotors, compensation, ahead, ramps)
         except QpFailure:
             self.failures += 1
             self._warm = False
@@ -138,7 +139,8 @@ class NmpcController:
         dw_C = ((later[0] - now[0]) / self._dt, (later[1] - now[1]) / self._dt, (later[2] - now[2]) / self._dt)
         return ControlOutput(speed, wrench, reached, tuple(r[3:7]), tuple(r[10:13]), dw_C)
 
-    def _iterate(self, state: tuple[float, ...], rotors: RotorEstimate, compensation: tuple[float, ...], ramps: bool) -> tuple:
+    def _iterate(self, state: tuple[float, ...], rotors: RotorEstimate, compensation: tuple[float, ...], ahead: float,
+                 ramps: bool) -> tuple:
         """One real-time iteration; returns rotor commands, wrench and the thrusts that will be reached."""
         s, X, U, n = self.settings, self.X, self.U, self._layout.states
         if not self._warm:
@@ -150,7 +152,7 @@ class NmpcController:
             self._work.clear()
             self._warm = True
         z = self._stages.arguments
-        begin(state, rotors.speed, rotors.command, compensation, self._ahead, self._constants, self._R, ramps, X, U, self._start,
+        begin(state, rotors.speed, rotors.command, compensation, ahead, self._constants, self._R, ramps, X, U, self._start,
               self._target, z)
         if self._layout.with_lines:
             self._fill_lines(z)

@@ -48,4 +48,6 @@ class NmpcSettings:
     rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="soft limit of each body rate; 0: 1.2 times the vehicle's body_rate_max")
     thrust_rate_max: float = quantity(0.0, unit="N/s", low=0.0, doc="limit of the thrust rates; 0: the vehicle's, or what its rotor lag allows in hover")
     lead: float = quantity(0.02, unit="s", low=0.002, high=0.2, doc="time in which the rotors reach the wanted thrust")
+    ramps: bool = quantity(False, doc="thrusts change over an interval as the reference's, and are sent as early as led rotors are late; "
+                                      "else they are held, and sent `lead` early")
     lines: LineWeights = part(LineWeights)
