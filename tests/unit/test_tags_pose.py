@@ -126,10 +126,31 @@ def test_sensitivity_to_the_lens_agrees_with_another_lens():
     for column, (name, change) in enumerate(step.items()):
         true = dataclasses.replace(CAMERA, **{name: getattr(CAMERA, name) + change})
         pose = solve(measure(rng, p, R, 0.0, camera=true), 0.05)
-        moved = -errors(p, R, pose)
+        error = errors(p, R, pose)
         unit = 1e-3 if name in ("fx", "fy") else change
-        np.testing.assert_allclose(moved, exact.by_intrinsics[:, column] * unit,
-                                   atol=0.05 * np.abs(moved).max() + 1e-6)
+        np.testing.assert_allclose(error, exact.by_intrinsics[:, column] * unit,
+                                   atol=0.05 * np.abs(error).max() + 1e-6)
+
+
+def test_a_lens_known_to_its_sigmas_makes_a_pose_as_sure_as_it_is():
+    """And a better one than without considering the lens: an error of fx / fy does not go into the attitude."""
+    rng = np.random.default_rng(6)
+    sigma = np.array([0.003, 0.003, 0.5, 0.5])
+    nees, considered, ignored = [], [], []
+    for _ in range(200):
+        p, R = view_of_pad(rng, 1.7, 75.0)
+        k = rng.normal(0, sigma)
+        true = dataclasses.replace(CAMERA, fx=CAMERA.fx * (1 + k[0]), fy=CAMERA.fy * (1 + k[1]), cx=CAMERA.cx + k[2], cy=CAMERA.cy + k[3])
+        rays = measure(rng, p, R, 0.05, camera=true)
+        pose = solve(rays, 0.05, lens_sigma=sigma)
+        error = errors(p, R, pose)
+        covariance = pose.covariance + pose.by_intrinsics @ np.diag(sigma**2) @ pose.by_intrinsics.T
+        nees.append(error @ np.linalg.solve(covariance, error))
+        considered.append(error[3:])
+        ignored.append(errors(p, R, solve(rays, 0.05))[3:])
+    low, high = chi2.ppf((0.025, 0.975), 6 * len(nees)) / len(nees)
+    assert low < np.mean(nees) < high
+    assert np.linalg.norm(considered) < np.linalg.norm(ignored)
 
 
 def test_the_papers_average_has_no_flips_but_the_joint_solution_is_better():

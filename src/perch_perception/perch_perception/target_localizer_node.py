@@ -51,7 +51,7 @@ class TargetLocalizerNode(CameraNode[TargetLocalizerConfig]):
         super().__init__("target_localizer", TargetLocalizerConfig, **kwargs)
         board = load_board(self.params.board)
         self._localizer = BoardLocalizer(board, self._mount, self.params.localizer,
-                                         averaging=self.params.mode == "average")
+                                         averaging=self.params.mode == "average", calibration=self.params.calibration)
         self._target: FusedTarget | MapPose | None = None
         self._costs: deque[float] = deque(maxlen=300)
         self._counts = {"images": 0, "found": 0, "complete": 0}

@@ -69,7 +69,7 @@ class ModelledSight:
         rays = self._mount.camera.unproject(measured.reshape(-1, 2)).reshape(-1, 4, 3)
         corners_S = self._board.corners_S[[self._board.ids.index(i) for i in ids]]
         try:
-            pose = solve_board(self._mount.camera, corners_S, rays, sigma, ids, self._R_CS)
+            pose = solve_board(self._mount.camera, corners_S, rays, sigma, ids, self._R_CS, lens_sigma=self._params.calibration.lens)
         except LocalizationRefusal as refusal:
             return Localization(None, message=str(refusal))
         if not settings.min_range <= np.linalg.norm(pose.p_CS) <= settings.max_range:
@@ -99,7 +99,7 @@ class RenderedSight:
     """Sightings by the tag pipeline on rendered images."""
 
     def __init__(self, board: TagBoard, mount: CameraMount, params: TargetLocalizerConfig) -> None:
-        self._localizer = BoardLocalizer(board, mount, params.localizer, averaging=params.mode == "average")
+        self._localizer = BoardLocalizer(board, mount, params.localizer, averaging=params.mode == "average", calibration=params.calibration)
 
     def see(self, delivery: Delivery, exposed: float, state: TrueState, pad: PerchSurface, body: BodyState | None) -> Localization:
         """What the localiser says of a frame."""

@@ -17,6 +17,7 @@ from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.average import average_board
 from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
+from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
 from perch_perception.tags.refinement import refine_corners
 from perch_perception.tags.view import VirtualView
@@ -69,13 +70,15 @@ class BoardLocalizer:
         mount: the camera.
         settings: see `LocalizerConfig`.
         averaging: compute the paper's average too.
+        calibration: how well the lens is known.
     """
 
     def __init__(self, board: TagBoard, mount: CameraMount, settings: LocalizerConfig | None = None,
-                 averaging: bool = False) -> None:
+                 averaging: bool = False, calibration: CalibrationSigma = CalibrationSigma()) -> None:
         self.board, self.mount = board, mount
         self.settings = settings or LocalizerConfig()
         self._averaging = averaging
+        self._lens_sigma = calibration.lens
         self._detector = TagDetector(board, mount.camera)
         self._tag_size = float(np.median(np.linalg.norm(board.corners_S[:, 0] - board.corners_S[:, 1], axis=-1)))
         self._radius = float(np.linalg.norm(board.corners_S, axis=-1).max())
@@ -191,7 +194,7 @@ class BoardLocalizer:
         ids = tuple(i for i, valid in zip(detection.ids, refined.valid) if valid)
         corners_S = self.board.corners_S[[self.board.ids.index(i) for i in ids]]
         rays, sigma = refined.rays_C[refined.valid], refined.sigma[refined.valid]
-        pose = solve_board(self.mount.camera, corners_S, rays, sigma, ids, prior_R_CS, start)
+        pose = solve_board(self.mount.camera, corners_S, rays, sigma, ids, prior_R_CS, start, self._lens_sigma)
         distance = float(np.linalg.norm(pose.p_CS))
         if not self.settings.min_range <= distance <= self.settings.max_range:
             raise LocalizationRefusal(

@@ -34,6 +34,11 @@ class CalibrationSigma:
     rotation: float = config.quantity(0.277, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis of B")
     time: float = config.quantity(0.0019, unit="s", low=0.0, high=0.05, doc="camera-IMU time offset")
 
+    @property
+    def lens(self) -> np.ndarray:
+        """1-sigma of fx, fy (relative), cx, cy [px], shape (4,)."""
+        return np.array([self.focal, self.focal, self.centre, self.centre])
+
 
 @dataclass(frozen=True)
 class MapPose:
@@ -82,8 +87,7 @@ def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: C
     by_shared[:3, BODY] = np.concatenate([np.eye(3), -so3.hat(v_BS_W)], axis=1)
     by_shared[3:, BODY] = np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1)
     shared = np.zeros((SHARED, SHARED))
-    sigma = [*[np.radians(calibration.rotation)] * 3, *[calibration.focal] * 2, *[calibration.centre] * 2,
-             calibration.time]
+    sigma = [*[np.radians(calibration.rotation)] * 3, *calibration.lens, calibration.time]
     shared[:8, :8] = np.diag(np.square(sigma))
     shared[BODY, BODY] = body.covariance
     return MapPose(body.p_WB + v_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, shared)

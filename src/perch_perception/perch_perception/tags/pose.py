@@ -3,6 +3,11 @@
 A single small square has two nearly equally good poses (the IPPE ambiguity): averages over single-tag poses flip and
 are 12-20 deg off at 3 m. All corners together, over the pad's 0.56 m, have one clear minimum.
 
+The lens is known to a few tenths of a per cent, which is more of a pixel than the corners' noise: k = (fx, fy, cx, cy) is
+considered. With the corners' derivative G by k, whitened and in k's sigmas, the residuals' covariance is I + G G^T, and
+
+    W = (I + G G^T)^-1 = I - G (I + G^T G)^-1 G^T,   A = (J^T W J)^-1 J^T W,   cov = A A^T (noise) + A G G^T A^T (lens).
+
 Errors of a pose T_AB = (p_AB, R_AB) are (dp, dtheta) in the axes of A: p = p^ + dp, R = exp(dtheta) R^. That is also what
 the covariance of geometry_msgs/PoseWithCovariance means.
 """
@@ -24,6 +29,7 @@ PRIOR_SIGMA = np.radians(10.0)     # how far the attitude may have turned since 
 MAX_OUTLIER_RATIO = 5.0            # residuals beyond this many sigma (RMS) mean that a tag is not where it should be
 MAX_RESIDUAL = 0.35                # ... if they also exceed this [px] ...
 CALIBRATION_SHARE = 0.005          # ... and this share of the corners' extent: the lens is not known better
+EXACT_LENS = np.zeros(4)
 
 
 class LocalizationRefusal(PerchError):
@@ -57,8 +63,8 @@ class BoardPose:
 
 
 def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
-                prior_R_CS: np.ndarray | None = None,
-                start: tuple[np.ndarray, np.ndarray] | None = None) -> BoardPose:
+                prior_R_CS: np.ndarray | None = None, start: tuple[np.ndarray, np.ndarray] | None = None,
+                lens_sigma: np.ndarray = EXACT_LENS) -> BoardPose:
     """Joint pose over all corners; a tag that contradicts the others is left out.
 
     Args:
@@ -69,11 +75,12 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         ids: numbers of the tags, n of them.
         prior_R_CS: predicted attitude; only helps to choose between two minima.
         start: predicted (p_CS, R_CS) of a board whose pose was unique: spares looking for a second minimum.
+        lens_sigma: 1-sigma of the lens's fx, fy (relative), cx, cy [px], shape (4,).
 
     Raises:
         LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
     """
-    best = _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start)
+    best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start)
     extent = float(np.ptp(camera.project(rays_C)[0], axis=(0, 1)).max())
     if not _contradicts(best, sigma, extent):
         return best
@@ -82,7 +89,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         for out in range(len(ids)):
             keep = np.arange(len(ids)) != out
             rest = tuple(np.array(ids)[keep].tolist())
-            trial = _solve(camera, corners_S[keep], rays_C[keep], sigma[keep], rest, prior_R_CS)
+            trial = _solve(camera, corners_S[keep], rays_C[keep], sigma[keep], rest, lens_sigma, prior_R_CS)
             trials.append((trial.rms, out, trial))
         _, out, trial = min(trials, key=lambda entry: entry[0])
         if not _contradicts(trial, sigma, extent):
@@ -94,30 +101,32 @@ def _contradicts(pose: BoardPose, sigma: np.ndarray, extent: float) -> bool:
     return pose.rms > max(MAX_RESIDUAL, MAX_OUTLIER_RATIO * float(np.sqrt(np.mean(sigma**2))), CALIBRATION_SHARE * extent)
 
 
-def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start=None) -> BoardPose:
+def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=None) -> BoardPose:
     """Best of the two IPPE branches, or of the start alone, after refinement."""
-    points, rays, noise = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3), sigma.reshape(-1)
+    points, rays = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3)
     pixels, seen = camera.project(rays)
     if not np.all(seen):
         raise LocalizationRefusal("a corner lies beyond the lens's field of view")
+    corners = _Corners(camera, points, sigma.reshape(-1), pixels, lens_sigma)
     branches = []
     for p, R in [start] if start is not None else planar_branches(points, rays):
-        refined = _refine(camera, points, pixels, noise, p, R)
+        refined = _refine(corners, p, R)
         if refined is None or refined[0][2] <= 0.0 and camera.max_angle <= np.pi / 2:
             continue
-        p, R, chi2, information = refined
+        p, R, chi2 = refined
         if R[:, 2] @ p >= 0.0:
             continue  # the back of the board
         cost = chi2
         if prior_R_CS is not None:
             cost += (np.linalg.norm(so3.log(R @ prior_R_CS.T)) / PRIOR_SIGMA) ** 2
-        branches.append((cost, chi2, p, R, information))
+        branches.append((cost, chi2, p, R))
     if not branches:
         raise LocalizationRefusal(f"tags {list(ids)}: no pose shows the front of the board")
     branches.sort(key=lambda branch: branch[0])
-    cost, chi2, p, R, information = branches[0]
+    cost, chi2, p, R = branches[0]
     freedom = max(2 * len(points) - 6, 1)
-    covariance = np.linalg.inv(information) * max(1.0, chi2 / freedom)
+    covariance, by_intrinsics = corners.errors(p, R)
+    covariance = covariance * max(1.0, chi2 / freedom)
     gap = np.inf
     if len(branches) > 1:
         turn = so3.log(branches[1][3] @ R.T)
@@ -126,10 +135,8 @@ def _solve(camera, corners_S, rays_C, sigma, ids, prior_R_CS, start=None) -> Boa
             gap = branches[1][0] - cost
             apart = np.concatenate([branches[1][2] - p, turn])
             share = 1.0 / (1.0 + np.exp(min(0.5 * gap, 500.0)))
-            covariance = (1.0 - share) * covariance + share * (np.linalg.inv(branches[1][4]) + np.outer(apart, apart))
-    rms = float(np.sqrt(chi2 / np.sum(2.0 / noise**2)))
-    by_intrinsics = intrinsics_sensitivity(camera, corners_S, sigma, p, R)
-    return BoardPose(p, R, covariance, tuple(ids), rms, by_intrinsics, float(gap))
+            covariance = (1.0 - share) * covariance + share * (corners.errors(*branches[1][2:])[0] + np.outer(apart, apart))
+    return BoardPose(p, R, covariance, tuple(ids), corners.rms(p, R), by_intrinsics, float(gap))
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -156,18 +163,10 @@ def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.n
 
 def intrinsics_sensitivity(camera: Camera, corners_S: np.ndarray, sigma: np.ndarray, p_CS: np.ndarray,
                            R_CS: np.ndarray) -> np.ndarray:
-    """Derivative of the least-squares pose by the true lens's fx, fy (relative), cx, cy [px], shape (6, 4).
-
-    With residuals r(x, k), the minimum over x moves by -(J^T J)^-1 J^T dr/dk when the model's k changes; a true k that
-    is larger than the model's moves it the other way.
-    """
-    points, noise = corners_S.reshape(-1, 3), sigma.reshape(-1)
-    jacobian, pixels = _pose_jacobian(camera, points, noise, p_CS, R_CS)
-    by_k = np.zeros((len(points), 2, 4))
-    by_k[:, 0, 0], by_k[:, 1, 1] = pixels[:, 0] - camera.cx, pixels[:, 1] - camera.cy
-    by_k[:, 0, 2] = by_k[:, 1, 3] = 1.0
-    by_k = (by_k / noise[:, None, None]).reshape(-1, 4)
-    return np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ by_k)
+    """Derivative of (dp, dtheta) of the least-squares pose by the true lens's fx, fy (relative), cx, cy [px], shape (6, 4)."""
+    points = corners_S.reshape(-1, 3)
+    pixels = camera.project(points @ R_CS.T + p_CS)[0]
+    return _Corners(camera, points, sigma.reshape(-1), pixels, EXACT_LENS).errors(p_CS, R_CS)[1]
 
 
 def reprojection_rms(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, p_CS: np.ndarray,
@@ -178,9 +177,66 @@ def reprojection_rms(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, 
     return float(np.sqrt(np.mean(residual**2))) if np.all(seen) else np.inf
 
 
-def _refine(camera, points, pixels, noise, p, R):
-    """Levenberg-Marquardt on SE(3); returns p, R, chi^2 and the information matrix, or None where it leaves the lens."""
-    state = _linearise(camera, points, pixels, noise, p, R)
+class _Corners:
+    """Least squares over measured corners.
+
+    Args:
+        camera: the lens.
+        points_S: the corners in S, shape (m, 3).
+        noise: 1-sigma of each [px], shape (m,).
+        pixels: where they were measured, shape (m, 2).
+        lens_sigma: 1-sigma of fx, fy (relative), cx, cy [px], shape (4,).
+    """
+
+    def __init__(self, camera: Camera, points_S: np.ndarray, noise: np.ndarray, pixels: np.ndarray, lens_sigma: np.ndarray) -> None:
+        self._camera, self._points, self._noise, self._pixels = camera, points_S, noise, pixels
+        by_lens = np.zeros((len(points_S), 2, 4))
+        by_lens[:, 0, 0], by_lens[:, 1, 1] = pixels[:, 0] - camera.cx, pixels[:, 1] - camera.cy
+        by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+        self._by_lens = (by_lens / noise[:, None, None]).reshape(-1, 4)
+        self._G = self._by_lens * lens_sigma
+        self._back = np.linalg.solve(np.eye(4) + self._G.T @ self._G, self._G.T)
+
+    def linearise(self, p: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
+        """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
+        jacobian, projected = self._jacobian(p, R)
+        residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
+        if not np.all(np.isfinite(residual)):
+            return None
+        weighed = self._weighed(residual)
+        return float(residual @ weighed), jacobian.T @ weighed, jacobian.T @ self._weighed(jacobian)
+
+    def errors(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """At the minimum: covariance of (dp, dtheta) from the noise, (6, 6), and their derivative by the true lens, (6, 4).
+
+        Pixels that a longer lens makes larger bring the solution nearer than the truth, which is ahead: -A dr/dk.
+        """
+        jacobian, _ = self._jacobian(p, R)
+        weighed = self._weighed(jacobian)
+        A = np.linalg.solve(jacobian.T @ weighed, weighed.T)
+        return A @ A.T, -A @ self._by_lens
+
+    def rms(self, p: np.ndarray, R: np.ndarray) -> float:
+        """Residual per image axis [px]; corners that are known better count more."""
+        residual = self._camera.project(self._points @ R.T + p)[0] - self._pixels
+        return float(np.sqrt(np.sum((residual / self._noise[:, None]) ** 2) / np.sum(2.0 / self._noise**2)))
+
+    def _weighed(self, whitened: np.ndarray) -> np.ndarray:
+        """W times residuals or derivatives, shape (2m, ...)."""
+        return whitened - self._G @ (self._back @ whitened)
+
+    def _jacobian(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivative of the whitened pixels by (dp, dtheta), shape (2m, 6), and the pixels (m, 2); NaN beyond the lens."""
+        turned = self._points @ R.T
+        points_C = turned + p
+        by_point = self._camera.project_jacobian(points_C) / self._noise[:, None, None]
+        by_turn = -by_point @ so3.hat(turned)  # d X_C = dtheta x R X
+        return np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6), self._camera.project(points_C)[0]
+
+
+def _refine(corners: _Corners, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Levenberg-Marquardt on SE(3); returns p, R and chi^2, or None where it leaves the lens."""
+    state = corners.linearise(p, R)
     if state is None:
         return None
     chi2, gradient, information = state
@@ -188,7 +244,7 @@ def _refine(camera, points, pixels, noise, p, R):
     for _ in range(MAX_ITERATIONS):
         step = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
         p_new, R_new = p + step[:3], so3.exp(step[3:]) @ R
-        trial = _linearise(camera, points, pixels, noise, p_new, R_new)
+        trial = corners.linearise(p_new, R_new)
         if trial is None or trial[0] > chi2 + 1e-9:
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e6:
@@ -199,22 +255,4 @@ def _refine(camera, points, pixels, noise, p, R):
         damping *= 0.1
         if gain < 1e-4 * max(chi2, 1.0) or np.abs(step).max() < 1e-7:
             break
-    return p, R, chi2, information
-
-
-def _linearise(camera, points, pixels, noise, p, R):
-    """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
-    jacobian, projected = _pose_jacobian(camera, points, noise, p, R)
-    residual = ((projected - pixels) / noise[:, None]).ravel()
-    if not np.all(np.isfinite(residual)):
-        return None
-    return float(residual @ residual), jacobian.T @ residual, jacobian.T @ jacobian
-
-
-def _pose_jacobian(camera, points, noise, p, R):
-    """Derivative of the whitened pixels by (dp, dtheta), shape (2k, 6), and the pixels (k, 2); NaN beyond the lens."""
-    turned = points @ R.T
-    points_C = turned + p
-    by_point = camera.project_jacobian(points_C) / noise[:, None, None]
-    by_turn = -by_point @ so3.hat(turned)  # d X_C = dtheta x R X
-    return np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6), camera.project(points_C)[0]
+    return p, R, chi2

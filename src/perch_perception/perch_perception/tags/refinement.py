@@ -23,7 +23,7 @@ MIN_REACH, MAX_REACH = 1.5, 5.0  # half length of a profile [px]
 CORNER_MARGIN = 0.08   # share of the edge left out at each end, where the neighbouring edge interferes
 MIN_CONTRAST = 8.0     # least mean step of an edge [grey values]
 MIN_EDGE = 5.0         # an edge shorter than this is not measured [px]
-SYSTEMATIC = 0.05      # error of a corner that averaging along the edge does not remove [px]
+SYSTEMATIC = 0.03      # error of a corner that averaging along the edge does not remove [px]
 
 
 @dataclass(frozen=True)
