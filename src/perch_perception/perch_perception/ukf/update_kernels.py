@@ -188,42 +188,6 @@ def missing(C, P):
 
 
 @compiled
-def as_sure_as(P, rows, C, T):
-    """Raise the block P_xx of the given rows by what it misses to C, and enter the factor that then takes it to C into T.
-
-    Args:
-        P: covariance (21, 21); its block is changed.
-        rows: indices of x, (n,).
-        C: the covariance that the block is to have, (n, n).
-        T: the transform P := T P T^T, (21, 21); T_xx = L(C) L(P_xx)^-1 is entered.
-
-    Returns:
-        False where a covariance is not positive definite.
-    """
-    n = len(rows)
-    block = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            block[i, j] = P[rows[i], rows[j]]
-    block += missing(C, block)
-    wanted, have = C.copy(), np.zeros((n, n))
-    for i in range(n):
-        wanted[i, i] += 1e-6 * C[i, i] + 1e-12  # it may be singular
-    target = np.zeros((n, n))
-    if not (cholesky(wanted, 1.0, target) and cholesky(block, 1.0, have)):
-        return False
-    for i in range(n):
-        for j in range(n - 1, -1, -1):
-            x = target[i, j]
-            for k in range(j + 1, n):
-                x -= T[rows[i], rows[k]] * have[k, j]
-            T[rows[i], rows[j]] = x / have[j, j]
-        for j in range(n):
-            P[rows[i], rows[j]] = block[i, j]
-    return True
-
-
-@compiled
 def add_process_noise(run, gyro_walk2, accel_walk2, P):
     """Add to P (21, 21) what a run's IMU noise and bias walks do, see `UnscentedTransform.process_noise`."""
     T, q, turn = 0.0, 0.0, 0.0
