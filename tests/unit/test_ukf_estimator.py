@@ -202,21 +202,23 @@ def test_same_inputs_give_the_same_bits():
     assert a.estimator.estimate.P.tobytes() == b.estimator.estimate.P.tobytes()
 
 
-def test_a_replay_that_was_put_off_ends_where_a_prompt_one_does():
-    at_once, in_halves = Flight(6).fly(end=1500), Flight(6).fly(end=1500)
+def test_an_update_in_parts_ends_where_one_at_once_does():
+    at_once, in_parts = Flight(6).fly(end=1500), Flight(6).fly(end=1500)
     k = next(k for k in range(1500, 1520) if k - 20 in at_once.poses)
-    for flight in (at_once, in_halves):
+    for flight in (at_once, in_parts):
         flight.fly(1500, k)
-    before = in_halves.estimator.estimate.p_WB
-    assert in_halves.estimator.add_vio(in_halves.poses[k - 20], catch_up=False) is VioOutcome.APPLIED
-    assert in_halves.estimator.behind and (in_halves.estimator.estimate.p_WB == before).all()
-    for flight in (at_once, in_halves):
+    before = in_parts.estimator.estimate.p_WB
+    assert in_parts.estimator.add_vio(in_parts.poses[k - 20], at_once=False) is VioOutcome.APPLIED
+    assert in_parts.estimator.behind and (in_parts.estimator.estimate.p_WB == before).all()
+    for flight in (at_once, in_parts):
         flight.estimator.add_imu(flight.sample(k))
     at_once.estimator.add_vio(at_once.poses[k - 20])
-    in_halves.estimator.catch_up()
-    assert not in_halves.estimator.behind
-    assert at_once.estimator.estimate.p_WB.tobytes() == in_halves.estimator.estimate.p_WB.tobytes()
-    assert at_once.estimator.estimate.P.tobytes() == in_halves.estimator.estimate.P.tobytes()
+    for part in range(3):
+        assert in_parts.estimator.behind
+        in_parts.estimator.go_on()
+    assert not in_parts.estimator.behind
+    assert at_once.estimator.estimate.p_WB.tobytes() == in_parts.estimator.estimate.p_WB.tobytes()
+    assert at_once.estimator.estimate.P.tobytes() == in_parts.estimator.estimate.P.tobytes()
 
 
 def test_coasts_without_vio_grows_its_covariance_and_recovers():

@@ -49,8 +49,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, backlog=True)
 
     def _receive_vio(self, msg: Odometry) -> None:
-        """In real time the update, which takes half a period, waits until the next sample's command has left, and the replay
-        until the one after that."""
+        """In real time the update, which takes half a period, waits until the next sample's command has left, its further
+        parts until those after it."""
         if self._participant.lockstep is False:
             self._unused_vio.append(msg)
         else:
@@ -66,13 +66,13 @@ class EstimatorNode(PerchNode[UkfConfig]):
             velocity_covariance = R_WB @ np.array(msg.twist.covariance).reshape(6, 6)[:3, :3] @ R_WB.T
         v = v if msg.twist.covariance[0] >= 0 else None  # -1: no velocity in this message
         self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance),
-                                catch_up=self._participant.lockstep is not False)
+                                at_once=self._participant.lockstep is not False)
         self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs.append(time.perf_counter() - begin)
 
-    def _catch_up(self) -> None:
+    def _go_on(self) -> None:
         begin = time.perf_counter()
-        self._estimator.catch_up()
+        self._estimator.go_on()
         self._update_costs[-1] += time.perf_counter() - begin
 
     def _receive_imu(self, data: bytes) -> None:
@@ -90,7 +90,7 @@ class EstimatorNode(PerchNode[UkfConfig]):
             self._participant.later(lambda: self._publish_costs(sample.stamp * 1e-9))
         self._steps += 1
         if self._estimator.behind:
-            self._participant.later(self._catch_up)
+            self._participant.later(self._go_on)
         elif self._unused_vio:
             msg = self._unused_vio.popleft()
             self._participant.later(lambda: self._use_vio(msg))

@@ -8,6 +8,7 @@ equations are in docs/estimation.md.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.stats import chi2
@@ -39,7 +40,7 @@ class Estimator:
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
         self._lag = 0
-        self._behind = False  # the live state does not go on from the base yet
+        self._rest: Iterator[None] | None = None  # of the work on a pose
         self._waiting: list[VioPose] = []
         self._refused_in_row = 0
         self._accepted = self._rejected = 0
@@ -65,17 +66,19 @@ class Estimator:
             self.add_vio(self._waiting.pop(0))
         return outcome
 
-    def add_vio(self, pose: VioPose, catch_up: bool = True) -> VioOutcome:
+    def add_vio(self, pose: VioPose, at_once: bool = True) -> VioOutcome:
         """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done.
 
-        Without `catch_up` the replay is left to the method of that name: half of the work, for who has to be on time.
+        Where not all is done at once two thirds are left to `go_on`, in parts, for who has to be on time.
         """
+        while self.behind:
+            self.go_on()
         outcome = pose.problem() or self._timing(pose)
         if outcome is None:
             try:
                 outcome = self._apply(pose) if self._base is not None else self._begin(pose)
-                if catch_up or self._live is None:
-                    self._catch_up()
+                while self.behind and (at_once or self._live is None):
+                    self._go_on()
             except CovarianceError as error:
                 self._break(str(error))
                 return VioOutcome.GATED
@@ -89,13 +92,13 @@ class Estimator:
 
     @property
     def behind(self) -> bool:
-        """Whether a VIO pose has been applied whose replay is still to be done."""
-        return self._behind
+        """Whether a VIO pose was accepted that the estimate does not show yet."""
+        return self._rest is not None
 
-    def catch_up(self) -> None:
-        """Replay the IMU since the last VIO pose, if that is still to be done."""
+    def go_on(self) -> None:
+        """Do the next part of what `add_vio` has left."""
         try:
-            self._catch_up()
+            self._go_on()
         except CovarianceError as error:
             self._break(str(error))
 
@@ -167,7 +170,7 @@ class Estimator:
     def _begin(self, pose: VioPose) -> VioOutcome:
         steps = self._imu.run(max(self._imu.oldest, pose.stamp - round(self.config.rest_time * 1e9)), pose.stamp)
         self._doubt[:] = 0.0
-        self._settle(start.from_vio(self.config, pose, steps), pose)
+        self._rest = self._settle(start.from_vio(self.config, pose, steps), pose)
         self._broken = False
         return VioOutcome.STARTED
 
@@ -187,11 +190,15 @@ class Estimator:
                 return VioOutcome.GATED
             prior = self._jumped(prior, innovation)
             innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
-        belief = drift.follow(self._transform.correct(prior, innovation), pose, self._doubt)
+        self._rest = self._follow(self._transform.correct(prior, innovation), pose)
+        return outcome
+
+    def _follow(self, belief: Belief, pose: VioPose) -> Iterator[None]:
+        belief = drift.follow(belief, pose, self._doubt)
+        yield
         if self.config.use_velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
             belief = tracklet.join(belief, pose)
-        self._settle(belief, pose)
-        return outcome
+        yield from self._settle(belief, pose)
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
         return self._transform.innovate(prior, pose.p_WB, pose.q_WB, drift.white(self.config.vio))
@@ -208,17 +215,18 @@ class Estimator:
         self._doubt += np.diag(extra[at.D_DRIFT])
         return dataclasses.replace(prior, P=prior.P + np.diag(extra))
 
-    def _settle(self, belief: Belief, pose: VioPose) -> None:
-        """Make a belief at a pose's stamp the new base, which the live state is to catch up with."""
+    def _settle(self, belief: Belief, pose: VioPose) -> Iterator[None]:
+        """Make a belief at a pose's stamp the new base, and bring the live state from there up to now."""
         self._base, self._covariance, self._refused_in_row = belief, pose.covariance, 0
-        self._anchors, self._behind = [belief], True
+        self._anchors = [belief]
+        yield
+        now = self._imu.last.stamp
+        self._live = self._transform.predict(belief, self._imu.run(belief.stamp, now), now)
+        self._x, self._lag = self._live.x.copy(), 0
 
-    def _catch_up(self) -> None:
-        """Bring the live state from the base up to now, where that is still to be done."""
-        if self._behind:
-            now = self._imu.last.stamp
-            self._live = self._transform.predict(self._base, self._imu.run(self._base.stamp, now), now)
-            self._x, self._lag, self._behind = self._live.x.copy(), 0, False
+    def _go_on(self) -> None:
+        if next(self._rest, self._rest) is self._rest:  # that was the last part
+            self._rest = None
 
     def _refresh(self) -> None:
         """Bring the published covariance up to now, and keep a belief from which the kept IMU steps can be replayed."""
@@ -239,5 +247,5 @@ class Estimator:
     def _break(self, why: str) -> None:
         """Start again with the next VIO pose."""
         self._base = self._live = self._covariance = None
-        self._anchors, self._behind = [], False
+        self._anchors, self._rest = [], None
         self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"
