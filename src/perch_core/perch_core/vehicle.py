@@ -94,6 +94,7 @@ class Vehicle:
     body_rate_max: float = quantity(unit="rad/s", above=0.0, doc="largest |omega| that a plan may ask for")
     drag: Vector3 = quantity((0.0, 0.0, 0.0), unit="N s/m", low=0.0, doc="linear rotor drag, axes of B")
     perch_offset: float = quantity(unit="m", low=0.0, high=1.0, doc="velcro or gripper below the centre of mass")
+    stand_off: float = quantity(0.0, unit="m", low=0.0, high=0.2, doc="how far short of a wire the gripper is planned to stop")
     rest_sag: float = quantity(0.0, unit="m", low=0.0, high=0.1, doc="how much lower it stands, felt or feet pressed by its weight")
     perch_radius: float = quantity(0.04, unit="m", above=0.0, doc="radius of the velcro plate")
     body_radii: Vector3 = quantity(unit="m", above=0.0, doc="ellipsoid that contains the vehicle")
@@ -134,6 +135,11 @@ class Vehicle:
     def hover_thrust(self) -> float:
         """Collective thrust that carries the weight [N]."""
         return self.mass * GRAVITY
+
+    @property
+    def wire_offset(self) -> float:
+        """Centre of mass from the axis of a wire, where a perch on it is planned to end [m]."""
+        return self.perch_offset + self.stand_off
 
     @property
     def standing_height(self) -> float:

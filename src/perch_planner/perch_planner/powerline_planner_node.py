@@ -109,7 +109,7 @@ class PowerlinePlannerNode(PerchNode[PowerlinePlannerParameters]):
             deadline = float(request.deadline) if request.deadline != 0 else self.params.deadline
             if not math.isfinite(deadline):
                 raise PlanningRefusal("bad_input", "deadline", -1.0, f"deadline {deadline} s is not finite")
-            asked = powerline_request(request, self._model, self._vehicle.perch_offset)
+            asked = powerline_request(request, self._model, self._vehicle.wire_offset)
             waited = time.monotonic() - job.arrived
             if 0.0 < deadline <= waited:
                 raise PlanningRefusal("deadline", "wall-clock time", deadline - waited,

@@ -40,7 +40,7 @@ def fly_line(task: Task) -> RunResult:
     trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5)
     flight, vehicle = TracedFlight(trace), load_vehicle(scenario.vehicle)
     metrics = flatten(flight_metrics(flight, vehicle, trace.end_time), trace.end_time)
-    metrics |= perching_errors(flight, scenario, vehicle.perch_offset) | mapping_errors(flight, scenario)
+    metrics |= perching_errors(flight, scenario, vehicle.wire_offset) | mapping_errors(flight, scenario)
     metrics["other_lines_touched"] = float(_others_touched(flight, scenario))
     return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion), trace.outcome,
                      trace.message, metrics=metrics)
@@ -58,13 +58,13 @@ def _others_touched(flight: Flight, scenario: Scenario) -> int:
     return sum(m.state in states and m.body.startswith("cable") and m.body != target for _, m in flight.messages("contact"))
 
 
-def perching_errors(flight: Flight, scenario: Scenario, perch_offset: float) -> dict[str, float | None]:
+def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> dict[str, float | None]:
     """Errors when the perch ends, or when the gripper closes before.
 
     Args:
         flight: what was flown.
         scenario: where the wires truly are.
-        perch_offset: gripper below the centre of mass, to the wire's axis [m].
+        wire_offset: centre of mass from the wire's axis where the plan ends [m].
 
     Returns:
         `perching_position_m`: across the wire, of the body's true place against the true wire from its planned place against the
@@ -89,7 +89,7 @@ def perching_errors(flight: Flight, scenario: Scenario, perch_offset: float) -> 
         return none
     wanted, last, true = plan.sample(moment - plan.start_time), plan.sample(perch_time), truth.at(np.array([moment]))
     b3 = so3.quat_to_matrix(wanted.q)[:, 2]
-    planned_wire = last.p - perch_offset * so3.quat_to_matrix(last.q)[:, 2]
+    planned_wire = last.p - wire_offset * so3.quat_to_matrix(last.q)[:, 2]
     wire = CableLine(scenario.world.cables[_target(scenario)]).nearest(true.p[0])
     apart = (true.p[0] - wire.point_W) - (wanted.p - planned_wire)
     apart -= (apart @ wire.direction) * wire.direction

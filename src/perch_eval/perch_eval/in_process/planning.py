@@ -58,7 +58,7 @@ class PowerlinePlanning:
         """The plan for a query, or why there is none."""
         msg, response = powerline_request(query), PlanPowerline.Response()
         try:
-            plan = self._planner.plan(powerline_messages.powerline_request(msg, self._model, self._vehicle.perch_offset))
+            plan = self._planner.plan(powerline_messages.powerline_request(msg, self._model, self._vehicle.wire_offset))
         except PerchError as error:
             response.message = str(error)
         else:

@@ -99,7 +99,7 @@ class PowerlineProblem:
             perch = PerchPose.at(np.array(self.perch.position), q_WB / np.linalg.norm(q_WB), velocity)
         else:
             perch = PerchPose.on_line(target, np.array(self.perch.point), np.radians(self.perch.pitch_deg),
-                                      vehicle.perch_offset, start[:3], velocity)
+                                      vehicle.wire_offset, start[:3], velocity)
         return PowerlineRequest(start, request.lines, self.target, perch, self.perception, self.recovery)
 
 

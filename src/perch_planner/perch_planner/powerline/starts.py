@@ -83,7 +83,7 @@ class StartSearch:
         """Hovers around the perch point that face it, above the minimum height, the present start first."""
         yield request
         target = request.target()
-        grip = request.perch.p_WB - vehicle.perch_offset * request.perch.s3_W
+        grip = request.perch.p_WB - vehicle.wire_offset * request.perch.s3_W
         normal = _normal(target, request.start[P] - grip)
         for distance in self.distances:
             for height in self.heights:

@@ -16,13 +16,13 @@ from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 
 
-def powerline_request(msg: PlanPowerline.Request, model: RotorModel, perch_offset: float) -> PowerlineRequest:
+def powerline_request(msg: PlanPowerline.Request, model: RotorModel, wire_offset: float) -> PowerlineRequest:
     """The planner's request of a message.
 
     Args:
         msg: as asked.
         model: of the vehicle, for the thrusts of a hover.
-        perch_offset: from the wire's axis to the centre of mass along b3 [m].
+        wire_offset: from the wire's axis to the centre of mass along b3 [m].
 
     Raises:
         PerchError: values that cannot be a request.
@@ -51,7 +51,7 @@ def powerline_request(msg: PlanPowerline.Request, model: RotorModel, perch_offse
         point = to_array(msg.perch_point)
         if not np.all(np.isfinite(point)):
             raise PlanningRefusal("bad_input", "perch point", -1.0, f"perch point {point.tolist()} is not finite")
-        perch = PerchPose.on_line(target, point, float(msg.perch_pitch), perch_offset, start[P], velocity)
+        perch = PerchPose.on_line(target, point, float(msg.perch_pitch), wire_offset, start[P], velocity)
     return PowerlineRequest(start, lines, request.target_line, perch, request.perception, request.with_recovery)
 
 
