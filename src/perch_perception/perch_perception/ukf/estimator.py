@@ -96,9 +96,10 @@ class Estimator:
         return self._rest is not None
 
     def go_on(self) -> None:
-        """Do the next part of what `add_vio` has left."""
+        """Do the next part of what `add_vio` has left, if there is one."""
         try:
-            self._go_on()
+            if self.behind:
+                self._go_on()
         except CovarianceError as error:
             self._break(str(error))
 
