@@ -17,21 +17,19 @@ import math
 
 import numpy as np
 from perch_core import so3
+from perch_core.jit import compiled
 
 from perch_perception.ukf import layout as at
 from perch_perception.ukf import update_kernels
 from perch_perception.ukf.config import VioNoise
 from perch_perception.ukf.measurement import VioPose
 from perch_perception.ukf.tracklet import split
-from perch_perception.ukf.unscented import Belief
-
-_POSE = np.r_[at.D_POSITION, at.D_ATTITUDE]
-_BLOCK = np.ix_(_POSE, _POSE)
+from perch_perception.ukf.unscented import Belief, CovarianceError
 
 
 def least_growth(noise: VioNoise, dt: float) -> np.ndarray:
     """Least covariance that the drift gains in dt [s], shape (6, 6)."""
-    return np.diag(np.repeat([noise.drift_position**2 * dt, noise.drift_attitude**2 * dt], 3))
+    return _twice_three(noise.drift_position**2 * dt, noise.drift_attitude**2 * dt)
 
 
 def increment(noise: VioNoise, C_before: np.ndarray, C_now: np.ndarray, dt: float,
@@ -102,27 +100,45 @@ def follow(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
     Raises:
         CovarianceError: a covariance is not positive definite.
     """
-    x, theta = belief.x.copy(), at.D_ATTITUDE
+    theta = at.D_ATTITUDE
     B = np.linalg.solve(belief.P[theta, theta], belief.P[theta, at.D_ACCEL_BIAS]).T
-    x[at.POSITION] += x[16:19]
-    x[at.QUATERNION] = update_kernels.vios_attitude(x)
-    x[at.ACCEL_BIAS] += B @ at.minus(x, belief.x)[theta]
-    x[at.DRIFT] = 0.0
+    x = belief.x.copy()
+    turn = update_kernels.take_over_pose(x)
+    x[at.ACCEL_BIAS] += B @ np.array(turn)
     J = np.zeros((6, 6))
     J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(x[at.QUATERNION]).T
-    beside = np.eye(at.ERROR_SIZE)
-    beside[at.D_ACCEL_BIAS, theta] = -B
-    P = beside @ belief.P @ beside.T
-    own = P[_BLOCK]
-    less, more = split(own, J @ (pose.covariance + doubt) @ J.T)
-    P[_POSE] -= less @ np.linalg.solve(own, P[_POSE])
-    P[:, _POSE] = P[_POSE].T
-    P[_BLOCK] = own - less + more
-    beside[at.D_ACCEL_BIAS, theta] = B
+    try:
+        P = _as_sure(belief.P, B, J @ (pose.covariance + doubt) @ J.T)
+    except np.linalg.LinAlgError:
+        raise CovarianceError("covariance after an update is not positive definite") from None
+    return dataclasses.replace(belief, x=x, P=P)
+
+
+@compiled
+def _as_sure(P, B, C):
+    """`follow`'s covariance (21, 21), of P (21, 21), B (3, 3) and VIO's C (6, 6) of the errors (position, rotation in B)."""
+    n = len(P)
+    beside, back, pose = np.eye(n), np.eye(n), np.zeros((6, n))  # indices: `layout`
+    beside[12:15, 6:9] = -B
+    back[12:15, 6:9] = B
+    pose[:3, :3] = pose[3:, 6:9] = np.eye(3)
     P = beside @ P @ beside.T
-    return dataclasses.replace(belief, x=x, P=0.5 * (P + P.T))
+    own = pose @ P @ pose.T
+    D, M = split(own, C)
+    gain = np.linalg.solve(own, D).T
+    kept = back @ (np.eye(n) - pose.T @ gain @ pose)
+    moved = back @ pose.T
+    P = kept @ P @ kept.T + moved @ (D - gain @ D + M) @ moved.T
+    return 0.5 * (P + P.T)
 
 
 def white(noise: VioNoise) -> np.ndarray:
     """Covariance of the white part of a VIO pose, shape (6, 6)."""
-    return np.diag(np.repeat([noise.position**2, noise.attitude**2], 3))
+    return _twice_three(noise.position**2, noise.attitude**2)
+
+
+def _twice_three(a: float, b: float) -> np.ndarray:
+    """Diagonal (a, a, a, b, b, b), shape (6, 6)."""
+    out = np.zeros((6, 6))
+    out.flat[::7] = a, a, a, b, b, b
+    return out

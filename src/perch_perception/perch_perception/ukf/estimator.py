@@ -144,6 +144,7 @@ class Estimator:
         row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
         prior = self._transform.predict(belief, row, 2_000_000)
         pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), np.zeros(3), np.eye(3))
+        pose.problem()
         drift.increment(self.config.vio, pose.covariance, pose.covariance, 0.03, pose.velocity_covariance)
         corrected = self._transform.correct(prior, self._innovate(prior, pose))
         drift.follow(corrected, pose, self._doubt)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from perch_core.jit import compiled
 
 
 class VioOutcome(enum.Enum):
@@ -63,16 +66,19 @@ class VioPose:
     def problem(self) -> VioOutcome | None:
         """Why the pose cannot be used, or None."""
         numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_WB, self.velocity_covariance) if n is not None]
-        if not all(np.all(np.isfinite(n)) for n in numbers) or abs(np.linalg.norm(self.q_WB) - 1) > 1e-3:
+        if not math.isfinite(sum(n.sum() for n in numbers)) or abs(math.hypot(*self.q_WB) - 1) > 1e-3:
             return VioOutcome.NOT_FINITE
         covariances = [C for C in (self.covariance, self.velocity_covariance) if C is not None]
-        return None if all(_is_covariance(C) for C in covariances) else VioOutcome.BAD_COVARIANCE
+        return None if all(_is_covariance(np.ascontiguousarray(C)) for C in covariances) else VioOutcome.BAD_COVARIANCE
 
 
-def _is_covariance(C: np.ndarray) -> bool:
+@compiled
+def _is_covariance(C):
     """Whether a matrix is symmetric and has no negative eigenvalue, up to rounding."""
     scale = np.abs(C).max()
-    return bool(np.all(np.abs(C - C.T) <= 1e-5 * scale + 1e-15) and np.linalg.eigvalsh(C)[0] >= -1e-9 * scale - 1e-15)
+    if np.abs(C - C.T).max() > 1e-5 * scale + 1e-15:
+        return False
+    return np.linalg.eigvalsh(C)[0] >= -1e-9 * scale - 1e-15
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ import dataclasses
 
 import numpy as np
 from perch_core import so3
+from perch_core.jit import compiled
 
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.measurement import VioPose
 from perch_perception.ukf.unscented import Belief, CovarianceError
 
-_KEPT = np.r_[at.D_POSITION, at.D_ATTITUDE, at.D_DRIFT]
 _LEAST = 1e-12  # variance that is left of what VIO claims to know exactly
 
 
@@ -40,37 +40,49 @@ def join(belief: Belief, pose: VioPose) -> Belief:
     Raises:
         CovarianceError: a covariance is not positive definite.
     """
-    x, U = belief.x.copy(), np.eye(at.ERROR_SIZE)
-    U[at.D_VELOCITY, at.D_ATTITUDE] = so3.hat(x[at.VELOCITY]) @ so3.quat_to_matrix(x[at.QUATERNION])
-    Q, u = U @ belief.P @ U.T, at.D_VELOCITY
-    own, C = Q[u, u], pose.velocity_covariance
-    less, more = split(own, C)
-    step = Q[:, u] @ np.linalg.solve(own + more, pose.v_WB - x[at.VELOCITY])
-    G = np.linalg.solve(own, Q[u]).T
-    after = Q - G @ less @ G.T
-    after[np.ix_(_KEPT, _KEPT)] = Q[np.ix_(_KEPT, _KEPT)]
-    after[u, u] += more
+    x = belief.x.copy()
+    A = -so3.hat(x[at.VELOCITY]) @ so3.quat_to_matrix(x[at.QUATERNION])
+    try:
+        step, P = _joined(belief.P, A, np.ascontiguousarray(pose.velocity_covariance), pose.v_WB - x[at.VELOCITY])
+    except np.linalg.LinAlgError:
+        raise CovarianceError("covariance after an update is not positive definite") from None
     x[at.VELOCITY] += step[at.D_VELOCITY]
     x[at.GYRO_BIAS] += step[at.D_GYRO_BIAS]
     x[at.ACCEL_BIAS] += step[at.D_ACCEL_BIAS]
-    back = 2.0 * np.eye(at.ERROR_SIZE) - U
-    P = back @ after @ back.T
-    return dataclasses.replace(belief, x=x, P=0.5 * (P + P.T))
+    return dataclasses.replace(belief, x=x, P=P)
 
 
-def split(own: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@compiled
+def _joined(P, A, C, y):
+    """`join`'s step (21,) and covariance (21, 21), of P (21, 21), A and VIO's C (3, 3) and y (3,)."""
+    n = len(P)
+    beside, back, u = np.eye(n), np.eye(n), np.zeros((3, n))  # indices: `layout`
+    beside[3:6, 6:9] = -A
+    back[3:6, 6:9] = A
+    u[:, 3:6] = np.eye(3)
+    P = beside @ P @ beside.T
+    own = u @ P @ u.T
+    D, M = split(own, C)
+    step = P @ u.T @ np.linalg.solve(own + M, y)
+    G = np.linalg.solve(own, u @ P).T
+    pose = G.copy()  # of position, attitude and drift
+    pose[3:6] = 0.0
+    pose[9:15] = 0.0
+    P = back @ (P - G @ D @ G.T + pose @ D @ pose.T + u.T @ M @ u) @ back.T
+    return step, 0.5 * (P + P.T)
+
+
+@compiled
+def split(own, C):
     """D and M, both >= 0, with own - D + M = C and D <= own: what C is smaller by in some directions, and larger in others, (n, n).
 
     The directions are those in which both are diagonal, own = L L^T, L^-1 C L^-T = E diag(l) E^T; the positive part of own - C in
     others may be larger than own.
 
     Raises:
-        CovarianceError: `own` is not positive definite.
+        numpy.linalg.LinAlgError: `own` is not positive definite.
     """
-    try:
-        L = np.linalg.cholesky(own)
-    except np.linalg.LinAlgError:
-        raise CovarianceError("covariance after an update is not positive definite") from None
+    L = np.linalg.cholesky(own)
     half = np.linalg.solve(L, C + _LEAST * np.eye(len(C)))
     values, E = np.linalg.eigh(np.linalg.solve(L, half.T))
     F = L @ E

@@ -32,6 +32,20 @@ def vios_attitude(x):
 
 
 @compiled
+def take_over_pose(x):
+    """Give the nominal state x (22,) the pose that VIO would report there and no drift; the turn in B, a rotation vector."""
+    q = vios_attitude(x)
+    turn = _rotation_vector(quaternion_product((-x[6], -x[7], -x[8], x[9]), q))
+    for i in range(3):
+        x[i] += x[16 + i]
+    for i in range(4):
+        x[6 + i] = q[i]
+    for i in range(16, 22):
+        x[i] = 0.0
+    return turn
+
+
+@compiled
 def _vios_attitude_near(x, sign, e):
     """As `vios_attitude`, of the nominal state moved by the error sign * e (21,)."""
     q = turned((x[6], x[7], x[8], x[9]), (sign * e[6], sign * e[7], sign * e[8]))
