@@ -6,7 +6,7 @@ from perch_sim.simulation import START
 
 
 def test_an_image_exposed_before_the_first_step_ends_is_looked_at():
-    flight, middles = _Flight(load_scenario("surface_90_far"), 64, Sensing(), None), []
+    flight, middles = _Flight(load_scenario("surface_90_far"), 64, Sensing()), []
     answer = flight.target.answer
 
     def noted(delivery, *others):

@@ -1,4 +1,4 @@
-"""Where the cameras' images are drawn while the flight goes on: on threads, or in processes of their own."""
+"""Where the cameras' images are drawn: in this process when they are looked at, or in processes of their own while the flight goes on."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import multiprocessing
 import select
 import signal
 from collections import deque
-from collections.abc import Collection, Sequence
-from concurrent.futures import Executor, Future
-from concurrent.futures import wait as wait_for
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Protocol
@@ -49,38 +48,42 @@ class Drawing(Protocol):
         """Begin the image of one exposure: `Renderer.render` of that camera."""
 
 
-class DrawnOnThreads:
-    """Images drawn by an executor of the caller's, in this process."""
+class DrawnOnDemand:
+    """Images drawn in this process when somebody looks at them, and not at all where nobody does.
 
-    def __init__(self, scenario: Scenario, seed: int, cameras: Collection[str], executor: Executor) -> None:
+    On a thread they are drawn no sooner where every core has a flight of its own, and drawing and flight wait for each
+    other's interpreter lock.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, cameras: Collection[str]) -> None:
         """
         Args:
             scenario: what is seen.
             seed: of the flight.
             cameras: names of those that take images.
-            executor: carries the work out.
 
         Raises:
             ConfigError: the scenario's vehicle or board does not exist.
         """
         self.cameras = tuple(cameras)
         self._renderers = {name: Renderer(scene, mount, seed) for name, scene, mount in _seen(scenario, seed, cameras)}
-        self._executor = executor
 
     def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
         """As `Drawing.draw`."""
-        return _Submitted(self._executor.submit(self._renderers[camera].render, poses, rng, target_shift))
+        return _Undrawn(partial(self._renderers[camera].render, poses, rng, target_shift))
 
 
-class _Submitted:
-    def __init__(self, future: Future[np.ndarray]) -> None:
-        self._future = future
+class _Undrawn:
+    def __init__(self, render: Callable[[], np.ndarray]) -> None:
+        self._render, self._image = render, None
 
     def done(self, timeout: float = 0.0) -> bool:
-        return bool(wait_for((self._future,), timeout).done)
+        return self._image is not None
 
     def result(self) -> np.ndarray:
-        return self._future.result()
+        if self._image is None:
+            self._image = self._render()
+        return self._image
 
 
 class DrawnInProcesses:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time as clock
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +40,7 @@ from perch_planner.powerline_planner_node import PowerlinePlannerParameters
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
 from perch_sim.camera_stream import Delivery
-from perch_sim.drawing import DrawnOnThreads
+from perch_sim.drawing import DrawnOnDemand
 from perch_sim.participants import triggers
 from perch_sim.simulation import Output, Simulation
 from perch_sim.state_history import StateHistory
@@ -72,13 +71,13 @@ class Sensing:
 class _Flight:
     """One flight in the making."""
 
-    def __init__(self, scenario: Scenario, seed: int, sensing: Sensing, pool: ThreadPoolExecutor | None) -> None:
+    def __init__(self, scenario: Scenario, seed: int, sensing: Sensing) -> None:
         powerline = scenario.mode != "surface"
         if powerline and sensing.target != "rendered":
             raise PerchError(f"scenario {scenario.name}: powerlines have no error model; sensing.target must be rendered")
         params = NodeParameters(scenario, seed)
         self.scenario = scenario
-        self.simulation = Simulation(scenario, seed, DrawnOnThreads(scenario, seed, sensing.cameras, pool) if pool else None)
+        self.simulation = Simulation(scenario, seed, DrawnOnDemand(scenario, seed, sensing.cameras) if sensing.cameras else None)
         vehicle = self.simulation.vehicle
         self.latency = {t.node: round(t.latency * 1e9)
                         for t in triggers(("vio", "target_localizer", "powerline_mapper", "mission"), scenario.latency)}
@@ -225,16 +224,15 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
         PerchError: something that this engine does not fly.
     """
     began = clock.perf_counter()
-    with ThreadPoolExecutor(1, thread_name_prefix="render") as pool:
-        flight = _Flight(scenario, seed, sensing, pool if sensing.cameras else None)
-        limit = round(scenario.time_limit * SECOND)
-        stamp, cancelled = 0, False
-        while flight.commanding.outcome is None and stamp < limit + PATIENCE:
-            stamp = flight.step(cancelled)
-            cancelled = stamp > limit
-        end = stamp + round(linger * SECOND)
-        while stamp < end:
-            stamp = flight.step(False)
+    flight = _Flight(scenario, seed, sensing)
+    limit = round(scenario.time_limit * SECOND)
+    stamp, cancelled = 0, False
+    while flight.commanding.outcome is None and stamp < limit + PATIENCE:
+        stamp = flight.step(cancelled)
+        cancelled = stamp > limit
+    end = stamp + round(linger * SECOND)
+    while stamp < end:
+        stamp = flight.step(False)
     trace, outcome = flight.trace, flight.commanding.outcome
     trace.pad, trace.phases = flight.simulation.pad, flight.commanding.phases
     trace.end_time = seconds(end - round(linger * SECOND))
