@@ -68,7 +68,7 @@ def _fly(scenario: str, seed: int) -> _Flown:
 
 
 def _rmse(flight: estimation_flight.Flight, track: estimation_flight.EstimatorTrack) -> np.ndarray:
-    perching = track.times >= flight.perch_time
+    perching = track.times >= flight.motion.perch_time
     return np.sqrt((track.errors[perching, :3] ** 2).mean(axis=0))
 
 

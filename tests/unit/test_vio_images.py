@@ -91,7 +91,7 @@ def test_from_the_ground_to_the_wall():
     assert set(posed) <= {FrameOutcome.RESTING, FrameOutcome.LEAVING, FrameOutcome.TRACKING}
     lift_off = flight().motion.settings.ground + 0.35
     assert all(s.result.outcome is not FrameOutcome.RESTING for s in steps if s.time > lift_off)
-    errors = np.array([s.error for s in steps if s.error is not None and s.time > flight().perch_time])
+    errors = np.array([s.error for s in steps if s.error is not None and s.time > flight().motion.perch_time])
     assert np.sqrt((errors[:, :3] ** 2).mean(axis=0)).max() < 0.03
     assert np.degrees(np.linalg.norm(errors[-1, 3:6])) < 1.5
     assert steps[-1].result.restarts == 0
@@ -146,7 +146,7 @@ def test_a_covered_camera_is_reported_and_survived():
     assert last.result.restarts == 0
     # the estimator coasts meanwhile and says so
     whole, estimator, healths = flight(), Estimator(), {}
-    poses = [flights.vio_pose(s.result) for s in steps if s.result.estimate is not None]
+    poses = [flights.received(s.result.estimate) for s in steps if s.result.estimate is not None]
     for k in range(int(4.4 / CONTROL_PERIOD)):
         while poses and poses[0].stamp * 1e-9 + 0.04 <= whole.truth.times[k]:
             estimator.add_vio(poses.pop(0))

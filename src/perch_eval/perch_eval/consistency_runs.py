@@ -36,9 +36,6 @@ class _Run:
     """One flight: the estimator along it, VIO's NEES at its poses, the pad as it was seen."""
 
     track: EstimatorTrack
-    perch_time: float
-    airborne: float
-    end: float
     vio_times: np.ndarray
     vio_nees: np.ndarray
     vio_nis: float  # over its dimension
@@ -57,6 +54,7 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
         NEES of estimator, VIO and target over time, and a summary with RMSE through the perch and mean NIS.
     """
     flown, progress = [], Progress(runs, what="perches")
+    motion = flights.motion_of(load_scenario(scenario_name), first_seed)  # its phases are those of every run
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker) as pool:
         for one in pool.map(_fly, [scenario_name] * runs, range(first_seed, first_seed + runs)):
             flown.append(one)
@@ -68,10 +66,10 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     covariances = np.array([one.track.covariances[:n] for one in flown])
     results = [consistency.judge(name, times, consistency.nees(errors[..., s], covariances[..., s, s]), s.stop - s.start)
                for name, s in GROUPS.items()]
-    grid = np.arange(flown[0].airborne, flown[0].end - 0.1, 1 / 30)
+    grid = np.arange(motion.settings.ground + AIRBORNE_AFTER, motion.duration - 0.1, 1 / 30)
     results.append(consistency.judge("vio: pose", grid, np.array([np.interp(grid, one.vio_times, one.vio_nees) for one in flown]), 6))
     results += _judge_target([one.sightings for one in flown])
-    rmse = 100 * np.array([np.sqrt((one.track.errors[one.track.times >= one.perch_time, :3] ** 2).mean(axis=0)) for one in flown])
+    rmse = 100 * np.array([np.sqrt((one.track.errors[one.track.times >= motion.perch_time, :3] ** 2).mean(axis=0)) for one in flown])
     summary = {"scenario": scenario_name, "runs": runs, "rmse_cm_median": np.median(rmse, axis=0).tolist(),
                "rmse_cm_worst": rmse.max(axis=0).tolist(),
                "estimator_nis_over_6": float(np.concatenate([one.track.nis for one in flown]).mean() / 6),
@@ -87,14 +85,13 @@ def _fly(scenario_name: str, seed: int) -> _Run:
     scenario = load_scenario(scenario_name)
     flight = flights.fly(scenario, seed)
     steps = flights.run_vio(flight)
-    airborne = flight.motion.settings.ground + AIRBORNE_AFTER
-    track = flights.run_estimator(flight, steps, begin=airborne)
+    track = flights.run_estimator(flight, steps, begin=flight.motion.settings.ground + AIRBORNE_AFTER)
     posed = [s for s in steps if s.error is not None]
     seen = [s for s in posed if s.result.nis_dimension]
-    return _Run(track, flight.perch_time, airborne, flight.motion.duration, np.array([s.time for s in posed]),
+    return _Run(track, np.array([s.time for s in posed]),
                 np.array([consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed]),
                 sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen),
-                see_target(scenario, flight, track, seed, flight.perch_time + LOOK[0], flight.perch_time + LOOK[1]))
+                see_target(scenario, flight, track, seed, flight.motion.perch_time + LOOK[0], flight.motion.perch_time + LOOK[1]))
 
 
 def _judge_target(sightings: list[Sightings]) -> list[Consistency]:

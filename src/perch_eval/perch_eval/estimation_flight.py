@@ -19,7 +19,8 @@ from perch_core.vehicle import load_vehicle
 from perch_eval.consistency import attitude_error
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
 from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
-from perch_perception.vio import VioConfig, VioResult, VisualInertialOdometry
+from perch_perception.ukf.odometry import vio_pose
+from perch_perception.vio import VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
 from perch_sim.calibration import true_mount
 from perch_sim.rendering import Renderer, build_scene
 
@@ -36,7 +37,6 @@ class Flight:
         readings: of the IMU.
         mount: the camera as calibrated, what VIO is told.
         frames: (middle of the exposure [s], stamp [ns], image), in order.
-        perch_time: when the perching trajectory begins [s].
         told_wrong: by how much position [m] and yaw [rad] are wrong that VIO is told at its start, shape (4,).
     """
 
@@ -45,7 +45,6 @@ class Flight:
     readings: ImuReadings
     mount: CameraMount
     frames: tuple[tuple[float, int, np.ndarray], ...]
-    perch_time: float
     told_wrong: np.ndarray = field(default_factory=lambda: np.zeros(4))
 
     def sample(self, k: int) -> ImuSample:
@@ -86,8 +85,7 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
-    return Flight(motion, truth, read_imu(truth, vehicle.imu, rng), mount, tuple(frames),
-                  motion.duration - motion.settings.perch, _told_wrong(seed))
+    return Flight(motion, truth, read_imu(truth, vehicle.imu, rng), mount, tuple(frames), _told_wrong(seed))
 
 
 def _told_wrong(seed: int) -> np.ndarray:
@@ -155,11 +153,9 @@ def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:
                            m.R_WB[0].T @ m.v_WB[0] - e.R_WB.T @ e.v_WB])
 
 
-def vio_pose(result: VioResult) -> VioPose:
+def received(e: VioPoseEstimate) -> VioPose:
     """What the estimator node makes of VIO's odometry."""
-    e = result.estimate
-    return VioPose(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.pose_covariance, e.v_WB,
-                   e.R_WB @ e.velocity_covariance @ e.R_WB.T)
+    return vio_pose(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.pose_covariance, e.v_WB, e.velocity_covariance)
 
 
 @dataclass(frozen=True)
@@ -183,7 +179,7 @@ def run_estimator(flight: Flight, steps: list[VioStep], config: UkfConfig = UkfC
                   begin: float = 0.7, stride: int = 5) -> EstimatorTrack:
     """The estimator on a flight's IMU and on VIO's poses, which arrive `latency` [s] after their exposure."""
     estimator, q, rows, nis = Estimator(config), flight.truth.q_WB, [], []
-    poses: Iterator[VioPose] = iter([vio_pose(s.result) for s in steps if s.result.estimate is not None])
+    poses: Iterator[VioPose] = iter([received(s.result.estimate) for s in steps if s.result.estimate is not None])
     pending = next(poses, None)
     for k, t in enumerate(flight.truth.times):
         while pending is not None and pending.stamp * 1e-9 + latency <= t:

@@ -102,6 +102,11 @@ class PerchMotion:
         # a spline of degree 7 through the path: position and its derivatives then belong together exactly
         object.__setattr__(self, "_path", make_interp_spline(times, self._position(times), k=7))
 
+    @property
+    def perch_time(self) -> float:
+        """When the perching trajectory begins [s]."""
+        return self.duration - self.settings.perch
+
     def _position(self, t: np.ndarray) -> np.ndarray:
         s, rng = self.settings, np.random.default_rng(self.seed)
         begin = s.ground + s.climb + s.hover

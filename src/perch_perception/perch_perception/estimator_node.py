@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from perch_core import so3
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds, odometry_arrays, to_stamp, to_vector
@@ -19,8 +18,8 @@ from perch_core.ros.wire import OdometryTemplate, read_imu
 from perch_msgs.msg import EstimatorStatus
 from sensor_msgs.msg import Imu
 
-from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
-from perch_perception.ukf.odometry import covariances
+from perch_perception.ukf import Estimator, ImuSample, UkfConfig
+from perch_perception.ukf.odometry import covariances, vio_pose
 
 STATUS_PERIOD = 50       # steps: 10 Hz
 DIAGNOSTICS_PERIOD = 500  # steps: 1 Hz
@@ -60,13 +59,11 @@ class EstimatorNode(PerchNode[UkfConfig]):
         begin = time.perf_counter()
         p, q, v, _ = odometry_arrays(msg)
         covariance = np.array(msg.pose.covariance).reshape(6, 6)
-        velocity_covariance = None
-        if msg.twist.covariance[0] > 0:  # in B; all zero: not given
-            R_WB = so3.quat_to_matrix(q)
-            velocity_covariance = R_WB @ np.array(msg.twist.covariance).reshape(6, 6)[:3, :3] @ R_WB.T
-        v = v if msg.twist.covariance[0] >= 0 else None  # -1: no velocity in this message
-        self._estimator.add_vio(VioPose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance),
-                                at_once=self._participant.lockstep is not False)
+        twist = np.array(msg.twist.covariance).reshape(6, 6)
+        v = v if twist[0, 0] >= 0 else None  # -1: no velocity in this message
+        velocity_covariance_B = twist[:3, :3] if twist[0, 0] > 0 else None  # all zero: not given
+        pose = vio_pose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance_B)
+        self._estimator.add_vio(pose, at_once=self._participant.lockstep is not False)
         self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs.append(time.perf_counter() - begin)
 

@@ -8,6 +8,7 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_eval.in_process.wire import received_velocity
 from perch_perception.ukf import ImuSample, VioPose
+from perch_perception.ukf.odometry import vio_pose
 from perch_perception.vio import VioConfig, VisualInertialOdometry
 from perch_sim import seeding
 from perch_sim.camera_stream import Delivery
@@ -73,5 +74,4 @@ class RenderedVio:
 def _received(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray,
               velocity_covariance_B: np.ndarray) -> VioPose:
     """A pose as the estimator takes it from `vio/odometry`."""
-    R_WB = so3.quat_to_matrix(q_WB)
-    return VioPose(stamp, p_WB, q_WB, covariance, received_velocity(q_WB, v_WB), R_WB @ velocity_covariance_B @ R_WB.T)
+    return vio_pose(stamp, p_WB, q_WB, covariance, received_velocity(q_WB, v_WB), velocity_covariance_B)

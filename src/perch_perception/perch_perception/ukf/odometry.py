@@ -1,4 +1,4 @@
-"""The estimate's covariances in the axes of nav_msgs/Odometry."""
+"""To and from the axes of nav_msgs/Odometry: the estimate's covariances, VIO's pose."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_perception.ukf import layout as at
-from perch_perception.ukf.measurement import Estimate
+from perch_perception.ukf.measurement import Estimate, VioPose
 
 
 def covariances(estimate: Estimate, gyro_noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -32,3 +32,17 @@ def covariances(estimate: Estimate, gyro_noise: float) -> tuple[np.ndarray, np.n
     twist = twist_map @ estimate.P @ twist_map.T
     twist[3:, 3:] += gyro_noise**2 * np.eye(3)
     return pose_map @ estimate.P @ pose_map.T, twist
+
+
+def vio_pose(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray | None,
+             velocity_covariance_B: np.ndarray | None) -> VioPose:
+    """VIO's pose as the estimator takes it.
+
+    Args:
+        stamp, p_WB, q_WB, covariance, v_WB: as in `VioPose`.
+        velocity_covariance_B: of the velocity in B, shape (3, 3), or None.
+    """
+    if velocity_covariance_B is None:
+        return VioPose(stamp, p_WB, q_WB, covariance, v_WB)
+    R_WB = so3.quat_to_matrix(q_WB)
+    return VioPose(stamp, p_WB, q_WB, covariance, v_WB, R_WB @ velocity_covariance_B @ R_WB.T)
