@@ -172,7 +172,7 @@ class MissionNode(PerchNode[MissionParameters]):
             return
         self._told = (now, *told)
         self._goal_handle.publish_feedback(Perch.Feedback(
-            phase=machine.phase.value, progress=float(machine.progress), time_to_contact=float(machine.time_to_contact),
+            phase=machine.phase.value, progress=machine.phase.progress, time_to_contact=float(machine.time_to_contact),
             message=machine.message))
 
     # -- planner -----------------------------------------------------------------------------------------------------

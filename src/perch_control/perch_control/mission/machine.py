@@ -11,7 +11,7 @@ from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.usable_target import usable
 from perch_control.mission.values import (
-    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
+    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanQuery, Result, Target)
 from perch_control.mission.waypoints import waypoint_lines
 
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
@@ -28,7 +28,6 @@ class MissionMachine:
         self.settings = settings
         self.phase = Phase.IDLE
         self.message = ""
-        self.target: Target | None = None
         self.time_to_contact = float("nan")
         self._adhesion = AdhesionMonitor(settings.adhesion)
         self._goal: Goal | None = None
@@ -39,9 +38,9 @@ class MissionMachine:
     def start(self, goal: Goal, time: float) -> None:
         """Take a goal; the machine must be idle."""
         self._goal, self._attempts_left = goal, goal.attempts
-        self.target, self._failure = None, None
+        self._failure: str | None = None
         self._moves = Moves(self.settings)
-        self._perch: PlanAnswer | None = None
+        self._running: RunningPerch | RunningPlan | None = None
         self._perch_id = 0
         self._contact_time = float("nan")
         self._cancelled = False
@@ -61,14 +60,6 @@ class MissionMachine:
         else:
             getattr(self, f"_{self.phase.value}")(inputs, outputs)
         return outputs
-
-    @property
-    def progress(self) -> float:
-        """Share of the mission's phases that lie behind, 0 to 1."""
-        order = [Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING, Phase.VERIFYING, Phase.PERCHED]
-        if self.phase is Phase.INSPECTING:
-            return order.index(Phase.TRACKING) / (len(order) - 1)
-        return order.index(self.phase) / (len(order) - 1) if self.phase in order else 0.0
 
     # -- phases ------------------------------------------------------------------------------------------------------
 
@@ -133,11 +124,14 @@ class MissionMachine:
         if not inputs.plan.success:
             self._end(outputs, Result.REFUSED, f"planner refused: {inputs.plan.message}")
             return
-        self._fly(inputs.plan, outputs)
+        if self._goal.mode is Mode.POWERLINE:
+            self._fly(RunningPlan(inputs.plan, self._target, self.settings), outputs)
+        else:
+            self._fly(RunningPerch(inputs.plan, self._target, self._target), outputs)
         self._enter(Phase.TRACKING, inputs.time, f"perching, {inputs.plan.duration:.2f} s")
 
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
-        end = self._perch.start_time + self._perch.duration
+        end = self._running.end
         self.time_to_contact = end - inputs.time
         if inputs.trajectory_id == self._perch_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"perch given up: {inputs.controller_message}")
@@ -151,9 +145,9 @@ class MissionMachine:
             self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
 
     def _verifying(self, inputs: Inputs, outputs: Outputs) -> None:
-        end = self._perch.start_time + self._perch.duration
+        end = self._running.end
         self.time_to_contact = end - inputs.time
-        if self._adhesion.attached(inputs.state, self.target):
+        if self._adhesion.attached(inputs.state, self._running.target):
             self._contact_time = inputs.time
             self._adhesion.reset()
             outputs.commands.append((Command.ATTACHED, "the surface carries the vehicle"))
@@ -221,40 +215,28 @@ class MissionMachine:
 
     def _gripped(self, inputs: Inputs) -> bool:
         """An abort came so late that the vehicle passed the wire on its way out, and holds it."""
-        if self._goal.mode is not Mode.POWERLINE or self._perch is None:
-            return False
-        after = inputs.time - self._perch.start_time - self._perch.duration
-        return -self.settings.contact_early < after < 1.0 and self._adhesion.attached(inputs.state, self.target)
+        return (isinstance(self._running, RunningPlan) and -self.settings.contact_early < inputs.time - self._running.end < 1.0
+                and self._adhesion.attached(inputs.state, self._running.target))
 
     # -- planning ----------------------------------------------------------------------------------------------------
 
     def _ask_plan(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
-        self.target = target
+        self._target = target
+        latency, lead = self.settings.planning_times(self._goal.mode)
         zero = np.zeros(3)
         p, yaw = self._moves.hover
-        outputs.query = PlanQuery(inputs.time + self._lead, p, zero, zero, zero, yaw, target, self._goal, self._latency)
+        outputs.query = PlanQuery(inputs.time + lead, p, zero, zero, zero, yaw, target, self._goal, latency)
         self._enter(Phase.PLANNING, inputs.time, "planning")
-
-    @property
-    def _latency(self) -> float:
-        """How long the planner of this goal is given [s]."""
-        powerline = self._goal.mode is Mode.POWERLINE
-        return self.settings.powerline_latency if powerline else self.settings.planner_latency
-
-    @property
-    def _lead(self) -> float:
-        return max(self.settings.plan_lead, self._latency + 0.04)
 
     def _replan(self, inputs: Inputs, outputs: Outputs) -> None:
         """Refine the target in flight and continue from the running plan's future (M's future work)."""
         better = self._running.better(inputs.plan, inputs.time, self.settings)
         if better is not None:
             if better is not self._running:
-                self._running, self.target = better, better.target
-                self._fly(better.plan, outputs)
-                self.message = f"re-planned, {better.plan.duration:.2f} s"
+                self._fly_better(better, outputs)
             return
-        asked = self._running.query(inputs.time, self._usable_now(inputs), self._goal, self.settings, inputs.time + self._lead, self._latency)
+        latency, lead = self.settings.planning_times(self._goal.mode)
+        asked = self._running.query(inputs.time, self._usable_now(inputs), self._goal, self.settings, inputs.time + lead, latency)
         if asked is not None:
             self._running, outputs.query = asked
 
@@ -264,22 +246,21 @@ class MissionMachine:
             outputs.way_out, better = self._running.answered(inputs.plan, inputs.time)
             outputs.trajectory_id = self._perch_id
             if better is not None:
-                self._running, self.target = better, better.target
-                self._fly(better.plan, outputs)
-                self.message = f"re-planned, {better.plan.duration:.2f} s"
+                self._fly_better(better, outputs)
         target = self._usable_now(inputs)
         moved = self._running.moved(inputs.time, target, self._goal)
         if moved is not None and outputs.perch is None and outputs.way_out is None:
-            self._running, self.target, self._perch = moved, moved.target, moved.plan
+            self._running = moved
             outputs.perch, outputs.trajectory_id = moved.plan, self._perch_id
         outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
 
-    def _fly(self, plan: PlanAnswer, outputs: Outputs) -> None:
-        self._perch, self._perch_id = plan, self._new_id()
-        outputs.perch, outputs.trajectory_id = plan, self._perch_id
-        if self.phase is Phase.PLANNING:
-            powerline = self._goal.mode is Mode.POWERLINE
-            self._running = RunningPlan(plan, self.target, self.settings) if powerline else RunningPerch(plan, self.target, self.target)
+    def _fly(self, running: RunningPerch | RunningPlan, outputs: Outputs) -> None:
+        self._running, self._perch_id = running, self._new_id()
+        outputs.perch, outputs.trajectory_id = running.plan, self._perch_id
+
+    def _fly_better(self, better: RunningPerch | RunningPlan, outputs: Outputs) -> None:
+        self._fly(better, outputs)
+        self.message = f"re-planned, {better.plan.duration:.2f} s"
 
     def _usable_now(self, inputs: Inputs) -> Target | None:
         """The target, where it is fresh and certain enough to plan on."""

@@ -25,7 +25,13 @@ class Phase(str, Enum):
     VERIFYING = "verifying"
     PERCHED = "perched"
     RECOVERING = "recovering"
-    LANDING = "landing"
+
+    @property
+    def progress(self) -> float:
+        """Share of the mission that lies behind, 0 to 1."""
+        order = (Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING, Phase.VERIFYING, Phase.PERCHED)
+        phase = Phase.TRACKING if self is Phase.INSPECTING else self
+        return order.index(phase) / (len(order) - 1) if phase in order else 0.0
 
 
 class Result(IntEnum):
