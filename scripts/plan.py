@@ -39,16 +39,29 @@ def _plan_perch(mapping: dict, source: str, out: Path) -> int:
     return 0
 
 
-def _plan_powerline(mapping: dict, source: str, out: Path) -> int:
-    from perch_planner.powerline.problem import run
+def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool = False) -> int:
+    from perch_core import config
+    from perch_planner.powerline import problem
+    from perch_planner.powerline.report import write_report
 
-    return run(mapping, source, out)
+    planned = problem.plan(config.from_mapping(problem.PowerlineProblem, mapping, source))
+    written = write_report(planned, out, animation)
+    for name in ("perch", "recovery"):
+        part = getattr(planned.plan, name)
+        if part is not None:
+            print(f"{name} of {part.duration:.3f} s; {part.solver}, {part.iterations} iterations in {1e3 * part.solve_time:.0f} ms")
+    for bound in planned.plan.bounds:
+        print(f"  {bound}")
+    seen = written.get("visibility")
+    if seen is not None:
+        print(f"line in front {100 * seen['cheirality_share']:.0f} %, its segment at the centre {100 * seen['segment_share']:.0f} %, "
+              f"in the image {100 * seen['seen_share']:.0f} % of the perch; mean |reprojection| {seen['mean_reprojection_px']:.0f} px")
+    print("written: " + ", ".join(written["files"]))
+    return 0
 
 
 def _animate_powerline(mapping: dict, source: str, out: Path) -> int:
-    from perch_planner.powerline.problem import run
-
-    return run(mapping, source, out, animation=True)
+    return _plan_powerline(mapping, source, out, animation=True)
 
 
 KINDS = {"perch": _plan_perch, "powerline": _plan_powerline}
@@ -60,12 +73,17 @@ def _apply(mapping: dict, changes: list[str]) -> None:
     import yaml
     from perch_core.errors import ConfigError
 
-    settings = mapping.setdefault("settings", {})
     for change in changes:
         key, sign, value = change.partition("=")
         if not sign:
             raise ConfigError("--set", change, "is not KEY=VALUE")
-        settings[key] = yaml.safe_load(value)
+        settings = mapping.get("settings") or {}
+        if not isinstance(settings, dict):
+            return  # refused with the rest of the file
+        try:
+            mapping["settings"] = {**settings, key: yaml.safe_load(value)}
+        except yaml.YAMLError:
+            raise ConfigError("--set", change, "is not valid YAML after the =") from None
 
 
 def main() -> int:
@@ -105,7 +123,7 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"error: {arguments.out}: {error.strerror}", file=sys.stderr)
+        print(f"error: --out: {arguments.out}: cannot be written: {error.strerror}", file=sys.stderr)
         return 2
 
 

@@ -60,7 +60,8 @@ def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
 
 @pytest.mark.parametrize("arguments, code, words", [
     (("surface_90", "--set", "thrust_max=2.6"), 1, "thrust_floor"), (("no_such_problem",), 2, "no_such_problem"),
-    (("surface_90", "--set", "solver=x"), 2, "settings.solver"), ((), 2, "problem is needed")])
+    (("surface_90", "--set", "solver=x"), 2, "settings.solver"), ((), 2, "problem is needed"),
+    (("surface_90", "--set", "thrust_max=["), 2, "--set: thrust_max=[: is not valid YAML")])
 def test_the_script_says_what_is_wrong_by_word_and_exit_code(arguments, code, words, tmp_path):
     done = run(*arguments, "--out", str(tmp_path / "never"))
     assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr

@@ -21,6 +21,7 @@ from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
+from perch_planner.powerline.report import write_report
 from perch_planner.powerline.request import PerchPose
 from perch_planner.powerline.starts import StartSearch, best_start
 
@@ -116,7 +117,7 @@ def test_a_perch_that_no_trajectory_reaches_is_refused_with_what_is_violated(pla
 
 
 def test_the_report_holds_what_was_planned(planned: PlannedProblem, tmp_path: Path) -> None:
-    written = problem.report(planned, tmp_path)
+    written = write_report(planned, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plan.csv", "plan.json", "plan.png", "visibility.png"]
     content = json.loads((tmp_path / "plan.json").read_text())
     assert content["perch"]["duration_s"] == planned.plan.perch.duration == written["perch"]["duration_s"]

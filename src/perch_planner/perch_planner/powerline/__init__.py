@@ -1,6 +1,6 @@
 """Perches on powerlines by nonlinear programming: plan, check, recover. [P:V]
 
-`PowerlinePlanner` plans in this process, `PowerlineWorker` in one that can be killed; `problem` reads and reports files.
+`PowerlinePlanner` plans in this process, `PowerlineWorker` in one that can be killed; `problem` reads files, `report` writes what came out.
 """
 
 from perch_planner.powerline.certificate import Bound

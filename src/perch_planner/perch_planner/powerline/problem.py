@@ -1,4 +1,4 @@
-"""Powerline problems as YAML files of `kind: powerline`: read, planned and reported without ROS."""
+"""Powerline problems as YAML files of `kind: powerline`: read and planned without ROS."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.config import choice, part, quantity, text
-from perch_core.errors import ConfigError, PlanningRefusal
+from perch_core.errors import ConfigError
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, V, W, hover_state
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
@@ -123,32 +123,6 @@ def load(name_or_path: str | Path) -> PowerlineProblem:
     return config.load(PowerlineProblem, config.find("problems", name_or_path))
 
 
-def run(mapping: dict[str, Any], source: str, out: Path, animation: bool = False) -> int:
-    """Plan the content of a problem file, write its report and print what came out, for `scripts/plan.py`.
-
-    Returns:
-        Exit code 0.
-
-    Raises:
-        ConfigError: a value that is refused.
-        PlanningRefusal: bad request, or no trajectory within the limits.
-    """
-    planned = plan(config.from_mapping(PowerlineProblem, mapping, source))
-    written = report(planned, out, animation)
-    for name in ("perch", "recovery"):
-        part = getattr(planned.plan, name)
-        if part is not None:
-            print(f"{name} of {part.duration:.3f} s; {part.solver}, {part.iterations} iterations in {1e3 * part.solve_time:.0f} ms")
-    for bound in planned.plan.bounds:
-        print(f"  {bound}")
-    seen = written.get("visibility")
-    if seen is not None:
-        print(f"line in front {100 * seen['cheirality_share']:.0f} %, its segment at the centre {100 * seen['segment_share']:.0f} %, "
-              f"in the image {100 * seen['seen_share']:.0f} % of the perch; mean |reprojection| {seen['mean_reprojection_px']:.0f} px")
-    print("written: " + ", ".join(written["files"]))
-    return 0
-
-
 def plan(problem: PowerlineProblem, **changes: Any) -> PlannedProblem:
     """Plan a problem in this process.
 
@@ -166,20 +140,3 @@ def plan(problem: PowerlineProblem, **changes: Any) -> PlannedProblem:
     for name, value in changes.items():
         request = config.replace(request, **{name: value})
     return PlannedProblem(problem, vehicle, request, planner, planner.plan(request))
-
-
-def report(planned: PlannedProblem, folder: Path | str, animation: bool = False) -> dict[str, Any]:
-    """Write CSV, JSON and pictures of a plan; see `report.write_report`.
-
-    A plan with perception awareness is pictured beside the same perch without it, where there is one.
-    """
-    from perch_planner.powerline.report import write_report  # matplotlib is slow to load and flights need none
-
-    without = None
-    if planned.request.perception:
-        try:
-            blind = config.replace(planned.request, perception=False, with_recovery=False)
-            without = planned.planner.plan(blind).perch
-        except PlanningRefusal:  # nothing to compare with; the plan itself stands
-            pass
-    return write_report(planned, Path(folder), animation, without)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from perch_core import config
+from perch_core.errors import PlanningRefusal
+from perch_planner.powerline.plan import Manoeuvre
+from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.visibility import visibility
-
-if TYPE_CHECKING:
-    from perch_planner.powerline.plan import Manoeuvre
-    from perch_planner.powerline.problem import PlannedProblem
 
 COLUMNS = ("t", "p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w", "v_x", "v_y", "v_z", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z",
            "dw_x", "dw_y", "dw_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
@@ -54,20 +54,30 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def write_report(planned: PlannedProblem, folder: Path, animation: bool = False, without: Manoeuvre | None = None
-                 ) -> dict[str, Any]:
+def _without_awareness(planned: PlannedProblem) -> Manoeuvre | None:
+    """The perch of a plan with perception awareness, planned without it; None where there is nothing to compare."""
+    if not planned.request.perception:
+        return None
+    try:
+        return planned.planner.plan(config.replace(planned.request, perception=False, with_recovery=False)).perch
+    except PlanningRefusal:  # the plan itself stands
+        return None
+
+
+def write_report(planned: PlannedProblem, folder: Path, animation: bool = False) -> dict[str, Any]:
     """Write `plan.csv`, `plan.json`, `plan.png`, with a perch `visibility.png`, and if wanted `plan.gif`.
+
+    A plan with perception awareness is pictured beside the same perch without it, where there is one.
 
     Args:
         planned: what to report.
         folder: made where it is missing.
         animation: also write the film.
-        without: the same perch without perception awareness, for comparison in the visibility picture.
 
     Returns:
         The content of the JSON file, with the files' names under "files".
     """
-    from perch_planner.powerline import picture
+    from perch_planner.powerline import picture  # matplotlib is slow to load
 
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "plan.csv", folder / "plan.json", folder / "plan.png"]
@@ -75,7 +85,7 @@ def write_report(planned: PlannedProblem, folder: Path, animation: bool = False,
     picture.draw_manoeuvre(planned, paths[2])
     if planned.plan.perch is not None:
         paths.append(folder / "visibility.png")
-        picture.draw_visibility(planned, paths[-1], without)
+        picture.draw_visibility(planned, paths[-1], _without_awareness(planned))
     if animation:
         paths.append(folder / "plan.gif")
         picture.draw_animation(planned, paths[-1])
