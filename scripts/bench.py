@@ -38,8 +38,11 @@ def main() -> int:
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures to FILE")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions: the figures are rougher")
     arguments = parser.parse_args()
-    if arguments.json and not arguments.json.resolve().parent.is_dir():
-        parser.error(f"--json {arguments.json}: its folder does not exist")
+    if arguments.json:
+        try:
+            arguments.json.open("a").close()  # before minutes of measuring
+        except OSError as error:
+            parser.error(f"--json {arguments.json}: cannot be written: {error.strerror}")
     enter()
     leave_quietly_on_interrupt()
     sys.path.insert(0, str(ROOT / "bench"))

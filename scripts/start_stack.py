@@ -7,6 +7,7 @@ The nodes' output appears with the node's name in front; it is also kept, with t
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -61,6 +62,8 @@ def main() -> int:
         parser.error(f"--domain {arguments.domain} is outside [0, 101]")
     if arguments.view is not None and not 0 <= arguments.view <= 65535:
         parser.error(f"--view {arguments.view} is outside [0, 65535]")
+    if not 0.0 < arguments.ready_timeout < math.inf:
+        parser.error(f"--ready-timeout {arguments.ready_timeout} is not > 0 s")
     if arguments.namespace and not arguments.namespace.startswith("/"):
         parser.error(f"--namespace {arguments.namespace}: must begin with '/', as in /quad1")
     if arguments.domain is not None:
@@ -96,6 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs, sharing
+    from perch_eval.output_folder import output_folder
     from perch_eval.stack import Stack
     from perch_eval.view.address import check_free
     from ros_graph.connection import visit
@@ -116,7 +120,7 @@ def run(arguments: argparse.Namespace) -> None:
         lockstep=not arguments.realtime,
         overrides=overrides,
     )
-    folder = (arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute()
+    folder = output_folder((arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute(), "--log-dir")
     programs = node_programs(launches, folder, namespace=arguments.namespace, composed=sharing(arguments.composed))
     stack = Stack(programs, folder, on_line=printer([program.name for program in programs]))
     try:

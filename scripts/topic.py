@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ros_graph.commands import add_spin_time, main, parser
+from ros_graph.commands import add_spin_time, count, main, parser, positive
 from ros_graph.qos_options import add_qos_options
 
 EXAMPLES = """examples:
@@ -45,7 +45,7 @@ def command_line() -> argparse.ArgumentParser:
     echo = commands.add_parser("echo", help="print messages as they come")
     _add_topic(echo)
     echo.add_argument("--once", action="store_true", help="end after one message")
-    echo.add_argument("-n", type=int, metavar="N", help="end after N messages")
+    echo.add_argument("-n", type=count, metavar="N", help="end after N messages")
     echo.add_argument("--timeout", type=float, metavar="S", help="end after so long [s]; exit code 1 if nothing came")
     echo.add_argument("--field", metavar="PATH", help="only a part, as in pose.pose.position.x or rotor_speed[0]")
     echo.add_argument("--csv", action="store_true", help="one line per message")
@@ -58,17 +58,17 @@ def command_line() -> argparse.ArgumentParser:
 
     rate = commands.add_parser("hz", help="measure the rate")
     _add_topic(rate)
-    rate.add_argument("-w", "--window", type=int, default=10_000, metavar="N", help="messages to average over")
-    rate.add_argument("-n", type=int, metavar="N", help="end after N messages")
+    rate.add_argument("-w", "--window", type=count, default=10_000, metavar="N", help="messages to average over")
+    rate.add_argument("-n", type=count, metavar="N", help="end after N messages")
     add_qos_options(rate)
 
     publish = commands.add_parser("pub", help="publish a message")
     publish.add_argument("topic")
     publish.add_argument("type")
     publish.add_argument("values", nargs="?", default="", help="fields in YAML, as in '{data: 1.0}'")
-    publish.add_argument("-r", "--rate", type=float, default=1.0, metavar="HZ")
+    publish.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ")
     publish.add_argument("-1", "--once", action="store_true")
-    publish.add_argument("-t", "--times", type=int, metavar="N")
+    publish.add_argument("-t", "--times", type=count, metavar="N")
     publish.add_argument("-w", "--wait-matching-subscriptions", type=int, metavar="N")
     add_qos_options(publish)
 

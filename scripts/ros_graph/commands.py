@@ -28,6 +28,22 @@ def parser(description: str, examples: str) -> argparse.ArgumentParser:
     )
 
 
+def count(text: str) -> int:
+    """A number of messages on a command line: at least one."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not >= 1")
+    return value
+
+
+def positive(text: str) -> float:
+    """A quantity on a command line that is neither zero, negative nor infinite."""
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a number > 0")
+    return value
+
+
 def add_spin_time(target: argparse.ArgumentParser) -> None:
     """How long to wait for the graph to become known."""
     target.add_argument(

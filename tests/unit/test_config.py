@@ -60,6 +60,9 @@ def test_refusals_name_file_key_and_range(tmp_path, content, key, words):
 def test_broken_yaml_and_missing_file(tmp_path):
     with pytest.raises(ConfigError, match="not valid YAML"):
         read(tmp_path, "{a: [")
+    (tmp_path / "picture.yaml").write_bytes(b"\x89PNG\xff\x00")
+    with pytest.raises(ConfigError, match="picture.yaml: is not text"):
+        config.load(Outer, tmp_path / "picture.yaml")
     with pytest.raises(ConfigError, match="cannot be read"):
         config.load(Outer, tmp_path / "none.yaml")
 

@@ -1,6 +1,8 @@
 """Campaign files, draws, causes of failure, results and their ranking."""
 
 import math
+from contextlib import closing
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +11,8 @@ from scipy.stats import binomtest, kstest
 
 from perch_core.errors import ConfigError
 from perch_core.scenario import Adhesion
+from perch_eval import demo
+from perch_eval.campaign import command as campaign
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.distributions import parse
 from perch_eval.campaign.engines import Task, carry_out
@@ -16,6 +20,7 @@ from perch_eval.campaign.figures import Axis
 from perch_eval.campaign.ranking import worst
 from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results
 from perch_eval.campaign.specification import Run, load_campaign, scenario_of
+from perch_eval.evaluation import command as evaluation
 from perch_eval.statistics import Rate, Spread
 from perch_sim.contact_event import ContactEvent, ContactState
 
@@ -136,6 +141,29 @@ def test_results_outlive_the_writer_and_are_read_while_it_writes(tmp_path):
     with pytest.raises(ResultsError, match="other settings"):
         Results(path, "c", "another", resume=True)
     assert Results(path, "c", "digest", resume=True).finished() == {1, 2, 3}
+
+
+def test_a_damaged_results_file_is_named_and_left_as_it_is(tmp_path):
+    path = tmp_path / "r.sqlite"
+    with closing(Results(path, "c", "digest", resume=False)) as results:
+        for n in range(400):
+            results.add(RunResult(n, n, "perched", "perched", "words " * 20))
+    whole = path.read_bytes()
+    for content in (b"no database at all" * 100, whole[:len(whole) // 2], whole[:8192] + bytes(8192) + whole[16384:]):
+        path.write_bytes(content)
+        with pytest.raises(ResultsError, match="r.sqlite cannot be read as results"):
+            Results(path, "c", "digest", resume=True)
+        assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("folder", ["file", "file/below", "/proc/flights"])
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_flown(tmp_path, monkeypatch, capsys, folder):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    for main, arguments in ((campaign.main, ["contact"]), (evaluation.main, ["--only", "m_planning"]), (demo.main, [])):
+        assert main([*arguments, "--out", folder]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.startswith(f"error: --out: {folder}: cannot be written: ") and len(said.err.splitlines()) == 1
 
 
 def test_the_worst_flights_show_every_cause():

@@ -68,8 +68,9 @@ def test_plots_are_written(recorded, tmp_path):
 
 @pytest.mark.parametrize("options, words", [
     (["--from", "90"], "the flight lasts"),
-    (["--fps", "0"], "--fps 0 is not > 0"),
+    (["--fps", "0"], "--fps 0 is not a number > 0"),
     (["--out", "x.avi"], "neither .gif nor .mp4"),
+    (["--speed", "inf"], "--speed inf is not a number > 0"),
     (["--vehicle", "zeppelin"], "zeppelin"),
 ])
 def test_what_cannot_be_shown_is_refused_in_one_line(recorded, capsys, options, words):
@@ -77,6 +78,17 @@ def test_what_cannot_be_shown_is_refused_in_one_line(recorded, capsys, options, 
     assert main([str(path), *options]) == 2
     said = capsys.readouterr().err
     assert words in said and len(said.splitlines()) == 1
+
+
+def test_a_damaged_recording_is_read_as_far_as_it_goes(recorded, tmp_path):
+    path, _ = recorded
+    whole, damaged = path.read_bytes(), tmp_path / "damaged.mcap"
+    middle = len(whole) // 2
+    damaged.write_bytes(whole[:middle] + bytes(4096) + whole[middle + 4096:])
+    count = len(Flight(path).messages("odometry"))
+    assert 0 < len(Flight(damaged).messages("odometry")) < count
+    damaged.write_bytes(whole[:middle])
+    assert 0 < len(Flight(damaged).messages("odometry")) < count
 
 
 def test_no_recording_is_the_callers_mistake(tmp_path, capsys):

@@ -158,11 +158,13 @@ def read_yaml(path: Path | str) -> Any:
         ConfigError: the file is missing or is not YAML.
     """
     try:
-        return yaml.load(Path(path).read_text(), _LOADER)
+        return yaml.load(Path(path).read_text(encoding="utf-8"), _LOADER)
     except OSError as error:
         raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from None
     except yaml.YAMLError as error:
         raise ConfigError(str(path), "", f"is not valid YAML: {' '.join(str(error).split())}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(str(path), "", "is not text in UTF-8") from None
 
 
 def load(cls: type[T], path: Path | str) -> T:

@@ -15,6 +15,7 @@ from perch_core.scenario import Scenario, load_scenario
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
+from perch_eval.output_folder import output_folder
 from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
 from perch_eval.report import build_report, inspection_words
 from perch_eval.stack import Stack, StackError
@@ -66,11 +67,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
     check_flight(scenario, source)
     if not 0 <= seed < 2**31:
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "flight.mcap").unlink(missing_ok=True)  # of an earlier flight: this one may end before it records
-    except OSError as error:
-        raise ConfigError("--out", str(out), f"cannot be written: {error.strerror}") from None
+    (output_folder(out) / "flight.mcap").unlink(missing_ok=True)  # of an earlier flight: this one may end before it records
     say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
     with reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)

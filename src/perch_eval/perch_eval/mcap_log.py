@@ -10,6 +10,7 @@ from ament_index_python.packages import get_package_share_directory
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
+from zstandard import ZstdError
 
 _PRIMITIVE = {"bool", "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32",
               "int64", "uint64", "string", "wstring"}
@@ -78,7 +79,7 @@ class McapLog:
 def read(path: Path, topics: set[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
     """Messages of a file in the order written: topic, type, time [ns], data.
 
-    A cut-off file is read as far as it goes; a flight that broke off before its first message has no file at all.
+    A cut-off or damaged file is read as far as it goes; a flight that broke off before its first message has no file at all.
     """
     if not path.exists():
         return
@@ -87,7 +88,7 @@ def read(path: Path, topics: set[str] | None = None) -> Iterator[tuple[str, str,
             for schema, channel, message in NonSeekingReader(file).iter_messages(topics=list(topics) if topics else None,
                                                                                  log_time_order=False):
                 yield channel.topic, schema.name, message.log_time, message.data
-        except (McapError, EOFError, struct.error):
+        except (McapError, EOFError, struct.error, ZstdError, UnicodeDecodeError):
             return
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sqlite3
 import sys
 from collections import Counter
 from pathlib import Path
@@ -16,13 +17,14 @@ from perch_eval.campaign.ranking import worst
 from perch_eval.campaign.results import Results, RunResult
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
+from perch_eval.output_folder import output_folder
 from perch_eval.statistics import Rate
 
 EXAMPLES = """examples:
-  python3 scripts/campaign.py wind                              config/campaigns/wind.yaml, in process, on all cores
+  python3 scripts/campaign.py contact                           config/campaigns/contact.yaml, in process, on all cores
   python3 scripts/campaign.py my.yaml --engine stack --jobs 1   the real nodes, each flight in a ROS domain of its own
-  python3 scripts/campaign.py wind --resume                     go on after an interruption
-  python3 scripts/campaign.py wind --cluster tcp://host:8786    on a Dask cluster (`local`: one on this machine)
+  python3 scripts/campaign.py contact --resume                  go on after an interruption
+  python3 scripts/campaign.py contact --cluster tcp://host:8786 on a Dask cluster (`local`: one on this machine)
 
 exit code: 0 every run was flown (whatever came of it), 1 some could not be carried out, 2 the caller's mistake,
 130 interrupted (results so far are kept; --resume goes on)"""
@@ -55,10 +57,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         campaign = load_campaign(args.campaign, args.engine, args.runs)
         resolve(campaign.engine)
-        out = args.out or Path("out") / "campaigns" / campaign.name
-        out.mkdir(parents=True, exist_ok=True)
+        out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
         results = Results(out / "results.sqlite", campaign.name, campaign.digest, args.resume)
-    except (PerchError, OSError) as error:
+    except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
@@ -68,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
         found = results.all()
         keep_worst(campaign, found, out)
         report = write_report(campaign, found, out)
-    except PerchError as error:
+    except (PerchError, OSError, sqlite3.Error) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -126,8 +127,6 @@ def summary(found: list[RunResult]) -> str:
     for cause, count in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():
         lines.append(f"  {count:5d}  {cause:<11} {MEANING.get(cause, '')}")
     return "\n".join(lines)
-
-
 
 
 if __name__ == "__main__":

@@ -55,13 +55,18 @@ class Results:
             resume: go on where an earlier campaign ended.
 
         Raises:
-            ResultsError: it holds another campaign's results, or results and `resume` is not asked for.
+            ResultsError: it holds another campaign's results, or results and `resume` is not asked for, or it is damaged.
         """
         self._db = sqlite3.connect(path)
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=NORMAL")
-        self._db.executescript(_SCHEMA)
-        known = dict(self._db.execute("SELECT key, value FROM campaign"))
+        try:
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=NORMAL")
+            self._db.executescript(_SCHEMA)
+            known = dict(self._db.execute("SELECT key, value FROM campaign"))
+            _read(self._db)
+        except sqlite3.Error as error:
+            self._db.close()
+            raise ResultsError(f"{path} cannot be read as results ({error}): choose another --out") from None
         if known and known.get("digest") != digest:
             self._db.close()
             raise ResultsError(f"{path} holds results of campaign {known.get('name')!r} with other settings: "

@@ -8,9 +8,10 @@ import sys
 import time
 from pathlib import Path
 
-from perch_core.errors import PerchError
+from perch_core.errors import ConfigError, PerchError
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
+from perch_eval.output_folder import output_folder
 
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       --quick: both papers, 5 seeds a condition, 1 on lines
@@ -103,13 +104,13 @@ def main(arguments: list[str] | None = None) -> int:
     effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, args.fresh, args.seeds, args.line_seeds)
     began = time.monotonic()
     try:
-        args.out.mkdir(parents=True, exist_ok=True)
+        output_folder(args.out)
         sections = evaluate(effort, args.only or [name for name in PARTS if args.full or name not in BEYOND_PAPERS])
         document.write(sections, args.out, mode, time.monotonic() - began)
     except KeyboardInterrupt:
         print("\ninterrupted; finished flights are kept, the same command goes on", file=sys.stderr)
         return 130
-    except OSError as error:
+    except (ConfigError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     found = document.counts(sections)

@@ -60,8 +60,8 @@ def _show(args: argparse.Namespace) -> int:
     if not args.flight.is_file():
         raise PerchError(f"{args.flight}: no such recording")
     for name in ("fps", "speed"):
-        if not getattr(args, name) > 0.0:
-            raise PerchError(f"--{name} {getattr(args, name):g} is not > 0")
+        if not 0.0 < getattr(args, name) < np.inf:
+            raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
     flight, vehicle = Flight(args.flight, args.namespace), load_vehicle(args.vehicle)
     try:
         view = View.of(flight)

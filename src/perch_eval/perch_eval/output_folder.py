@@ -1,0 +1,26 @@
+"""Folders that receive results: made, and tried out before the work begins."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from perch_core.errors import ConfigError
+
+
+def output_folder(path: Path, option: str = "--out") -> Path:
+    """Make a folder for results.
+
+    Args:
+        path: of the folder.
+        option: what the caller named it with, for the message.
+
+    Raises:
+        ConfigError: it cannot be made, or nothing can be written to it.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            return path
+    except OSError as error:
+        raise ConfigError(option, str(path), f"cannot be written: {error.strerror}") from None

@@ -1,0 +1,66 @@
+"""Scripts refuse what they cannot work with before they begin, in one line that names the option; exit code 2."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+
+
+class Entered(Exception):
+    """The arguments were accepted."""
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    """Runs a script's `main` up to where it enters its environment, in an empty folder with a file `file` in it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    Path("file").touch()
+
+    def enter():
+        raise Entered
+
+    def run_(name: str, *arguments: str):
+        spec = importlib.util.spec_from_file_location(f"script_{name}", SCRIPTS / f"{name}.py")
+        script = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(script)
+        monkeypatch.setattr(script, "enter", enter, raising=False)
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        if hasattr(script, "main") and not hasattr(script, "HANDLERS"):
+            script.main()
+        else:
+            script.command_line().parse_args(arguments)
+            raise Entered
+
+    return run_
+
+
+@pytest.mark.parametrize("name, arguments, words", [
+    ("bench", ("planner", "--json", "file/figures.json"), "--json file/figures.json: cannot be written: "),
+    ("bench", ("planner", "--json", "."), "--json .: cannot be written: "),
+    ("start_stack", ("--ready-timeout", "nan"), "--ready-timeout nan is not > 0 s"),
+    ("start_stack", ("--ready-timeout", "-1"), "--ready-timeout -1.0 is not > 0 s"),
+    ("topic", ("hz", "/imu/data_raw", "--window", "-1"), "-1 is not >= 1"),
+    ("topic", ("echo", "/odometry", "-n", "0"), "0 is not >= 1"),
+    ("topic", ("pub", "/x", "std_msgs/msg/Empty", "--rate", "0"), "0 is not a number > 0"),
+])
+def test_what_cannot_be_is_refused(run, capsys, name, arguments, words):
+    with pytest.raises(SystemExit) as end:
+        run(name, *arguments)
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and words in said.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name, arguments", [
+    ("bench", ("planner", "--json", "figures.json")),
+    ("start_stack", ("--ready-timeout", "20")),
+    ("topic", ("hz", "/imu/data_raw", "--window", "500", "-n", "3")),
+])
+def test_what_can_be_is_accepted(run, name, arguments):
+    with pytest.raises(Entered):
+        run(name, *arguments)
