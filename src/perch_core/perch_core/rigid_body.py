@@ -1,4 +1,4 @@
-"""Rigid-body dynamics that planners and controllers use. The simulator has its own, and a test compares them."""
+"""Rigid-body dynamics in plain numpy: tests hold the compiled models of controllers, planner and simulator against it."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class Grip:
 
 @dataclass(frozen=True, kw_only=True)
 class Latency:
-    """Modelled time from a slow participant's trigger to when its result counts [s] (DESIGN: VIO 35-45 ms)."""
+    """Modelled time from a slow participant's trigger to when its result counts [s] (on the paper's board VIO takes 35-45 ms)."""
 
     vio: float = quantity(0.040, unit="s", low=0.002, high=1.0)
     target_localizer: float = quantity(0.060, unit="s", low=0.002, high=1.0)

@@ -1,7 +1,7 @@
 """The paper's comparison for Table I: one nonlinear program with the thrust bounded at every sample. [M:eq16]
 
 The reduced coordinates of the planner's own QP are used, so that the comparison is fair to the nonlinear program: in
-the paper's coefficients it is slower still (DESIGN, section 5: 8-60 s).
+the paper's coefficients it is slower still (8-60 s).
 """
 
 from __future__ import annotations

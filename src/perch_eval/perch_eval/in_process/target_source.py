@@ -1,8 +1,8 @@
 """Where target poses come from: corners with the measured error of the tag pipeline, or the pipeline on rendered images.
 
 The error model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
-calibration errors included), shaken by the error that `perch_perception.tags` makes on rendered images (DESIGN, section 5:
-0.06 px at 1.7 m, 0.18 px at 3 m), and solved with the nominal camera by the code that flies. What it does not model:
+calibration errors included), shaken by the error that `perch_perception.tags` makes on rendered images (0.06 px
+at 1.7 m, 0.18 px at 3 m), and solved with the nominal camera by the code that flies. What it does not model:
 blur, contrast and light.
 """
 
