@@ -36,7 +36,6 @@ class MapperConfig:
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     straightness: float = config.quantity(0.02, unit="m", above=0.0, high=1.0,
                                           doc="a sagging wire is cut into chords that stay within this")
-    rotation_sigma: float = config.quantity(0.29, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis, 1 sigma")
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
     association: AssociationConfig = config.part(AssociationConfig)
 
@@ -233,11 +232,12 @@ class LineMapper:
         The odometry's position is left out: its drift moves vehicle and wires together.
         """
         lever = so3.hat(estimate.curve.at(np.array(s)) - self._body.p_WB)
-        turned = self._body.covariance[3:, 3:] + np.radians(self.settings.rotation_sigma) ** 2 * np.eye(3)
+        turned = self._body.covariance[3:, 3:] + np.radians(self.settings.triangulation.mount_rotation) ** 2 * np.eye(3)
         return estimate.point_covariance(s) + lever @ turned @ lever.T
 
     def _direction_sigma(self, estimate: WireEstimate) -> float:
-        attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1] + np.radians(self.settings.rotation_sigma) ** 2
+        mount = np.radians(self.settings.triangulation.mount_rotation)
+        attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1] + mount**2
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
 
 

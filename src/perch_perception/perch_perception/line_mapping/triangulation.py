@@ -52,6 +52,11 @@ class TriangulationConfig:
     sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
                                  doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
 
+    @property
+    def radius_known(self) -> bool:
+        """Whether the radius is told; else it is estimated from the widths alone."""
+        return self.radius_sigma > 0.0
+
 
 class DegenerateBaseline(PerchError):
     """The camera's motion does not determine the wire. `ratio` is sigma2/sigma1 of the planes' normals."""
@@ -140,7 +145,7 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
     # the median of all widths anew: those of crossing wires may have come first
-    size = _log_radius(curve, observations) if settings.radius_sigma == 0.0 else np.log(settings.radius)
+    size = np.log(settings.radius) if settings.radius_known else _log_radius(curve, observations)
     used = np.ones(len(observations), bool)
     drifted = _drifted(observations, settings)
     rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
@@ -196,7 +201,7 @@ def _wandering(by_rays, by_widths, walk, settings, curvature, mount, size):
     together they know the wire's place no better than that, however many they are.
     """
     parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
-    by_radius, misfit = (settings.radius_sigma**-2, size - np.log(settings.radius)) if settings.radius_sigma > 0.0 else (1e-6, 0.0)
+    by_radius, misfit = (settings.radius_sigma**-2, size - np.log(settings.radius)) if settings.radius_known else (1e-6, 0.0)
     tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [by_radius]])
     information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [misfit]])
     for part, slope, variance in zip(parts, slopes, walk):
