@@ -31,7 +31,6 @@ from perch_control.reference import FlatReference  # noqa: E402
 from perch_control.rotor_lag import RotorEstimate  # noqa: E402
 from perch_control.settings import GeometricGains  # noqa: E402
 from perch_core.scenario import load_scenario  # noqa: E402
-from perch_core.trajectory import rest_to_rest  # noqa: E402
 from perch_core.vehicle import load_vehicle  # noqa: E402
 from perch_eval.inspection.flight import fly  # noqa: E402
 from perch_eval.inspection.layout import random_layout  # noqa: E402
@@ -79,18 +78,12 @@ def _timed(law) -> tuple[list[float], list[float]]:
 
 
 def _move_rmse(job: tuple[str, str, bool]) -> float:
-    """A move of 2 m, 1 m, 0.5 m in 2 s, begun when the adaptation has settled: RMSE over all axes [m], by law, case and with L1 or not."""
+    """`Loop.move_rmse` [m] by law, case and with L1 or not."""
     name, case, adaptive = job
     loop = make_loop(law=LAWS[name](), disturbances=DISTURBED[case])
     if adaptive:
         loop.controller.compensator = L1Augmentation(VEHICLE, L1Settings())
-    loop.begin_in_hover()
-    loop.run(1.0)
-    hover = loop.references[-1]
-    loop.states.clear(), loop.references.clear()
-    loop.follow(rest_to_rest(hover, hover + [2, 1, 0.5], 0, 0.5, 2.0))
-    loop.run(2.4)
-    return float(np.linalg.norm(loop.rmse))
+    return loop.move_rmse()
 
 
 def _speed(quick: bool) -> list[Figure]:

@@ -103,6 +103,16 @@ class Loop:
         self.follow(rest_to_rest(p, p + [0, 0, height], 0.0, 0.0, max(1.0, height / 0.8)))
         self.run(max(1.0, height / 0.8) + 0.5)
 
+    def move_rmse(self) -> float:
+        """A move of 2 m, 1 m, 0.5 m in 2 s from a hover, begun when an adaptation has settled: RMSE over all axes [m]."""
+        self.begin_in_hover()
+        self.run(1.0)
+        hover = self.references[-1]
+        self.states.clear(), self.references.clear()
+        self.follow(rest_to_rest(hover, hover + [2, 1, 0.5], 0, 0.5, 2.0))
+        self.run(2.4)
+        return float(np.linalg.norm(self.rmse))
+
     @property
     def rmse(self) -> np.ndarray:
         """RMS of the distance to the reference per axis over the recorded steps [m], shape (3,)."""

@@ -2,22 +2,18 @@
 
 import numpy as np
 import pytest
-import rclpy
-from nav_msgs.msg import Odometry
+from nodes.played_vehicle import PlayedVehicle, played
 from perch_core import so3
 from perch_core.catenary import Catenary
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, nanoseconds, to_array, to_seconds, to_stamp
+from perch_core.ros.conversions import to_array
 from perch_core.vehicle import load_vehicle
-from perch_msgs.msg import PowerlineArray, Step, StepReport
+from perch_msgs.msg import PowerlineArray
 from perch_perception import powerline_mapper_node
 from perch_sim.rendering import CableCurve, Renderer, Scene
-from rclpy.experimental import EventsExecutor
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
-STEP_NS = 2_000_000
 MOUNT = load_vehicle("rpg").mounts["front"]
 CABLES = [Catenary.from_sag(np.array([3.0, -4.0, z]), np.array([3.2, 4.0, z]), 0.05) for z in (1.9, 2.6)]
 PITCH_UP = np.array([0.0, -np.sin(0.05), 0.0, np.cos(0.05)])
@@ -30,44 +26,16 @@ def renderer():
     return Renderer(scene, MOUNT, seed=1)
 
 
-class Vehicle:
-    """The test's side: it rises at 0.5 m/s and sends odometry, steps and images."""
+class Vehicle(PlayedVehicle):
+    """Rises in front of the wires."""
 
-    velocity = np.array([0.0, 0.0, 0.5])
-    sigma = 0.005
+    start, velocity = np.array([0.0, 0.0, 1.8]), np.array([0.0, 0.0, 0.5])
+    attitude, sigma, mount = PITCH_UP, 0.005, MOUNT
 
-    def __init__(self, context, executor, renderer):
-        self.node = rclpy.create_node("test_vehicle", context=context)
-        executor.add_node(self.node)
-        self.executor, self.renderer, self.index = executor, renderer, 0
-        self.rng = np.random.default_rng(0)
-        self.maps, self.reports = [], []
-        self.odometry = self.node.create_publisher(Odometry, "odometry", qos.CHAIN)
-        self.ticks = self.node.create_publisher(Step, "tick", qos.STEP)
-        self.images = self.node.create_publisher(Image, "camera_front/image_raw", qos.IMAGE)
+    def __init__(self, *graph):
+        super().__init__(*graph)
+        self.maps = []
         self.node.create_subscription(PowerlineArray, "powerlines", self.maps.append, qos.GATED)
-        self.node.create_subscription(StepReport, "step_report", self.reports.append, qos.GATED)
-
-    def position(self, t):
-        return np.array([0.0, 0.0, 1.8]) + t * self.velocity
-
-    def spin_until(self, condition, what):
-        for _ in range(1000):
-            if condition():
-                return
-            self.executor.spin_once(timeout_sec=0.01)
-        raise AssertionError(f"never saw {what}")
-
-    def advance(self, until):
-        while self.index * STEP_NS < round(until * 1e9):
-            stamp = to_stamp(self.index * STEP_NS)
-            msg = Odometry()
-            msg.header.stamp = stamp
-            fill_odometry(msg, self.position(to_seconds(stamp)), PITCH_UP, self.velocity, np.zeros(3))
-            msg.pose.covariance = np.diag([self.sigma**2] * 3 + [1e-5] * 3).ravel()
-            self.odometry.publish(msg)
-            self.ticks.publish(Step(stamp=stamp, index=self.index, lockstep=True))
-            self.index += 1
 
     def fly(self, seconds, encoding="rgb8"):
         """Images at 30 Hz, each answered before the next."""
@@ -77,38 +45,17 @@ class Vehicle:
             exposed = 0.1 + k / 30
             pixels = self.renderer.render([(self.position(exposed), R_WB)], self.rng)
             msg = Image(height=480, width=640, step=1920, encoding=encoding, data=pixels.tobytes())
-            msg.header.stamp = to_stamp(round((exposed + MOUNT.stamp_offset) * 1e9))
+            msg.header.stamp = self.stamp(exposed)
             self.images.publish(msg)
             self.advance(exposed + 0.02)
             self.spin_until(lambda: len(self.triggers()) == first + k + 1, f"the report of image {k}")
         return self.maps[-1] if self.maps else None
 
-    def triggers(self):
-        return [nanoseconds(r.trigger) for r in self.reports if nanoseconds(r.trigger) > 0]
-
 
 @pytest.fixture
 def graph(ros_domain, renderer):
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=ros_domain)
-    executor = EventsExecutor(context=context)
-    nodes = []
-
-    def start(kind=Vehicle, **parameters):
-        node = powerline_mapper_node.create(
-            context=context, parameter_overrides=[Parameter(k, value=v) for k, v in parameters.items()])
-        executor.add_node(node)
-        vehicle = kind(context, executor, renderer)
-        nodes.extend((node, vehicle.node))
-        vehicle.spin_until(lambda: vehicle.reports and vehicle.images.get_subscription_count()
-                           and vehicle.odometry.get_subscription_count() and vehicle.ticks.get_subscription_count(),
-                           "the node")
-        return vehicle
-
-    yield start
-    for node in nodes:
-        node.destroy_node()
-    rclpy.shutdown(context=context)
+    with played(powerline_mapper_node, ros_domain, renderer, Vehicle) as start:
+        yield start
 
 
 def test_maps_two_wires_and_reports_every_image(graph):

@@ -2,30 +2,21 @@
 
 import numpy as np
 import pytest
-import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
+from nodes.played_vehicle import PlayedVehicle, played
 from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, nanoseconds, pose_arrays, to_seconds, to_stamp
+from perch_core.ros.conversions import nanoseconds, pose_arrays, to_seconds
 from perch_core.scenario import load_scenario
 from perch_core.vehicle import load_vehicle
-from perch_msgs.msg import Step, StepReport, TargetDetection
+from perch_msgs.msg import TargetDetection
 from perch_perception import target_localizer_node
 from perch_sim.rendering import Renderer, build_scene
-from rclpy.experimental import EventsExecutor
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
-STEP_NS = 2_000_000
 MOUNT = load_vehicle("snapdragon").mounts["front"]
 SCENARIO = load_scenario("surface_60")
-SPEED = 1.5  # towards the pad [m/s]
-
-
-def position(t):
-    return np.array([SPEED * t, 0.0, 1.2])
 
 
 @pytest.fixture(scope="module")
@@ -33,86 +24,38 @@ def renderer():
     return Renderer(build_scene(SCENARIO, seed=2), MOUNT, seed=2)
 
 
-class Vehicle:
-    """The test's side: it flies towards the pad and sends odometry, steps and images."""
+class Vehicle(PlayedVehicle):
+    """Flies towards the pad."""
 
-    def __init__(self, context, executor, renderer):
-        self.node = rclpy.create_node("test_vehicle", context=context)
-        executor.add_node(self.node)
-        self.executor, self.renderer, self.index = executor, renderer, 0
-        self.rng = np.random.default_rng(0)
-        self.detections, self.reports, self.poses = [], [], []
-        self.odometry = self.node.create_publisher(Odometry, "odometry", qos.CHAIN)
-        self.ticks = self.node.create_publisher(Step, "tick", qos.STEP)
-        self.images = self.node.create_publisher(Image, "camera_front/image_raw", qos.IMAGE)
+    start, velocity, mount = np.array([0.0, 0.0, 1.2]), np.array([1.5, 0.0, 0.0]), MOUNT
+
+    def __init__(self, *graph):
+        super().__init__(*graph)
+        self.detections, self.poses = [], []
         self.node.create_subscription(TargetDetection, "target/detections", self.detections.append, qos.GATED)
-        self.node.create_subscription(StepReport, "step_report", self.reports.append, qos.GATED)
         self.node.create_subscription(PoseWithCovarianceStamped, "target/pose", self.poses.append, qos.GATED)
-
-    def spin_until(self, condition, what):
-        for _ in range(1000):
-            if condition():
-                return
-            self.executor.spin_once(timeout_sec=0.01)
-        raise AssertionError(f"never saw {what}")
-
-    def advance(self, until):
-        """Steps with odometry up to a time [s]."""
-        while self.index * STEP_NS < round(until * 1e9):
-            stamp = to_stamp(self.index * STEP_NS)
-            msg = Odometry()
-            msg.header.stamp = stamp
-            fill_odometry(msg, position(to_seconds(stamp)), np.array([0.0, 0.0, 0.0, 1.0]),
-                          np.array([SPEED, 0.0, 0.0]), np.zeros(3))
-            msg.pose.covariance = np.diag([1e-4] * 3 + [1e-5] * 3).ravel()
-            self.odometry.publish(msg)
-            self.ticks.publish(Step(stamp=stamp, index=self.index, lockstep=True))
-            self.index += 1
 
     def send(self, exposed, pixels=None, **fields):
         """An image exposed at a true time [s]; its stamp carries the camera's offset."""
         if pixels is None:
-            pixels = self.renderer.render([(position(exposed), np.eye(3))], self.rng)
+            pixels = self.renderer.render([(self.position(exposed), np.eye(3))], self.rng)
         msg = Image(height=480, width=640, step=640, encoding="mono8")
         msg.data = pixels.tobytes()
-        msg.header.stamp = to_stamp(round((exposed + MOUNT.stamp_offset) * 1e9))
+        msg.header.stamp = self.stamp(exposed)
         for name, value in fields.items():
             setattr(msg, name, value)
         self.images.publish(msg)
         return nanoseconds(msg.header.stamp)
 
     def answer(self, count):
-        self.spin_until(lambda: len(self.detections) >= count and self.answered() >= count, f"answer {count}")
+        self.spin_until(lambda: len(self.detections) >= count and len(self.triggers()) >= count, f"answer {count}")
         return self.detections[count - 1]
-
-    def answered(self):
-        return len([r for r in self.reports if nanoseconds(r.trigger) > 0])
 
 
 @pytest.fixture
 def graph(ros_domain, renderer):
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=ros_domain)
-    executor = EventsExecutor(context=context)
-    nodes = []
-
-    def start(**parameters):
-        node = target_localizer_node.create(
-            context=context, parameter_overrides=[Parameter(k, value=v) for k, v in parameters.items()])
-        executor.add_node(node)
-        nodes.append(node)
-        vehicle = Vehicle(context, executor, renderer)
-        nodes.append(vehicle.node)
-        vehicle.spin_until(lambda: vehicle.reports, "the greeting")
-        vehicle.spin_until(lambda: vehicle.images.get_subscription_count() > 0
-                           and vehicle.odometry.get_subscription_count() > 0
-                           and vehicle.ticks.get_subscription_count() > 0, "the node's subscriptions")
-        return vehicle
-
-    yield start
-    for node in nodes:
-        node.destroy_node()
-    rclpy.shutdown(context=context)
+    with played(target_localizer_node, ros_domain, renderer, Vehicle) as start:
+        yield start
 
 
 def target_error(pose):
