@@ -101,6 +101,19 @@ def test_same_seed_and_poses_give_the_same_bytes_and_noise_differs_between_frame
     assert first[0] != first[1] and first[0] != other[0]
 
 
+@pytest.mark.parametrize("mount, region", [
+    (FRONT, (slice(150, 331), slice(201, 417))), (DOWN, (slice(0, 77), slice(3, 640))), (FRONT, (slice(479, 480), slice(0, 1)))])
+def test_a_region_is_drawn_as_in_the_whole_image_and_nothing_else(mount, region):
+    (p, R), renderer = level(0.4, 0.1, 1.3, 20), Renderer(WALL, mount, seed=2)
+    poses = [(p + [0.004 * k, 0, 0], R @ Rotation.from_euler("Y", 0.4 * k, degrees=True).as_matrix()) for k in range(5)]
+    for exposure in (poses[:1], poses):  # sharp, and blurred
+        whole = renderer.render(exposure, np.random.default_rng(4))
+        part = renderer.render(exposure, np.random.default_rng(4), region=region)
+        np.testing.assert_array_equal(part[region], whole[region])
+        part[region] = 0
+        assert not part.any() and whole[region].any()
+
+
 def test_threads_may_share_a_renderer():
     renderer = Renderer(WALL, DOWN)
     poses = [level(0.1 * i, 0, 1.0 + 0.1 * i, 10.0 * i) for i in range(8)]

@@ -103,6 +103,31 @@ def test_following_without_reading_the_numbers_is_as_accurate_and_notices_a_cove
     assert place.errors(p, R, result.board)[0] < 0.003
 
 
+def test_looks_at_nothing_outside_the_regions_that_it_asks_for(places):
+    """Between searches none, while it tracks the board's surroundings: poses are those from whole images, to the last bit."""
+    place = places("surface_90")
+    told, asking, asked = BoardLocalizer(BOARD, MOUNT), BoardLocalizer(BOARD, MOUNT), []
+
+    def within(image):
+        def look(region):
+            asked.append(region)
+            seen = np.zeros_like(image)
+            seen[region] = image[region]
+            return seen
+        return look
+
+    for k in range(15):
+        p, R = np.array([0.05 * k, 0.02 * k, 1.2]), so3.exp(np.array([0.0, -0.1 * (k % 2), 0.02 * k]))
+        image = place.image(p, R) if k > 1 else np.zeros((480, 640), np.uint8)
+        a, b = told.process(image, k / 30, body(k / 30, p, R)), asking.process(within(image), k / 30, body(k / 30, p, R))
+        assert a.message == b.message and (a.board is None) == (b.board is None)
+        if a.board is not None:
+            np.testing.assert_array_equal(np.append(a.board.p_CS, a.board.R_CS), np.append(b.board.p_CS, b.board.R_CS))
+    sizes = [(rows.stop - rows.start) * (cols.stop - cols.start) for rows, cols in asked]
+    assert a.board is not None and sizes[:2] == [480 * 640] * 2 and len(asked) < 15
+    assert sizes[2] < 0.25 * 480 * 640 and sizes[2] < sizes[-1]
+
+
 def test_uses_what_is_left_of_the_board(places):
     """The vehicle turns until two tags have left the image: the rest still gives a pose, with an attitude that is less sure."""
     place = places("surface_90")

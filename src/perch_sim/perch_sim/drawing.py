@@ -22,7 +22,7 @@ from perch_core.processes import end_with_parent, give_way
 from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
-from perch_sim.rendering import Pose, Renderer, Scene, build_scene
+from perch_sim.rendering import Pose, Region, Renderer, Scene, build_scene
 
 NICE = 5             # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
 GREETING = b"ready"
@@ -35,8 +35,12 @@ class ImageToCome(Protocol):
     def done(self, timeout: float = 0.0) -> bool:
         """Whether it is there; waits for it up to `timeout` [s]."""
 
-    def result(self) -> np.ndarray | None:
-        """The image, uint8, as `Renderer.render`; None: whoever draws has ended."""
+    def result(self, region: Region | None = None) -> np.ndarray | None:
+        """The image, uint8, as `Renderer.render`; None: whoever draws has ended.
+
+        Args:
+            region: rows and columns that matter to who asks first; the rest need not be drawn. None: all of it.
+        """
 
 
 class Drawing(Protocol):
@@ -74,15 +78,15 @@ class DrawnOnDemand:
 
 
 class _Undrawn:
-    def __init__(self, render: Callable[[], np.ndarray]) -> None:
+    def __init__(self, render: Callable[..., np.ndarray]) -> None:
         self._render, self._image = render, None
 
     def done(self, timeout: float = 0.0) -> bool:
         return self._image is not None
 
-    def result(self) -> np.ndarray:
+    def result(self, region: Region | None = None) -> np.ndarray:
         if self._image is None:
-            self._image = self._render()
+            self._image = self._render(region=region)
         return self._image
 
 
@@ -199,7 +203,7 @@ class _Ordered:
             pass
         return self._complete
 
-    def result(self) -> np.ndarray | None:
+    def result(self, region: Region | None = None) -> np.ndarray | None:
         while not self._complete:
             self._draftsman.receive(1.0)
         return self._image

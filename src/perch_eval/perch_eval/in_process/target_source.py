@@ -103,7 +103,7 @@ class RenderedSight:
 
     def see(self, delivery: Delivery, exposed: float, state: TrueState, pad: PerchSurface, body: BodyState | None) -> Localization:
         """What the localiser says of a frame."""
-        return self._localizer.process(delivery.image.result(), exposed, body)
+        return self._localizer.process(delivery.image.result, exposed, body)
 
 
 class TargetSource(FrameSource):

@@ -55,9 +55,12 @@ class TagDetector:
         # cv2.resize maps the centre u of a pixel to 2 u + 0.5
         return self._select([(np.reshape(c, (4, 2)) - 0.5) / 2.0 for c in corners], ids)
 
-    def look(self, image: np.ndarray, view: VirtualView) -> Detection:
-        """Look for tags in a virtual view of the image (mono8); corners are returned in pixels of the image."""
-        corners, ids, _ = self._view.detectMarkers(view.resample(image, self.camera))
+    def look(self, image: np.ndarray, view: VirtualView, origin: tuple[int, int] = (0, 0)) -> Detection:
+        """Look for tags in a virtual view of the image (mono8), or of the part of it that begins at `origin` (column, row).
+
+        Corners are returned in pixels of the camera.
+        """
+        corners, ids, _ = self._view.detectMarkers(view.resample(image, self.camera, origin))
         found = []
         for corner in corners:
             pixels, valid = self.camera.project(view.rays(np.reshape(corner, (4, 2))))

@@ -15,7 +15,7 @@ BLUR = 0.78            # 1-sigma of optics (0.6 px), pixel (0.29 px) and bilinea
 
 
 def sample_profiles(image: np.ndarray, points: np.ndarray, normals: np.ndarray, reach: float,
-                    ) -> tuple[np.ndarray, np.ndarray]:
+                    origin: tuple[int, int] = (0, 0)) -> tuple[np.ndarray, np.ndarray]:
     """Grey values across edges.
 
     Args:
@@ -23,12 +23,13 @@ def sample_profiles(image: np.ndarray, points: np.ndarray, normals: np.ndarray, 
         points: places on the edges [px], shape (..., 2).
         normals: unit normals of the edges there, pointing from dark to light, shape (..., 2).
         reach: half length of the profiles [px].
+        origin: pixel (column, row) of the points that is the first of `image`, a part of the camera's.
 
     Returns:
         Offsets s along the normal (S,) [px] and grey values (..., S).
     """
     s = np.linspace(-reach, reach, max(9, int(2 * reach / STEP) | 1))
-    at = (points[..., None, :] + s[:, None] * normals[..., None, :]).astype(np.float32).reshape(-1, s.size, 2)
+    at = (points[..., None, :] + s[:, None] * normals[..., None, :]).astype(np.float32).reshape(-1, s.size, 2) - np.float32(origin)
     values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return s, values.reshape(points.shape[:-1] + (s.size,)).astype(float)
 

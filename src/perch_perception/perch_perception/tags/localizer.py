@@ -7,6 +7,7 @@ looks, which read the tags' numbers anew, the expected corners are good enough t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
 from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
 from perch_perception.tags.refinement import refine_corners
-from perch_perception.tags.view import VirtualView
+from perch_perception.tags.view import Region, VirtualView
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class LocalizerConfig:
 FOLLOW_GAP = 0.1      # time since the last sighting over which corners are expected well enough [s]
 FOLLOW_TAGS = 3       # so many tags must be expected: their agreement shows that nothing else was measured
 EXPECTED_MARGIN = 6.0  # an expected corner this near to the border may be outside [px]
+AROUND_VIEW = 12      # what is looked at beyond the view: profiles across edges at its border [px]
 CLEAR = 50.0          # chi^2 to the second-best pose of a sighting that can be followed
 
 
@@ -60,6 +62,19 @@ class Localization:
     complete: bool = False
     searched: bool = False
     message: str = ""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A region of an image, mono8, and the column and row at which it begins."""
+
+    pixels: np.ndarray
+    origin: tuple[int, int]
+
+    @classmethod
+    def of(cls, image: np.ndarray | Callable[[Region], np.ndarray], region: Region) -> _Part:
+        whole = image(region) if callable(image) else image
+        return cls(whole[region], (region[1].start, region[0].start))
 
 
 class BoardLocalizer:
@@ -89,11 +104,12 @@ class BoardLocalizer:
         self._searches = 0
         self._followed = 0                        # images since the numbers were read
 
-    def process(self, image: np.ndarray, time: float, body: BodyState | None = None) -> Localization:
+    def process(self, image: np.ndarray | Callable[[Region], np.ndarray], time: float, body: BodyState | None = None) -> Localization:
         """Look for the board.
 
         Args:
-            image: mono8, shape (height, width).
+            image: mono8, shape (height, width); or what gives the image of which only a region need hold: while a board is
+                tracked its surroundings are all that is looked at, and between searches nothing is.
             time: middle of the exposure [s]; must grow from image to image.
             body: state of the vehicle then; only used to predict where to look.
 
@@ -102,28 +118,32 @@ class BoardLocalizer:
         """
         if self._last is not None and time - self._last_time <= self.settings.lost_after:
             p_CS, R_CS = self._predict(body)
-            result = self._follow(image, time, body, p_CS, R_CS)
+            view = self._aim(p_CS, self._radius)
+            part = _Part.of(image, view.region(self.mount.camera, AROUND_VIEW))
+            result = self._follow(part, time, body, p_CS, R_CS)
             if result is None:
                 self._followed = 0
-                result = self._attempt(image, self._look(image, p_CS, self._radius), R_CS, False)
+                result = self._attempt(part, self._look(part, view), R_CS, False)
         elif time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
             return Localization(None, message="waiting for the next search")
         else:
             self._search_time, self._followed = time, 0
-            result = self._attempt(image, self._search(image), None, True)
+            camera = self.mount.camera
+            whole = _Part.of(image, (slice(0, camera.height), slice(0, camera.width)))
+            result = self._attempt(whole, self._search(whole), None, True)
         if result.board is not None:
             self._last, self._last_body, self._last_time = result.board, body, time
         return result
 
-    def _attempt(self, image: np.ndarray, detection: Detection, prior_R_CS: np.ndarray | None,
+    def _attempt(self, part: _Part, detection: Detection, prior_R_CS: np.ndarray | None,
                  searched: bool) -> Localization:
         """Solve for a detection; a refusal becomes the message."""
         try:
-            return self._solve(image, detection, prior_R_CS, searched)
+            return self._solve(part, detection, prior_R_CS, searched)
         except LocalizationRefusal as refusal:
             return Localization(None, searched=searched, message="; ".join([str(refusal), *detection.rejected]))
 
-    def _follow(self, image: np.ndarray, time: float, body: BodyState | None, p_CS: np.ndarray,
+    def _follow(self, part: _Part, time: float, body: BodyState | None, p_CS: np.ndarray,
                 R_CS: np.ndarray) -> Localization | None:
         """Measure the corners where they are expected; None where that is not safe, or where one is not found."""
         if (self._followed >= self.settings.follow_images or body is None or self._last_body is None
@@ -135,7 +155,7 @@ class BoardLocalizer:
         if len(ids) < FOLLOW_TAGS:
             return None
         try:
-            result = self._solve(image, Detection(ids, pixels[inside]), R_CS, False, start=(p_CS, R_CS))
+            result = self._solve(part, Detection(ids, pixels[inside]), R_CS, False, start=(p_CS, R_CS))
         except LocalizationRefusal:
             return None
         if result.message:
@@ -143,9 +163,9 @@ class BoardLocalizer:
         self._followed += 1
         return result
 
-    def _search(self, image: np.ndarray) -> Detection:
+    def _search(self, whole: _Part) -> Detection:
         """Search the frame, then look closer at what was found: the other tags are not far."""
-        first = self._detector.search(image, self._searches)
+        first = self._detector.search(whole.pixels, self._searches)
         self._searches += 1
         if not first.ids:
             return first
@@ -156,17 +176,19 @@ class BoardLocalizer:
         seen = [self.board.ids.index(number) for number in first.ids]
         centre_S = self.board.corners_S[seen].reshape(-1, 3).mean(axis=0)
         radius = float(np.linalg.norm(self.board.corners_S - centre_S, axis=-1).max())
-        closer = self._look(image, distance * direction / np.linalg.norm(direction), radius)
+        closer = self._look(whole, self._aim(distance * direction / np.linalg.norm(direction), radius))
         best = closer if len(closer.ids) >= len(first.ids) else first
         rejected = tuple(dict.fromkeys(first.rejected + closer.rejected))
         return Detection(best.ids, best.corners, rejected)
 
-    def _look(self, image: np.ndarray, p_CS: np.ndarray, radius: float) -> Detection:
-        """Look at a place where the board should be, `radius` [m] around p_CS."""
+    def _look(self, part: _Part, view: VirtualView) -> Detection:
+        return self._detector.look(part.pixels, view, part.origin)
+
+    def _aim(self, p_CS: np.ndarray, radius: float) -> VirtualView:
+        """The view of a place where the board should be, `radius` [m] around p_CS."""
         distance = float(np.linalg.norm(p_CS))
         share = min(self.settings.view_margin * radius / max(distance, 1e-3), 0.95)
-        view = VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
-        return self._detector.look(image, view)
+        return VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
 
     def _predict(self, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:
         """Where the board should be now, p_CS and R_CS: it stays in the map while the vehicle moves."""
@@ -178,7 +200,7 @@ class BoardLocalizer:
         p_WC_now, R_WC_now = self.mount.pose(now.p_WB, now.R_WB)
         return R_WC_now.T @ (p_WC + R_WC @ p - p_WC_now), R_WC_now.T @ R_WC @ R
 
-    def _solve(self, image: np.ndarray, detection: Detection, prior_R_CS: np.ndarray | None, searched: bool,
+    def _solve(self, part: _Part, detection: Detection, prior_R_CS: np.ndarray | None, searched: bool,
                start: tuple[np.ndarray, np.ndarray] | None = None) -> Localization:
         """Refine the corners and solve for the pose, from `start` (p_CS, R_CS) where that is known.
 
@@ -187,7 +209,7 @@ class BoardLocalizer:
         """
         if not detection.ids:
             raise LocalizationRefusal("no tag of the board found")
-        refined = refine_corners(image, self.mount.camera, detection.corners)
+        refined = refine_corners(part.pixels, self.mount.camera, detection.corners, origin=part.origin)
         blurred = [i for i, valid in zip(detection.ids, refined.valid) if not valid]
         if len(blurred) == len(detection.ids):
             raise LocalizationRefusal(f"the edges of tags {blurred} cannot be measured")

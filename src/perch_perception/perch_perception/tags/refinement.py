@@ -41,14 +41,16 @@ class RefinedCorners:
     valid: np.ndarray
 
 
-def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, rounds: int = 2) -> RefinedCorners:
+def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, rounds: int = 2,
+                   origin: tuple[int, int] = (0, 0)) -> RefinedCorners:
     """Measure the corners of tags.
 
     Args:
-        image: mono8, shape (height, width).
+        image: mono8, shape (height, width), or a part of it.
         camera: its lens.
         corners: pixels of the corners (TL, TR, BR, BL) to about 2 px, shape (n, 4, 2).
         rounds: how often profiles are laid through the improved corners; the first round is the coarse one.
+        origin: column and row of the part's first pixel.
 
     Returns:
         Rays of the corners; a tag is not valid where an edge has too little contrast, is too short, or moves
@@ -64,7 +66,7 @@ def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, round
     safe = np.where(valid[:, None, None], rays, _PLACEHOLDER)
     sigma = np.full(corners.shape[:2], np.inf)
     for round_ in range(rounds):
-        safe, sigma, good = _refine_once(image, camera, safe, sides, coarse=round_ == 0)
+        safe, sigma, good = _refine_once(image, origin, camera, safe, sides, coarse=round_ == 0)
         valid &= good
         safe = np.where(valid[:, None, None], safe, _PLACEHOLDER)
     pixels, seen = camera.project(safe)
@@ -77,13 +79,13 @@ def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, round
 _PLACEHOLDER = np.array([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]]) / np.sqrt(1.02)
 
 
-def _refine_once(image, camera, rays, sides, coarse):
+def _refine_once(image, origin, camera, rays, sides, coarse):
     """One round: profiles, steps, planes, corners. Returns rays (n, 4, 3), sigma (n, 4) and a mask (n,)."""
     n, samples = len(rays), COARSE_SAMPLES if coarse else SAMPLES
     points, normals = _edge_points(camera, rays, samples)
     module = 0.5 * (np.roll(sides, 1, axis=1) + np.roll(sides, -1, axis=1)) / MODULES  # from the edges that meet it
     reach = float(np.clip(PROFILE_MODULES * np.median(module), MIN_REACH, MAX_REACH))
-    s, profiles = sample_profiles(image, points, normals, reach)
+    s, profiles = sample_profiles(image, points, normals, reach, origin)
     if coarse:
         offset, height = gradient_centroid(s, profiles)
         weights = np.where(height > 0.35 * np.median(height, axis=2, keepdims=True) + 3.0, height, 0.0)

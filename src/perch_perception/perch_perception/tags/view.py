@@ -17,6 +17,10 @@ from perch_core.camera import Camera
 GRID = 8          # the lens is evaluated on every 8th pixel; linear in between it is good to 0.01 px
 MAX_SIDE = 640    # [px]
 MAX_HALF_ANGLE = math.radians(60.0)  # a pinhole stretches without bound towards 90 deg
+_BORDER = np.linspace(-1.0, 1.0, 9)  # places along a side of the view; between them the lens bends it by less than a pixel
+_BORDER = np.concatenate([np.stack(pair, axis=-1) for ends in (-np.ones(9), np.ones(9)) for pair in ((_BORDER, ends), (ends, _BORDER))])
+
+Region = tuple[slice, slice]  # rows and columns of an image
 
 
 @dataclass(frozen=True)
@@ -63,11 +67,27 @@ class VirtualView:
         rays_V = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         return (rays_V / np.linalg.norm(rays_V, axis=-1, keepdims=True)) @ self.R_CV.T
 
-    def resample(self, image: np.ndarray, camera: Camera) -> np.ndarray:
-        """The view of a camera's image, shape (side, side) uint8; black where the lens sees nothing."""
+    def region(self, camera: Camera, margin: int) -> Region:
+        """The part of a camera's image that the view shows, and `margin` [px] around it; all of it where the lens ends in the view."""
+        pixels, valid = camera.project(self.rays(self.centre + 0.5 * self.side * _BORDER))
+        if not valid.all():
+            return slice(0, camera.height), slice(0, camera.width)
+        size = np.array([camera.width, camera.height])
+        low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, size - 1)
+        high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, size)
+        return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+
+    def resample(self, image: np.ndarray, camera: Camera, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+        """The view of a camera's image, shape (side, side) uint8; black where the lens sees nothing.
+
+        Args:
+            image: mono8, the camera's or a part of it that holds the view.
+            camera: its lens.
+            origin: column and row of the part's first pixel.
+        """
         nodes = (np.arange(self.side // GRID) + 0.5) * GRID - 0.5  # where cv2.resize puts its samples
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1)
         pixels, valid = camera.project(self.rays(grid))
         coarse = np.where(valid[..., None], pixels, -1e4).astype(np.float32)
-        source = cv2.resize(coarse, (self.side, self.side), interpolation=cv2.INTER_LINEAR)
+        source = cv2.resize(coarse, (self.side, self.side), interpolation=cv2.INTER_LINEAR) - np.float32(origin)
         return cv2.remap(image, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

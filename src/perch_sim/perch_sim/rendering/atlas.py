@@ -59,9 +59,9 @@ def face_texture(scene: Scene, number: int, face: Face) -> np.ndarray:
     return textures.blobs(rng, rows, cols, face.texel, scene.contrast)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def build_atlas(scene: Scene) -> Atlas:
-    """Draw and pack the textures of a scene; both cameras of a vehicle share the result."""
+    """Draw and pack the textures of a scene; both cameras of a vehicle share the result. Kept are those of two scenes, 50 MB each."""
     faces = scene.faces()
     tiles = []
     for number, face in enumerate(faces):
@@ -70,7 +70,7 @@ def build_atlas(scene: Scene) -> Atlas:
     affine = np.zeros((len(faces), count.max(), 4), np.float32)
     tiles.append((-1, 0, np.full((8, 8), VOID, np.uint8)))
     places, shape = _pack([tile.shape for _, _, tile in tiles])
-    image = np.full(shape, VOID, np.uint8)
+    image = np.zeros(shape, np.uint8)  # between the tiles there are pages that nobody touches
     void = (0.0, 0.0)
     for (number, level, tile), (x, y) in zip(tiles, places):
         rows, cols = tile.shape

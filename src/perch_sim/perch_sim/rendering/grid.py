@@ -17,6 +17,8 @@ from perch_core.camera import Camera, PinholeCamera
 
 CELL = 8  # [px]
 
+Region = tuple[slice, slice]  # rows and columns of an image
+
 
 @lru_cache(maxsize=16)
 def sample_weights(supersampling: int) -> np.ndarray:
@@ -54,6 +56,12 @@ class CellGrid:
     centres: np.ndarray
     blind: np.ndarray
     pixel_angle: np.ndarray
+
+    def cells_in(self, region: Region) -> np.ndarray:
+        """Which cells a region of the image touches, shape (rows * cols,) bool."""
+        touched = np.zeros((self.rows, self.cols), dtype=bool)
+        touched[tuple(slice(part.start // CELL, -(-part.stop // CELL)) for part in region)] = True
+        return touched.ravel()
 
     def cell_of(self, pixels: np.ndarray) -> np.ndarray:
         """Cells that hold pixels (n, 2), shape (n,); -1 outside the image and for NaN."""

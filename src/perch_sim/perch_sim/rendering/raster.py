@@ -11,7 +11,7 @@ import numpy as np
 
 from perch_core.camera import Camera
 from perch_sim.rendering.atlas import LEVELS_PER_OCTAVE, Atlas
-from perch_sim.rendering.grid import CELL, CellGrid, sample_weights
+from perch_sim.rendering.grid import CELL, CellGrid, Region, sample_weights
 from perch_sim.rendering.kernels import affine_of_cells, faces_behind, nearer_samples, place_texels, texels_per_pixel, uniform_samples
 from perch_sim.rendering.visibility import FaceArrays, View, look
 
@@ -25,19 +25,19 @@ class Rasterizer:
 
     def __init__(self, faces: FaceArrays, atlas: Atlas, camera: Camera, grid: CellGrid) -> None:
         self.faces, self.atlas, self.camera, self.grid = faces, atlas, camera, grid
+        self._void = int(atlas.image[int(atlas.void[1]), int(atlas.void[0])])
 
-    def draw(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray) -> np.ndarray:
-        """Grey levels under full light, before the optics, uint8, shape (height, width).
+    def draw(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray, region: Region) -> np.ndarray:
+        """Grey levels under full light, before the optics, uint8, shape (height, width); outside the region anything.
 
         Args:
             p_WC, R_WC: pose of the camera in W [m].
             shift_W: displacement of the moving faces [m], shape (3,).
+            region: rows and columns to draw.
         """
         grid, faces = self.grid, self.faces
         view = look(faces, grid, self.camera, p_WC, R_WC, shift_W)
         first, uniform = view.first, view.uniform
-        image = np.full((grid.rows, CELL, grid.cols, CELL), int(self.atlas.image[
-            int(self.atlas.void[1]), int(self.atlas.void[0])]), np.uint8)
         fine_face = np.zeros(len(faces.fine) + 1, dtype=bool)
         fine_face[:-1] = faces.fine  # the last entry answers for the winner -1
         lit = ~grid.blind & (first >= 0)
@@ -45,15 +45,20 @@ class Rasterizer:
         mixed = ~uniform & ~grid.blind
         tagged = mixed & view.shown[faces.fine[faces.bounded]].any(axis=0)
         supersampling = self._fine_supersampling(view, np.flatnonzero((fine & lit) | tagged))
-        self._draw_uniform(image, view, np.flatnonzero(uniform & lit & ~fine), first, 1)
-        self._draw_uniform(image, view, np.flatnonzero(fine & lit), first, supersampling)
-        self._draw_mixed(image, view, np.flatnonzero(mixed & ~tagged), MIXED_SUPERSAMPLING)
-        self._draw_mixed(image, view, np.flatnonzero(tagged), max(supersampling, MIXED_SUPERSAMPLING))
-        image = image.reshape(grid.rows * CELL, grid.cols * CELL)[: self.camera.height, : self.camera.width]
-        if grid.blind.any():
-            blind = grid.blind.reshape(grid.rows, grid.cols).repeat(CELL, 0).repeat(CELL, 1)
-            image = np.where(blind[: self.camera.height, : self.camera.width], 0, image)
-        return np.ascontiguousarray(image)
+        asked = grid.cells_in(region)
+        image = np.empty((grid.rows, CELL, grid.cols, CELL), np.uint8)
+        self._draw_uniform(image, view, np.flatnonzero(uniform & lit & ~fine & asked), first, 1)
+        self._draw_uniform(image, view, np.flatnonzero(fine & lit & asked), first, supersampling)
+        self._draw_mixed(image, view, np.flatnonzero(mixed & ~tagged & asked), MIXED_SUPERSAMPLING)
+        self._draw_mixed(image, view, np.flatnonzero(tagged & asked), max(supersampling, MIXED_SUPERSAMPLING))
+        self._leave_empty(image, np.flatnonzero(uniform & ~lit & asked), self._void)
+        self._leave_empty(image, np.flatnonzero(grid.blind & asked), 0)
+        return image.reshape(grid.rows * CELL, grid.cols * CELL)[: self.camera.height, : self.camera.width]
+
+    def _leave_empty(self, image: np.ndarray, cells: np.ndarray, level: int) -> None:
+        if len(cells):
+            row, col = np.divmod(cells, self.grid.cols)
+            image[row, :, col, :] = level
 
     def _fine_supersampling(self, view: View, cells: np.ndarray) -> int:
         """Samples per pixel and direction for the cells that show the pad."""

@@ -11,7 +11,7 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_sim.rendering.atlas import build_atlas
 from perch_sim.rendering.cables import CablePainter
-from perch_sim.rendering.grid import build_grid
+from perch_sim.rendering.grid import Region, build_grid
 from perch_sim.rendering.raster import Rasterizer
 from perch_sim.rendering.scene import Scene
 from perch_sim.rendering.sensor import Sensor, control_exposure
@@ -50,38 +50,40 @@ class Renderer:
         self.scene, self.mount = scene, mount
         self.exposure = control_exposure(mount, scene.light)
         self._faces = FaceArrays.of(scene.faces())
+        self._whole = (slice(0, mount.camera.height), slice(0, mount.camera.width))
         self._grid = build_grid(mount.camera)
         self._raster = Rasterizer(self._faces, build_atlas(scene), mount.camera, self._grid)
         self._cables = CablePainter(scene.cables, mount.camera) if scene.cables else None
         self._tint = np.rint(TINT).astype(np.uint8)[None]
         self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed)
 
-    def render(self, poses: Sequence[Pose], rng: np.random.Generator,
-               target_shift: np.ndarray = np.zeros(3)) -> np.ndarray:
+    def render(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray = np.zeros(3),
+               region: Region | None = None) -> np.ndarray:
         """The image of one exposure.
 
         Args:
             poses: (p_WB [m], R_WB) of the body, evenly spread over the exposure, one or more.
             rng: draws this frame's noise.
             target_shift: displacement of the target panel and its pad from where the scene has them [m], shape (3,).
+            region: rows and columns that somebody looks at; the rest of the image stays black. None: all of it.
 
         Returns:
             mono8, uint8 (height, width); rgb8, uint8 (height, width, 3), where the mount asks for colour.
         """
         shift_W = np.asarray(target_shift, dtype=float)
         poses = [(np.asarray(p, dtype=float), np.asarray(R, dtype=float)) for p, R in poses]
-        frames = [self._light(*self.mount.pose(p, R), shift_W)
-                  for p, R in spread(poses, self._subframes(poses))]
-        if len(frames) == 1:
-            return self._sensor.expose(frames[0], rng)
-        mean = np.zeros(frames[0].shape, np.uint16)
-        for frame in frames:
-            mean += frame
-        return self._sensor.expose(((mean + len(frames) // 2) // len(frames)).astype(np.uint8), rng)
+        region = region or self._whole
+        lit = self._sensor.lit(region)
+        frames = [self._light(*self.mount.pose(p, R), shift_W, lit) for p, R in spread(poses, self._subframes(poses))]
+        light = frames[0]
+        if len(frames) > 1:
+            mean = sum(frame[lit].astype(np.uint16) for frame in frames)
+            light[lit] = (mean + len(frames) // 2) // len(frames)
+        return self._sensor.expose(light, rng, region)
 
-    def _light(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray) -> np.ndarray:
-        """What falls on the lens at one instant, under the light that the exposure is made for, uint8."""
-        image = self._raster.draw(p_WC, R_WC, shift_W)
+    def _light(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray, region: Region | None = None) -> np.ndarray:
+        """What falls on a region of the lens at one instant, under the light that the exposure is made for, uint8."""
+        image = self._raster.draw(p_WC, R_WC, shift_W, region or self._whole)
         if self.mount.colour:
             image = cv2.LUT(cv2.merge([image] * 3), self._tint)
         if self._cables is not None:

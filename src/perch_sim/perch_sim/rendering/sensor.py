@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 
 from perch_core.camera import Camera, CameraMount
+from perch_sim.rendering.grid import Region
 
+BLUR_REACH = 2   # of the filter that stands for it [px]
 PSF_SIGMA = 0.6  # blur of lens and pixel together [px]
 VIGNETTE = 0.35  # light lost in the corner of the image
 READ_NOISE = 1.5  # [grey levels]
@@ -61,18 +63,28 @@ class Sensor:
         self._sigma = np.sqrt(variance).astype(np.float32)
         self._size = (camera.height, camera.width)
 
-    def expose(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """A noisy image of what falls on the sensor, uint8.
+    def lit(self, region: Region) -> Region:
+        """What falls on a region and, blurred, around it."""
+        return tuple(slice(max(part.start - BLUR_REACH, 0), min(part.stop + BLUR_REACH, size)) for part, size in zip(region, self._size))
+
+    def expose(self, light: np.ndarray, rng: np.random.Generator, region: Region | None = None) -> np.ndarray:
+        """A noisy image of what falls on the sensor, uint8, black outside the region.
 
         Args:
-            light: uint8, shape (height, width) or (height, width, 3), before the optics.
+            light: uint8, shape (height, width) or (height, width, 3), before the optics; must hold within `lit(region)`.
             rng: draws this frame's noise.
+            region: rows and columns that are read out; None: all.
         """
-        image = cv2.GaussianBlur(light, (5, 5), PSF_SIGMA, borderType=cv2.BORDER_REPLICATE)
-        image = cv2.multiply(image, self._vignette, dtype=cv2.CV_8U)
+        region = region or (slice(0, self._size[0]), slice(0, self._size[1]))
+        around = self.lit(region)
+        inner = tuple(slice(part.start - wide.start, part.stop - wide.start) for part, wide in zip(region, around))
+        image = cv2.GaussianBlur(light[around], (5, 5), PSF_SIGMA, borderType=cv2.BORDER_REPLICATE)[inner]
+        image = cv2.multiply(image, self._vignette[region], dtype=cv2.CV_8U)
         y, x = rng.integers(0, BANK_MARGIN, 2)
-        noise = self._bank[y: y + self._size[0], x: x + self._size[1]]
-        return cv2.add(image, cv2.multiply(cv2.LUT(image, self._sigma), noise), dtype=cv2.CV_8U)
+        noise = self._bank[y: y + self._size[0], x: x + self._size[1]][region]
+        out = np.zeros(light.shape, np.uint8)
+        cv2.add(image, cv2.multiply(cv2.LUT(image, self._sigma), noise), dst=out[region], dtype=cv2.CV_8U)
+        return out
 
 
 def _per_channel(plane: np.ndarray, channels: int) -> np.ndarray:

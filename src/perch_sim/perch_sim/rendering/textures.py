@@ -34,15 +34,16 @@ def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast
         step = max(scale / texel, 1.5)
         small = rng.normal(128.0, 40.0, (int(rows / step) + 3, int(cols / step) + 3))
         small = np.clip(small, 0, 255).astype(np.uint8)
-        layer = cv2.LUT(cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC), EDGE)
+        layer = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC)
+        cv2.LUT(layer, EDGE, dst=layer)  # in place: new pages for every layer take as long as what is done with them
         weight_sum += weight
         share = weight / weight_sum
-        total = layer if total is None else cv2.addWeighted(total, 1.0 - share, layer, share, 0.0)
+        total = layer if total is None else cv2.addWeighted(total, 1.0 - share, layer, share, 0.0, dst=total)
     sample = total[:: max(1, rows // 256), :: max(1, cols // 256)].astype(float)
     mean = sample.mean()
     spread = max(np.percentile(np.abs(sample - mean), 99), 1.0)
     levels = rng.uniform(*MEANS) * (1.0 + contrast * np.clip((np.arange(256) - mean) / spread, -1.2, 1.2))
-    return cv2.LUT(total, np.clip(np.rint(levels), 0, 255).astype(np.uint8))
+    return cv2.LUT(total, np.clip(np.rint(levels), 0, 255).astype(np.uint8), dst=total)
 
 
 def pad(board: TagBoard, texel: float, rng: np.random.Generator) -> np.ndarray:
