@@ -120,7 +120,7 @@ def test_a_reference_keeps_the_attitude_that_it_carries():
         x = source.setpoint(float(t))
         there = trajectory.sample(float(t))
         for push in (0.0, 0.5):
-            row = np.array(reference_row(replace(x, a=tuple(np.add(x.a, (push, 0.0, -push)))).packed, 0.5, vehicle))
+            row = np.array(reference_row(x._replace(a=tuple(np.add(x.a, (push, 0.0, -push)))).packed, 0.5, vehicle))
             assert abs(row[3:7] @ there.q) > np.cos(np.radians(0.05)) and np.abs(row[10:13] - there.w).max() < 0.01
         row = np.array(reference_row(x.packed, 0.5, vehicle))
         assert np.abs(row[13:17] - there.rotor_thrust).max() < 0.02

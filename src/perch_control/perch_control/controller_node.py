@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 
 from perch_control.admission import AtEnd, Order
 from perch_control.assembly import Assembly, LawNotReady
+from perch_control.dry_run import dry_run
 from perch_control.modes import Command, StepResult
 from perch_control.nmpc import chosen_lines
 from perch_control.parameters import ControllerParameters
@@ -46,7 +47,9 @@ class ControllerNode(PerchNode[ControllerParameters]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("controller", ControllerParameters, self._change, **kwargs)
-        self._assembly = Assembly(self.params, load_vehicle(self.params.vehicle))
+        vehicle = load_vehicle(self.params.vehicle)
+        self._assembly = Assembly(self.params, vehicle)
+        dry_run(vehicle, self.params.gain_set(vehicle.name), self.params.flight, self.params.l1)
         self._flight = self._assembly.flight
         if self._assembly.nmpc is None and self.params.controller.standby:
             Thread(target=self._assembly.build_nmpc, daemon=True).start()
@@ -177,7 +180,8 @@ class ControllerNode(PerchNode[ControllerParameters]):
         index = step.index if step is not None else self._steps
         if index % STATUS_STEPS == 0:
             self._publish_status(to_stamp(stamp))
-        if result.setpoint is not None and index % self.params.controller.reference_period == 0:
+        wanted = result.setpoint is not None and index % self.params.controller.reference_period == 0
+        if wanted and self._references.get_subscription_count():
             self._publish_reference(to_stamp(stamp), result)
         if index % DIAGNOSTICS_STEPS == DIAGNOSTICS_PHASE:
             self._publish_diagnostics(seconds(stamp))

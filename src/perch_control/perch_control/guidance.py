@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_control.reference import Setpoint, flat_setpoints, packed_many, unpacked
+from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory
 
 SHORT = 0.3  # a takeover shorter than this asks for more than the vehicle can follow: it uses what time there is [s]
@@ -56,16 +57,26 @@ class Polynomial:
     def many(self, times: np.ndarray) -> np.ndarray:
         """Setpoints at many times [s], packed, shape (n, 33); the end velocity goes on past the end."""
         out = np.empty((len(times), 33))
-        flat_setpoints(*self._trajectory.arrays, np.minimum(times, self.duration), out)
-        over = np.maximum(times - self.duration, 0.0)
-        out[:, 0:3] += over[:, None] * out[:, 3:6]
-        out[over > 0.0, 6:15] = 0.0
-        out[:, 15:18] = self._h
+        _moving_on(*self._trajectory.arrays, times, self._h, out)
         return out
 
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]."""
         return unpacked(self.many(np.array([t]))[0])
+
+
+@compiled
+def _moving_on(tables, edges, durations, choose, times, h, out):
+    """As `flat_setpoints`, with b2_des `h` (3 floats) and, past the end, the velocity that was there."""
+    end = edges[-1]
+    flat_setpoints(tables, edges, durations, choose, np.minimum(times, end), out)
+    for k in range(len(times)):
+        over = times[k] - end
+        if over > 0.0:
+            out[k, 0:3] += over * out[k, 3:6]
+            out[k, 6:15] = 0.0
+        for i in range(3):
+            out[k, 15 + i] = h[i]
 
 
 def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polynomial:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from perch_control.reference import Setpoint
 from perch_core.errors import PerchError
@@ -39,8 +39,7 @@ class CommandRefused(PerchError):
     """The command is not carried out; the message says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class StepResult:
+class StepResult(NamedTuple):
     """Answer to one step.
 
     Attributes:

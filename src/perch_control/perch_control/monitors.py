@@ -44,12 +44,14 @@ class TrackingMonitor:
         tilt = reference_tilt_deg(state, setpoint)
         rate = norm(state[10:13])
         error = norm(axpy(-1.0, setpoint.p, state[0:3]))
-        out = [
-            (self._tilt.update(tilt > s.tilt_margin_deg, now), f"tilt {tilt:.0f} deg away from the plan's"),
-            (self._rate.update(rate > s.rate_factor * self.rate_max, now), f"body rate {rate:.1f} rad/s beyond any plan's"),
-            (self._position.update(error > s.position_error_max, now), f"{error:.2f} m away from the reference"),
-        ]
-        return next((text for acts, text in out if acts), "")
+        tilted = self._tilt.update(tilt > s.tilt_margin_deg, now)
+        spinning = self._rate.update(rate > s.rate_factor * self.rate_max, now)
+        away = self._position.update(error > s.position_error_max, now)
+        if tilted:
+            return f"tilt {tilt:.0f} deg away from the plan's"
+        if spinning:
+            return f"body rate {rate:.1f} rad/s beyond any plan's"
+        return f"{error:.2f} m away from the reference" if away else ""
 
     def exhausted(self, margin: float, now: float) -> bool:
         """The rotors have been at their limit for too long."""
@@ -58,4 +60,5 @@ class TrackingMonitor:
     def outside(self, p: tuple[float, ...]) -> float:
         """Distance by which a position is outside the geofence [m], 0 inside."""
         s = self.settings
-        return max(0.0, *(max(lo - x, x - hi) for x, lo, hi in zip(p, s.fence_low, s.fence_high)))
+        (x, y, z), (a, b, c), (d, e, f) = p, s.fence_low, s.fence_high
+        return max(0.0, a - x, x - d, b - y, y - e, c - z, z - f)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, sin
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,8 +20,7 @@ Vector = tuple[float, float, float]
 _ZERO = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """Wanted motion at one time; every vector in W, 3 floats.
 
     Attributes:
@@ -52,8 +51,8 @@ class Setpoint:
 
 def unpacked(row: np.ndarray) -> Setpoint:
     """The setpoint of which `row` has the fields, shape (33,)."""
-    x = row.tolist()
-    return Setpoint(*(tuple(x[k:k + 3]) for k in range(0, 33, 3)))
+    x = iter(row.tolist())
+    return Setpoint._make(zip(x, x, x))
 
 
 def _floats(v) -> Vector:

@@ -7,8 +7,8 @@ allocation can choose among the reachable thrusts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import exp
+from typing import NamedTuple
 
 from perch_core.jit import compiled
 from perch_core.vehicle import Vehicle
@@ -67,8 +67,7 @@ def lag_behind(time_constant: float, lead: float, period: float) -> float:
     return period * (1.0 - exp(-lead / time_constant)) / (1.0 - exp(-period / time_constant))
 
 
-@dataclass(frozen=True)
-class RotorEstimate:
+class RotorEstimate(NamedTuple):
     """Rotor speeds as the controller believes them to be: the lag model run on its own commands, or the measured ones.
 
     Attributes:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import radians, tan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ def packed_vehicle(vehicle: Vehicle) -> tuple:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class ControlOutput:
+class ControlOutput(NamedTuple):
     """What a controller answers in one period.
 
     Attributes:

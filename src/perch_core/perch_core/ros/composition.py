@@ -40,6 +40,11 @@ class FastPublisher:
         """Matched subscriptions of the middleware; neighbours are not among them."""
         return self._publisher.get_subscription_count()
 
+    @property
+    def heard(self) -> bool:
+        """Whether anybody would receive a message now."""
+        return bool(self._neighbours) or self._publisher.get_subscription_count() > 0
+
     def add_neighbour(self, receive: Receive) -> None:
         """Hand every message to `receive` from now on."""
         self._neighbours.append(receive)

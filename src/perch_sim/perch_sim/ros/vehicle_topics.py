@@ -91,7 +91,9 @@ class VehicleTopics:
         self.imu.publish(self._imu.fill(time, sample.gyro.tolist(), sample.accel.tolist()))
 
     def publish_truth(self, state: TrueState) -> None:
-        """The true state."""
+        """The true state, where somebody listens."""
+        if not self.odometry.heard:
+            return
         values = (x.tolist() for x in (state.p_WB, state.q_WB, state.v_WB, state.w_WB_B))
         self.odometry.publish(self._odometry.fill(state.time, *values))
 

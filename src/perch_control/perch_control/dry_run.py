@@ -1,0 +1,78 @@
+"""A flight before the flight, so that none of the compiled code is called for the first time in the air.
+
+A kernel is loaded from its cache by its first call, which takes milliseconds: those of a descent without position would all be loaded
+at the moment in which odometry has failed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_control.admission import AtEnd, Order
+from perch_control.flight import FlightController
+from perch_control.flight_settings import FlightSettings
+from perch_control.geometric import GeometricController
+from perch_control.l1 import L1Augmentation, L1Settings
+from perch_control.modes import Command, State
+from perch_control.reference import FlatReference
+from perch_control.settings import GeometricGains
+from perch_core.timing import CONTROL_PERIOD
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_core.vehicle import GRAVITY, Vehicle
+
+_RISE = 1.0  # [s]
+
+
+class _DryRun:
+    """A controller whose vehicle is where it is expected to be."""
+
+    def __init__(self, flight: FlightController) -> None:
+        self.flight, self.time = flight, 1.0
+
+    def step(self, count: int = 3) -> None:
+        """Let periods pass."""
+        for _ in range(count):
+            self.time += CONTROL_PERIOD
+            m = self.flight.maneuvers
+            at = m.expected(self.time) if m.flying else None
+            p, v = (at.p, at.v) if at is not None else ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self.flight.imu(self.time, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
+            self.flight.step(self.time, (*p, *v, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+
+    def follow(self, id: int, end: float, at_end: AtEnd) -> None:
+        """Take a trajectory to a height [m]."""
+        begin = self.flight.maneuvers.expected(self.time).p if self.flight.maneuvers.flying else (0.0, 0.0, 0.0)
+        start = self.time + CONTROL_PERIOD
+        path: FlatTrajectory = rest_to_rest(np.array(begin), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE, start_time=start)
+        self.flight.follow(Order(id, FlatReference(path), start, at_end))
+
+
+def dry_run(vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, l1: L1Settings) -> list[State]:
+    """Arm, rise, hover, begin a perch, recover, land, and descend without position, a few periods each.
+
+    Returns:
+        The states that it has been in.
+    """
+    flight = FlightController(vehicle, GeometricController(vehicle, gains), gains, settings)
+    flight.compensator = L1Augmentation(vehicle, l1)
+    run, seen = _DryRun(flight), []
+    run.step()
+    flight.command(Command.ARM)
+    seen.append(flight.state)
+    run.follow(1, 0.2, AtEnd.HOLD)
+    run.step(round(_RISE / CONTROL_PERIOD) + 5)
+    seen.append(flight.state)
+    run.follow(2, 0.4, AtEnd.CONTACT)
+    run.step()
+    seen.append(flight.state)
+    flight.maneuvers.recover("dry run")
+    run.step()
+    seen.append(flight.state)
+    flight.command(Command.LAND)
+    run.step()
+    seen.append(flight.state)
+    flight.step_blind(run.time + 0.1)
+    for k in range(1, 4):
+        flight.imu(run.time + 0.1 + k * CONTROL_PERIOD, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
+        flight.step_blind(run.time + 0.1 + k * CONTROL_PERIOD)
+    return seen
