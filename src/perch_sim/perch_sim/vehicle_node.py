@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection
 from typing import Any
 
 import cv2
@@ -23,18 +22,17 @@ from perch_core.scenario import load_scenario
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS, TICK_STEPS
 from perch_sim.camera_stream import Delivery
 from perch_sim.drawing import DrawnInProcesses
-from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.motors import MotorCommandError
 from perch_sim.pacing import Pacing
 from perch_sim.parameters import CAMERAS, VehicleParameters
-from perch_sim.participants import CONTROLLER, Trigger, triggers
+from perch_sim.participants import CONTROLLER, triggers
 from perch_sim.phase_times import PhaseTimes
-from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
+from perch_sim.ros.arrivals import Arrivals
+from perch_sim.ros.lockstep_watch import LockstepWatch
 from perch_sim.ros.vehicle_topics import VehicleTopics
+from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 
 MOST_WAITING = 2        # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
-MOST_UNDRAWN = 2        # frames per camera that have arrived before their images, in lockstep
-DRAWING_WAIT = 0.02      # for an image without which nobody can go on; then the next look after the flight [s]
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
 
@@ -61,7 +59,6 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._ticks = self.create_publisher(Step, "tick", qos.STEP)
         self._released: dict[str, int] = {}    # since the last tick
         self._output: Output | None = None     # of the step that is to be published next
-        self._undrawn: list[tuple[str, Delivery]] = []  # frames that have arrived, oldest first; their images are being drawn
         self._index = 0
         self._times = PhaseTimes()
         self._last_command = 0
@@ -80,6 +77,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self._idle_clock.cancel()
             self._watch = LockstepWatch(self, slow, CONTROLLER in names, [*self._topics.publishers(), self._steps, self._ticks],
                                         params.lockstep_timeout, params.start_timeout, self._drawing.ready)
+            self._arrivals = Arrivals(self._simulation.cameras, self._watch)
             self.create_subscription(StepReport, "step_report", self._receive_report, qos.GATED)
             self.create_timer(0.05, self._look_after, clock=steady)
         else:
@@ -134,18 +132,20 @@ class VehicleNode(PerchNode[VehicleParameters]):
             self._times.end("waiting")
             self._output = self._simulation.advance()
             self._times.end("physics")
-            self._take_arrived()
+            for name in self._arrivals.take(self._output.time):
+                if self._simulation.cameras[name].broken:
+                    self.get_logger().error(f"camera_{name}: the process that draws its images has ended: no images any more", once=True)
         stamp = self._output.time
         missing = watch.missing(stamp)
-        awaited = self._crowded() | {trigger.camera for trigger in watch.triggers if trigger.node in missing}
+        awaited = self._arrivals.crowded() | {trigger.camera for trigger in watch.triggers if trigger.node in missing}
         if awaited:
-            self._publish_drawn(awaited)
-            return not missing and not self._crowded()
+            self._publish_frames(self._arrivals.drawn(awaited))
+            return not missing and not self._arrivals.crowded()
         for trigger in watch.triggers:
             if trigger.period and self._index % trigger.period == 0:
                 watch.trigger(trigger.node, stamp, stamp + round(trigger.latency * 1e9))
         self._publish(watch.begin(stamp))
-        self._publish_drawn()
+        self._publish_frames(self._arrivals.drawn())
         return True
 
     def _in_time(self) -> bool:
@@ -164,50 +164,6 @@ class VehicleNode(PerchNode[VehicleParameters]):
             return False
         self._allowance -= 1
         return True
-
-    def _take_arrived(self) -> None:
-        """Trigger the work that begins with the frames that arrive at this step.
-
-        Their images may come later, while they are still being drawn: it is the results of that work that have a time.
-        """
-        stamp = self._output.time
-        for name, camera in self._simulation.cameras.items():
-            if camera.due(stamp) is None:
-                continue
-            if camera.broken:
-                self.get_logger().error(f"camera_{name}: the process that draws its images has ended: no images any more", once=True)
-            delivery = camera.take()
-            self._undrawn.append((name, delivery))
-            for trigger in self._triggered_by(name, delivery):
-                due = max(delivery.frame.middle + round(trigger.latency * 1e9), stamp + CONTROL_PERIOD_NS)
-                self._watch.trigger(trigger.node, delivery.frame.stamp, due)
-
-    def _crowded(self) -> set[str]:
-        """Cameras whose frames arrive faster than they are drawn: the flight waits for them even where nobody else does."""
-        names = [name for name, _ in self._undrawn]
-        return {name for name in names if names.count(name) > MOST_UNDRAWN}
-
-    def _triggered_by(self, name: str, delivery: Delivery) -> list[Trigger]:
-        return [trigger for trigger in self._watch.triggers
-                if trigger.camera == name and (delivery.image is not None or not trigger.needs_image)]
-
-    def _publish_drawn(self, awaited: Collection[str | None] = ()) -> None:
-        """Publish frames whose image has been drawn, each camera's in order; wait a moment for one of a camera that is awaited."""
-        drawn, coming, behind = [], [], set()
-        for name, delivery in self._undrawn:
-            if name in behind or not (delivery.image is None or delivery.image.done(DRAWING_WAIT if name in awaited else 0.0)):
-                behind.add(name)
-                coming.append((name, delivery))
-            else:
-                drawn.append((name, delivery))
-        self._undrawn = coming
-        for name, delivery in drawn:
-            if delivery.image is not None and delivery.image.result() is None:
-                for trigger in self._triggered_by(name, delivery):
-                    if trigger.needs_image:
-                        self._watch.cancel(trigger.node, delivery.frame.stamp)
-                self._simulation.cameras[name].give_up()
-        self._publish_frames(drawn)
 
     # -- real time ---------------------------------------------------------------------------------------------------
 
