@@ -1,0 +1,121 @@
+"""The estimator under every fault of its inputs: what becomes of it, what it says, and that it heals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from perch_perception.ukf import Estimator, Health, ImuOutcome, ImuSample, VioOutcome
+from unit.estimator_flight import MS, Flight
+
+
+def test_coasts_without_vio_grows_its_covariance_and_recovers():
+    flight = Flight(7).fly(end=1500)
+    before = flight.sigma()[:3].max()
+    kept, flight.poses = flight.poses, {k: v for k, v in flight.poses.items() if not 1500 - 25 <= k < 1900}
+    for k in range(1500, 1880):
+        flight.step(k)
+    assert flight.estimator.status.health is Health.COASTING
+    assert flight.estimator.status.vio_age > 0.5  # longer than the kept IMU history
+    coasting = flight.sigma()[:3].max()
+    assert coasting > 1.5 * before
+    assert np.abs(flight.error()[:3]).max() < 5 * coasting
+    flight.poses = kept
+    flight.fly(1880, 2100)
+    assert flight.estimator.status.health is Health.RUNNING
+    assert flight.sigma()[:3].max() < coasting
+    flight.assert_sane()
+
+
+@pytest.mark.parametrize(("change", "outcome"), [
+    (lambda p, now: replace(p, stamp=now + 200 * MS), VioOutcome.FUTURE),
+    (lambda p, now: replace(p, stamp=now + 10 * MS), VioOutcome.WAITING),
+    (lambda p, now: replace(p, stamp=now - 2_000 * MS), VioOutcome.OUT_OF_ORDER),
+    (lambda p, now: replace(p, p_WB=np.array([np.nan, 0, 0])), VioOutcome.NOT_FINITE),
+    (lambda p, now: replace(p, q_WB=np.zeros(4)), VioOutcome.NOT_FINITE),
+    (lambda p, now: replace(p, covariance=-np.eye(6)), VioOutcome.BAD_COVARIANCE),
+    (lambda p, now: replace(p, p_WB=p.p_WB + [1.0, 0, 0]), VioOutcome.GATED),
+])
+def test_unusable_poses_are_refused_with_the_reason(change, outcome):
+    flight = Flight(8).fly(end=1500)
+    before = flight.estimator.estimate.p_WB.copy()
+    pose = flight.poses[max(k for k in flight.poses if k < 1500)]
+    now = 1499 * 2 * MS
+    assert flight.estimator.add_vio(change(pose, now)) is outcome
+    np.testing.assert_array_equal(flight.estimator.estimate.p_WB, before)
+    if outcome is not VioOutcome.WAITING:
+        assert outcome.value in flight.estimator.status.message
+    flight.fly(1500, 1600)
+    flight.assert_sane()
+
+
+def test_a_pose_used_twice_is_a_duplicate():
+    flight = Flight(9).fly(end=1500)
+    used = flight.poses[max(k for k in flight.poses if k + 20 < 1500)]
+    assert flight.estimator.add_vio(used) is VioOutcome.DUPLICATE
+
+
+def test_a_pose_before_the_imu_has_come_is_refused():
+    flight = Flight(9)
+    assert flight.estimator.add_vio(flight.poses[160]) is VioOutcome.NO_IMU
+
+
+def test_a_waiting_pose_is_applied_when_the_imu_gets_there():
+    ahead, prompt = Flight(10, latency=-0.010), Flight(10, latency=0.0)
+    ahead.fly(end=1500)
+    prompt.fly(end=1500)
+    assert ahead.estimator.status.accepted >= prompt.estimator.status.accepted - 1 > 50
+    np.testing.assert_allclose(ahead.estimator.estimate.p_WB, prompt.estimator.estimate.p_WB, atol=2e-3)
+
+
+def test_a_jump_of_vios_map_is_gated_first_and_accepted_when_it_lasts():
+    flight = Flight(11).fly(end=1500)
+    flight.poses = {k: replace(p, p_WB=p.p_WB + [0.5, 0, 0]) if k >= 1480 else p for k, p in flight.poses.items()}
+    flight.fly(1500, 1600)
+    assert flight.estimator.status.rejected > 0
+    assert np.abs(flight.error()[:3]).max() < 0.1  # the jump is not followed while it is gated
+    flight.fly(1600, 2200)
+    assert flight.estimator.status.health is Health.RUNNING
+    assert flight.sigma()[0] > 0.2  # it cannot know which of both was right, and says so
+    flight.assert_sane()
+
+
+@pytest.mark.parametrize(("make", "outcome"), [
+    (lambda s: replace(s, w_B=(float("nan"), 0.0, 0.0)), ImuOutcome.NOT_FINITE),
+    (lambda s: replace(s, f_B=(0.0, float("inf"), 0.0)), ImuOutcome.NOT_FINITE),
+    (lambda s: replace(s, w_B=(34.0, 0.0, 0.0)), ImuOutcome.SATURATED),
+    (lambda s: replace(s, f_B=(0.0, 0.0, -156.0)), ImuOutcome.SATURATED),
+    (lambda s: replace(s, stamp=s.stamp - 20 * MS), ImuOutcome.NOT_NEWER),
+])
+def test_bad_imu_samples_are_bridged_with_a_larger_covariance(make, outcome):
+    good, bad = Flight(12).fly(end=1500), Flight(12).fly(end=1500)
+    for k in range(1500, 1505):
+        good.step(k)
+        bad.step(k, imu=False)
+        assert bad.estimator.add_imu(make(bad.sample(k))) is outcome
+        assert outcome.value in bad.estimator.status.message
+    bad.assert_sane()
+    if outcome is not ImuOutcome.NOT_NEWER:
+        assert np.all(bad.sigma()[:9] >= 0.99 * good.sigma()[:9])
+        assert bad.sigma()[3:9].max() > 1.2 * good.sigma()[3:9].max()
+    bad.fly(1505, 2000)
+    assert np.linalg.norm(bad.error()[:3]) < 0.15
+    bad.assert_sane()
+
+
+def test_an_imu_gap_grows_the_covariance_and_heals():
+    flight = Flight(13).fly(end=1500)
+    before = flight.sigma()
+    for k in range(1500, 1525):  # 50 ms
+        flight.step(k, imu=False)
+    flight.fly(1525, 1526)
+    assert flight.imu_outcome is ImuOutcome.GAP
+    assert np.all(flight.sigma()[3:9] > 1.5 * before[3:9])
+    flight.fly(1526, 2000)
+    assert np.linalg.norm(flight.error()[:3]) < 0.15
+    flight.assert_sane()
+
+
+def test_a_first_sample_that_is_not_finite_is_refused():
+    estimator = Estimator()
+    assert estimator.add_imu(ImuSample(0, (float("nan"),) * 3, (0.0, 0.0, 9.81))) is ImuOutcome.EMPTY
+    assert estimator.estimate is None
