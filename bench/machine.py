@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
+from perch_core.ros.priority import PRIORITY
 from perch_core.timing import CONTROL_PERIOD_NS
 
 _spawn = multiprocessing.get_context("spawn")
@@ -48,6 +49,21 @@ class LateWakeUps:
         return 100.0 * late / max(1, all_of_them)
 
 
+def late_with_load(load: float, seconds: float) -> float:
+    """Percentage of periods in which a loop that computes for as long as another program did, and does nothing else, is late by more
+    than a period: what the machine makes of that load.
+
+    Args:
+        load: processor time per period [s].
+        seconds: how long it runs.
+    """
+    ours, theirs = _spawn.Pipe()
+    process = _start(_compute, theirs, load, seconds)
+    late = ours.recv()
+    process.join()
+    return late
+
+
 def _start(work, *arguments) -> BaseProcess:
     process = _spawn.Process(target=work, args=arguments, daemon=True)
     process.start()
@@ -59,6 +75,21 @@ def _spin() -> None:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     while True:
         pass
+
+
+def _compute(pipe: Connection, load: float, seconds: float) -> None:
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    periods = round(seconds * 1e9 / CONTROL_PERIOD_NS)
+    due, late = time.monotonic_ns(), 0
+    for _ in range(periods):
+        due += CONTROL_PERIOD_NS
+        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+        end = time.thread_time() + load
+        while time.thread_time() < end:
+            pass
+        late += time.monotonic_ns() - due > 2 * CONTROL_PERIOD_NS
+    pipe.send(100.0 * late / periods)
 
 
 def _wake(pipe: Connection) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
-from machine import LateWakeUps, awake
+from machine import LateWakeUps, awake, late_with_load
 from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.conversions import to_seconds
@@ -102,8 +102,8 @@ class Probe:
 
 
 @contextmanager
-def running(scenario: Scenario, folder: Path, **options) -> Iterator[Probe]:
-    """A probe beside a stack that is up and stepping."""
+def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe, Stack]]:
+    """A stack that is up and stepping, and a probe beside it."""
     with reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         with Stack(programs(scenario, folder=folder, **options), folder) as stack:
@@ -115,7 +115,7 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[Probe]:
                         break
                     probe.listen(0.1)
                     stack.raise_if_ended()
-                yield probe
+                yield probe, stack
             finally:
                 probe.close()
 
@@ -128,33 +128,45 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
     """
     where = f"real time, {law}" + ("" if composed else ", one process per node")
     overrides = {"vehicle": {"cameras": "none"}, "controller": {"controller.type": law}}
-    with awake(), running(scenario, folder, lockstep=False, composed=composed, overrides=overrides) as probe:
+    with awake(), running(scenario, folder, lockstep=False, composed=composed, overrides=overrides) as (probe, stack):
         probe.take_off()
         counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
                      ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
         before = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
-        rates, machine = {topic: [] for topic in RATES}, LateWakeUps()
+        rates, machine, used = {topic: [] for topic in RATES}, LateWakeUps(), processor_time(stack)
         for _ in range(windows):
             counts = dict(probe.counts)
             span = probe.listen(WINDOW)
             for topic in RATES:
                 rates[topic].append((probe.counts[topic] - counts[topic]) / span)
-        late = machine.share()
+        late, used = machine.share(), processor_time(stack) - used
         after = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
         delay = float(probe.diagnostics["vehicle"]["command_us_median"])
+        load = used / max(1, after[0][1] - before[0][1])
     out = [figure(f"{where}: rate of {topic}", "Hz", samples, bar=499.0 if composed else None, comparison="median >=")
            for topic, samples in rates.items()]
     for (node, part, _), (old, old_all), (new, new_all) in zip(counts_of, before, after):
         share = 100.0 * (new - old) / max(1, new_all - old_all)
         out.append(figure(f"{where}: {part.replace('_', ' ')}, {node}", "% of steps", [share],
                           bar=0.1 if composed and part != "commands_missed" else None))
-    return [*out, figure(f"{where}: bare timer beside it late by a period", "% of steps", [late]),
-            figure(f"{where}: command after its IMU sample", "us", [delay])]
+    out += [figure(f"{where}: processor time of the nodes' callbacks", "us per step", [1e6 * load]),
+            figure(f"{where}: bare timer beside it late by a period", "% of steps", [late])]
+    if composed:
+        with awake():
+            same = late_with_load(load, windows * WINDOW)
+        out.append(figure(f"{where}: loop of as much processor time late by a period", "% of steps", [same]))
+    return [*out, figure(f"{where}: command after its IMU sample", "us", [delay])]
+
+
+def processor_time(stack: Stack) -> float:
+    """That the busiest program's main thread has used so far, in which its nodes' callbacks run [s]; Linux."""
+    stats = [Path(f"/proc/{pid}/task/{pid}/stat").read_text().rpartition(")")[2].split() for pid in stack.pids.values()]
+    return max(int(fields[11]) + int(fields[12]) for fields in stats) / os.sysconf("SC_CLK_TCK")
 
 
 def lockstep(scenario: Scenario, folder: Path, windows: int, composed: tuple[str, ...]) -> Figure:
     """Simulation time per wall-clock time of the 500 Hz chain, without cameras."""
-    with running(scenario, folder, composed=composed, overrides={"vehicle": {"cameras": "none"}}) as probe:
+    with running(scenario, folder, composed=composed, overrides={"vehicle": {"cameras": "none"}}) as (probe, _):
         factors = [_factor(probe) for _ in range(windows)]
     where = "one process" if composed else "one process per node"
     return figure(f"lockstep without cameras, {where}", "x real time", factors)

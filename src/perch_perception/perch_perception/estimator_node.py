@@ -70,6 +70,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
     def _go_on(self) -> None:
         begin = time.perf_counter()
         self._estimator.go_on()
+        if not self._estimator.behind:
+            self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs[-1] += time.perf_counter() - begin
 
     def _receive_imu(self, data: bytes) -> None:

@@ -83,7 +83,9 @@ class VehicleTopics:
                 *(p for camera in self.cameras.values() for p in (camera.image, camera.info))]
 
     def publish_clock(self, time: int) -> None:
-        """Simulation time [ns] on /clock."""
+        """Simulation time [ns] on /clock, where somebody listens."""
+        if not self.clock.get_subscription_count():
+            return
         self.clock.publish(Clock(clock=to_stamp(time)))
 
     def publish_imu(self, time: int, sample: ImuSample) -> None:
@@ -98,7 +100,9 @@ class VehicleTopics:
         self.odometry.publish(self._odometry.fill(state.time, *values))
 
     def publish_rotors(self, time: int, speed: np.ndarray, thrust: np.ndarray) -> None:
-        """Rotor speeds [rad/s] and thrusts [N], (4,)."""
+        """Rotor speeds [rad/s] and thrusts [N], (4,), where somebody listens."""
+        if not self.rotors.get_subscription_count():
+            return
         self._rotors.header.stamp = to_stamp(time)
         self._rotors.rotor_speed, self._rotors.thrust = speed, thrust
         self.rotors.publish(self._rotors)
