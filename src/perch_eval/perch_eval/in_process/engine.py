@@ -78,6 +78,8 @@ class _Flight:
         params = NodeParameters(scenario, seed)
         self.scenario = scenario
         self.simulation = Simulation(scenario, seed, DrawnOnDemand(scenario, seed, sensing.cameras) if sensing.cameras else None)
+        self.truth = StateHistory(MEMORY)
+        self.truth.append(self.simulation.state)  # an exposure may have its middle before the first step ends
         vehicle = self.simulation.vehicle
         self.latency = {t.node: round(t.latency * 1e9)
                         for t in triggers(("vio", "target_localizer", "powerline_mapper", "mission"), scenario.latency)}
@@ -90,7 +92,7 @@ class _Flight:
         if powerline:
             self.target = LineSource(params.of("powerline_mapper", PowerlineMapperConfig), front)
         else:
-            self.target = _target_source(scenario, seed, sensing, params.of("target_localizer", TargetLocalizerConfig), front)
+            self.target = self._target_source(seed, sensing, params.of("target_localizer", TargetLocalizerConfig), front)
         self.estimation = Estimation(params.of("estimator", UkfConfig))
         controller = params.of("controller", ControllerParameters)
         self.piloting = Piloting(controller, vehicle)
@@ -103,11 +105,18 @@ class _Flight:
         self.commanding = Commanding(params.of("mission", MissionParameters).mission, planning, goal_of(scenario))
         self.trace = FlightTrace(self.simulation.pad)
         self.poses, self.sightings, self.orders = Mailbox(), Mailbox(), Mailbox()
-        self.truth = StateHistory(MEMORY)
-        self.truth.append(self.simulation.state)  # an exposure may have its middle before the first step ends
         self.frames: dict[str, deque[Delivery]] = {"down": deque(), "front": deque()}
         self.index = 0
         self.status: PilotStatus | None = None
+
+    def _target_source(self, seed: int, sensing: Sensing, localizer: TargetLocalizerConfig, front: CameraMount) -> TargetSource:
+        """What sees the pad, by its error model or on rendered images."""
+        board = load_board(localizer.board)
+        if sensing.target == "rendered":
+            return TargetSource(RenderedSight(board, front, localizer), front, localizer)
+        true = true_mounts(self.scenario, {"front": front}, seed)["front"]
+        return TargetSource(ModelledSight(board, front, true, localizer, seeding.stream(seed, "tag_corners"), self.truth,
+                                          lambda: self.simulation.pad), front, localizer)
 
     def step(self, cancel: bool) -> int:
         """One control period. Returns its stamp [ns]."""
@@ -169,10 +178,7 @@ class _Flight:
             while waiting and consumer.covers(waiting[0]):
                 delivery = waiting.popleft()
                 due = max(delivery.frame.middle + self.latency[node], stamp + CONTROL_PERIOD_NS)
-                if name == "down":
-                    answer = self.vio.answer(delivery)
-                else:
-                    answer = self.target.answer(delivery, self.truth, self.simulation.pad)
+                answer = consumer.answer(delivery)
                 if answer is not None:
                     (self.poses if name == "down" else self.sightings).post(due, answer)
 
@@ -198,16 +204,6 @@ class _Flight:
                 self.trace.trajectories.append((time, item))
             else:
                 self.trace.commands.append((time, int(item[0]), item[1]))
-
-
-def _target_source(scenario: Scenario, seed: int, sensing: Sensing, localizer: TargetLocalizerConfig,
-                   front: CameraMount) -> TargetSource:
-    """What sees the pad, by its error model or on rendered images."""
-    board = load_board(localizer.board)
-    if sensing.target == "rendered":
-        return TargetSource(RenderedSight(board, front, localizer), front, localizer)
-    true = true_mounts(scenario, {"front": front}, seed)["front"]
-    return TargetSource(ModelledSight(board, front, true, localizer, seeding.stream(seed, "tag_corners")), front, localizer)
 
 
 def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: float = 0.0) -> FlightTrace:

@@ -6,13 +6,11 @@ import numpy as np
 from perch_msgs.msg import PowerlineArray
 
 from perch_core.camera import CameraMount
-from perch_core.surface import PerchSurface
 from perch_eval.in_process.frame_source import FrameSource
 from perch_perception.line_mapping import LineMapper, detect_lines, place
 from perch_perception.pose_buffer import StampError
 from perch_perception.powerline_mapper_node import PowerlineMapperConfig, map_message, mapping_pose
 from perch_sim.camera_stream import Delivery
-from perch_sim.state_history import StateHistory
 
 
 class LineSource(FrameSource):
@@ -23,7 +21,7 @@ class LineSource(FrameSource):
         self._params, self._mapper = params, LineMapper(params.mapper)
         self._used = -np.inf
 
-    def answer(self, delivery: Delivery, truth: StateHistory, pad: PerchSurface) -> PowerlineArray | None:
+    def answer(self, delivery: Delivery) -> PowerlineArray | None:
         """The map as published for one frame; None where the frame is not used."""
         exposed = self.exposed(delivery)
         if not self.fresh(exposed):

@@ -8,6 +8,8 @@ blur, contrast and light.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from perch_core.camera import CameraMount
@@ -39,7 +41,7 @@ class ModelledSight:
     """Sightings of the board made from the truth."""
 
     def __init__(self, board: TagBoard, mount: CameraMount, true: CameraMount, params: TargetLocalizerConfig,
-                 rng: np.random.Generator) -> None:
+                 rng: np.random.Generator, truth: StateHistory, pad: Callable[[], PerchSurface]) -> None:
         """
         Args:
             board: geometry of the tags.
@@ -47,13 +49,16 @@ class ModelledSight:
             true: the camera as it is.
             params: of the node.
             rng: of the corners' errors.
+            truth: the vehicle's last states.
+            pad: gives the true pad as it is now.
         """
+        self._truth, self._pad = truth, pad
         self._board, self._mount, self._true, self._params, self._rng = board, mount, true, params, rng
         self._last = self._searched = -np.inf
         self._R_CS: np.ndarray | None = None
 
-    def see(self, delivery: Delivery, exposed: float, state: TrueState, pad: PerchSurface, body: BodyState | None) -> Localization:
-        """What the localiser would say of a frame whose exposure had its middle at `state`."""
+    def see(self, delivery: Delivery, exposed: float, body: BodyState | None) -> Localization:
+        """What the localiser would say of a frame."""
         settings = self._params.localizer
         tracking = exposed - self._last <= settings.lost_after
         if not tracking:
@@ -61,7 +66,7 @@ class ModelledSight:
             if exposed - self._searched < 1.0 / settings.search_rate - 1e-3:
                 return Localization(None, message="waiting for the next search")
             self._searched = exposed
-        pixels, ids, side = self._visible(state, pad)
+        pixels, ids, side = self._visible(self._truth.at(delivery.frame.middle), self._pad())
         if not ids:
             return Localization(None, message="no tag of the board found")
         sigma = np.repeat(corner_sigma(side)[:, None], 4, axis=1)
@@ -101,7 +106,7 @@ class RenderedSight:
     def __init__(self, board: TagBoard, mount: CameraMount, params: TargetLocalizerConfig) -> None:
         self._localizer = BoardLocalizer(board, mount, params.localizer, averaging=params.mode == "average", calibration=params.calibration)
 
-    def see(self, delivery: Delivery, exposed: float, state: TrueState, pad: PerchSurface, body: BodyState | None) -> Localization:
+    def see(self, delivery: Delivery, exposed: float, body: BodyState | None) -> Localization:
         """What the localiser says of a frame."""
         return self._localizer.process(delivery.image.result, exposed, body)
 
@@ -114,7 +119,7 @@ class TargetSource(FrameSource):
         self._sight, self._params = sight, params
         self._target = None
 
-    def answer(self, delivery: Delivery, truth: StateHistory, pad: PerchSurface) -> Target | None:
+    def answer(self, delivery: Delivery) -> Target | None:
         """The target as published for one frame; None where nothing is."""
         exposed = self.exposed(delivery)
         if not self.fresh(exposed):
@@ -123,7 +128,7 @@ class TargetSource(FrameSource):
             body = self._buffer.at(exposed)
         except StampError:
             body = None
-        result = self._sight.see(delivery, exposed, truth.at(delivery.frame.middle), pad, body)
+        result = self._sight.see(delivery, exposed, body)
         if result.board is None or body is None:
             return None
         return self._update(result, body, exposed)

@@ -29,8 +29,9 @@ def sample_profiles(image: np.ndarray, points: np.ndarray, normals: np.ndarray, 
         Offsets s along the normal (S,) [px] and grey values (..., S).
     """
     s = np.linspace(-reach, reach, max(9, int(2 * reach / STEP) | 1))
-    at = (points[..., None, :] + s[:, None] * normals[..., None, :]).astype(np.float32).reshape(-1, s.size, 2) - np.float32(origin)
-    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    x, y = ((points[..., None, k] + s * normals[..., None, k]).astype(np.float32).reshape(-1, s.size) - np.float32(origin[k])
+            for k in (0, 1))
+    values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return s, values.reshape(points.shape[:-1] + (s.size,)).astype(float)
 
 
