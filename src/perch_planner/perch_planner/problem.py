@@ -13,7 +13,7 @@ from perch_core.config import choice, quantity
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
-from perch_core.vehicle import GRAVITY, Vehicle
+from perch_core.vehicle import Vehicle
 
 _ZERO = (0.0, 0.0, 0.0)
 

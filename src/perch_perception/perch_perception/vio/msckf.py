@@ -10,21 +10,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from perch_core import so3
-from perch_core.vehicle import GRAVITY
 
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, Bearings, corrected, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.landmark_choice import Spread
-from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.propagation import propagate
 from perch_perception.vio.sliding import Sliding
 from perch_perception.vio.state import Landmark, State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
 
-_G = np.array([0.0, 0.0, -GRAVITY])
 _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
 
 
@@ -45,11 +42,6 @@ class FrameReport:
         return self.landmarks_used + self.tracks_used + self.landmarks_new
 
 
-def _orthonormal(R: np.ndarray) -> np.ndarray:
-    """The rotation nearest to a matrix that rounding has taken off SO(3): one step of Newton's method."""
-    return 1.5 * R - 0.5 * R @ (R.T @ R)
-
-
 class Msckf:
     """Owns the state. The caller feeds IMU steps and bearings; nothing here knows of images or ROS."""
 
@@ -63,42 +55,10 @@ class Msckf:
         self.w_WB_B = np.zeros(3)
 
     def propagate(self, rows: np.ndarray, stamp: int) -> None:
-        """Move the inertial state along IMU steps (m, 9) to a stamp [ns].
-
-        The attitude columns of the transition are formed from first estimates: p' - p - v T - g T^2/2 and
-        v' - v - g T with what these were when the covariance last passed there (Hesch et al. 2014).
-        """
-        s = self.state
-        if len(rows) == 0:
-            s.stamp = stamp
-            return
-        pre = preintegrate(rows, s.gyro_bias, s.accel_bias)
-        T, R = pre.duration, s.R_WB
-        p = s.p_WB + s.v_WB * T + 0.5 * _G * T * T + R @ pre.dp
-        v = s.v_WB + _G * T + R @ pre.dv
-        R_end = R @ pre.dR
-        Phi = np.eye(at.INERTIAL_SIZE)
-        Phi[at.THETA, at.THETA] = R_end.T @ s.R_first
-        Phi[at.POSITION, at.THETA] = -so3.hat(p - s.p_first - s.v_first * T - 0.5 * _G * T * T) @ s.R_first
-        Phi[at.VELOCITY, at.THETA] = -so3.hat(v - s.v_first - _G * T) @ s.R_first
-        Phi[at.POSITION, at.VELOCITY] = T * np.eye(3)
-        Phi[at.THETA, 9:15] = pre.J[0:3]
-        Phi[at.POSITION, 9:15] = R @ pre.J[3:6]
-        Phi[at.VELOCITY, 9:15] = R @ pre.J[6:9]
-        G = np.zeros((9, 9))
-        G[:3, :3], G[3:6, 3:6], G[6:, 6:] = np.eye(3), R, R
-        P, n = s.P, at.INERTIAL_SIZE
-        own = Phi @ P[:n, :n] @ Phi.T
-        own[:9, :9] += G @ pre.Q @ G.T
-        P[:n, :n] = 0.5 * (own + own.T)
-        d = np.arange(3)
-        P[9 + d, 9 + d] += self.config.imu.gyro_bias_walk**2 * T
-        P[12 + d, 12 + d] += self.config.imu.accel_bias_walk**2 * T
-        P[:n, n:] = Phi @ P[:n, n:]
-        P[n:, :n] = P[:n, n:].T
-        s.p_WB, s.v_WB, s.R_WB, s.stamp = p, v, _orthonormal(R_end), stamp
-        s.freeze()
-        self.w_WB_B = pre.w_end
+        """Move the inertial state along IMU steps (m, 9) to a stamp [ns]."""
+        if len(rows):
+            self.w_WB_B = propagate(self.state, rows, self.config.imu)
+        self.state.stamp = stamp
 
     def add_frame(self, frame: int, ids: np.ndarray, bearings: Bearings) -> FrameReport:
         """Clone the pose at a frame and update with what is seen in it.
