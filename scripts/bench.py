@@ -39,8 +39,11 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer repetitions: the figures are rougher")
     arguments = parser.parse_args()
     if arguments.json:
+        new = not arguments.json.exists()
         try:
             arguments.json.open("a").close()  # before minutes of measuring
+            if new:
+                arguments.json.unlink()
         except OSError as error:
             parser.error(f"--json {arguments.json}: cannot be written: {error.strerror}")
     enter()

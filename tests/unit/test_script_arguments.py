@@ -64,3 +64,4 @@ def test_what_cannot_be_is_refused(run, capsys, name, arguments, words):
 def test_what_can_be_is_accepted(run, name, arguments):
     with pytest.raises(Entered):
         run(name, *arguments)
+    assert [path.name for path in Path().iterdir()] == ["file"]  # nothing is left of the trial
