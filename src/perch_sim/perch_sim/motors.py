@@ -37,12 +37,12 @@ class Motors:
         Raises:
             MotorCommandError: a speed is not finite; the command before it stays until it times out.
         """
-        speeds = np.asarray(speeds, float)
-        if armed and not math.isfinite(speeds.sum()):
-            raise MotorCommandError(f"motor_command: rotor_speed {speeds.tolist()} is not finite")
+        values = [float(s) for s in speeds]
+        if armed and not math.isfinite(sum(values)):
+            raise MotorCommandError(f"motor_command: rotor_speed {values} is not finite")
         self._armed, self._received, self.timed_out = armed, now, False
         if armed:
-            self._speeds = np.minimum(np.maximum(speeds, self._low), self._high)
+            self._speeds = np.array([min(max(s, self._low), self._high) for s in values])
 
     def target(self, now: int) -> np.ndarray:
         """Speeds that the rotors aim at, (4,) [rad/s]."""

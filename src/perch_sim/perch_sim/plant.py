@@ -124,7 +124,7 @@ class Plant:
 
     def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:
         """Judge what is touched at a time [ns]; `before` is the state one step earlier."""
-        if self.contact.free and not (self._distances <= 0.0).any():
+        if self.contact.free and min(self._distances.ravel().tolist(), default=1.0) > 0.0:
             return []
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
         events = self.contact.update(elapsed, before, self._x, self._distances)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core import so3
-from perch_perception.ukf import layout as at
+from perch_core.jit import compiled
 from perch_perception.ukf.measurement import Estimate, VioPose
 
 
@@ -21,17 +21,24 @@ def covariances(estimate: Estimate, gyro_noise: float) -> tuple[np.ndarray, np.n
         twist: covariance of (velocity in B, angular velocity in B), shape (6, 6).
     """
     R_WB = so3.quat_to_matrix(estimate.q_WB)
-    pose_map = np.zeros((6, at.VEHICLE_SIZE))
-    pose_map[:3, at.D_POSITION] = np.eye(3)
-    pose_map[3:, at.D_ATTITUDE] = R_WB
+    return _covariances(R_WB, so3.hat(R_WB.T @ estimate.v_WB), np.ascontiguousarray(estimate.P), gyro_noise)
+
+
+@compiled
+def _covariances(R_WB, hat_v_B, P, gyro_noise):
+    """`covariances` of P (15, 15), with R_WB and [v_B]x (3, 3)."""
+    pose_map = np.zeros((6, 15))  # indices: `layout`
+    pose_map[:3, 0:3] = np.eye(3)
+    pose_map[3:, 6:9] = R_WB
     # v_B = R^T v: an attitude error exp(theta) turns the velocity by v_B x theta
-    twist_map = np.zeros((6, at.VEHICLE_SIZE))
-    twist_map[:3, at.D_VELOCITY] = R_WB.T
-    twist_map[:3, at.D_ATTITUDE] = so3.hat(R_WB.T @ estimate.v_WB)
-    twist_map[3:, at.D_GYRO_BIAS] = -np.eye(3)
-    twist = twist_map @ estimate.P @ twist_map.T
-    twist[3:, 3:] += gyro_noise**2 * np.eye(3)
-    return pose_map @ estimate.P @ pose_map.T, twist
+    twist_map = np.zeros((6, 15))
+    twist_map[:3, 3:6] = R_WB.T
+    twist_map[:3, 6:9] = hat_v_B
+    twist_map[3:, 9:12] = -np.eye(3)
+    twist = twist_map @ P @ twist_map.T
+    for i in range(3, 6):
+        twist[i, i] += gyro_noise**2
+    return pose_map @ P @ pose_map.T, twist
 
 
 def vio_pose(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray | None,
