@@ -10,15 +10,18 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from perch_core.errors import PerchError
 from perch_core.scenario import load_scenario
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
+from perch_eval.arguments import output_folder, positive
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import prepare_worker
 from perch_eval.consistency import Consistency
@@ -106,15 +109,18 @@ def _judge_target(sightings: list[Sightings]) -> list[Consistency]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="surface_90")
-    parser.add_argument("--runs", type=int, default=50)
-    parser.add_argument("--first-seed", type=int, default=100)
-    parser.add_argument("--out", type=Path, default=Path("out/consistency"))
+    parser.add_argument("--scenario", default="surface_90", help="perch that is flown (default: %(default)s)")
+    parser.add_argument("--runs", type=positive, default=50, metavar="N", help="flights (default: %(default)s)")
+    parser.add_argument("--first-seed", type=positive, default=100, metavar="N", help="of the seeds that follow each other (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("out/consistency"), metavar="DIR", help="folder of results (default: %(default)s)")
     arguments = parser.parse_args()
-    results, summary = run(arguments.scenario, arguments.runs, arguments.first_seed)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "consistency.json").write_text(json.dumps(summary, indent=2))
-    consistency.plot(results, arguments.out / "consistency.png", {"take-off": 1.0, "hover": 3.0, "perch": 4.5})
+    try:
+        out = output_folder(arguments.out)
+        results, summary = run(arguments.scenario, arguments.runs, arguments.first_seed)
+    except PerchError as error:
+        parser.error(str(error))
+    (out / "consistency.json").write_text(json.dumps(summary, indent=2))
+    consistency.plot(results, out / "consistency.png", {"take-off": 1.0, "hover": 3.0, "perch": 4.5})
     print(json.dumps(summary, indent=2))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from perch_core.errors import ConfigError, PerchError
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
-from perch_eval.output_folder import output_folder
+from perch_eval.arguments import output_folder
 
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       --quick: both papers, 5 seeds a condition, 1 on lines

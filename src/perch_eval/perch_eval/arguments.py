@@ -1,11 +1,20 @@
-"""Folders that receive results: made, and tried out before the work begins."""
+"""What commands take: counts, and folders for results, which are tried out before the work begins."""
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from pathlib import Path
 
 from perch_core.errors import ConfigError
+
+
+def positive(text: str) -> int:
+    """A count of at least one, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not >= 1")
+    return value
 
 
 def output_folder(path: Path, option: str = "--out") -> Path:
