@@ -6,6 +6,7 @@ simulator's, the motion is exact (`perch_motion`), and nothing of the truth reac
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -126,6 +127,8 @@ def run_vio(flight: Flight, config: VioConfig = VioConfig(),
     start = flight.motion.sample(np.array([begin]))
     vio = VisualInertialOdometry(config, flight.mount, start.p_WB[0] + flight.told_wrong[:3], float(flight.told_wrong[3]))
     steps, k = [], int(np.searchsorted(flight.truth.times, begin))
+    gc.collect()
+    gc.freeze()  # as nodes do: what the flight holds would be looked through for garbage in the middle of a frame, for 0.1 s
     for time_, stamp, image in flight.frames:
         if time_ < begin:
             continue
@@ -141,6 +144,7 @@ def run_vio(flight: Flight, config: VioConfig = VioConfig(),
             result = vio.add_image(arriving, pixels)
             cost = time.process_time() - clock
             steps.append(VioStep(time_, result, cost, _vio_error(flight, result)))
+    gc.unfreeze()
     return steps
 
 
