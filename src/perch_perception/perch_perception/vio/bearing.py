@@ -76,7 +76,7 @@ def corrected(measured: Bearings, focal: float) -> np.ndarray:
 def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, distance):
     """Fill r, J, cosine, distance of `Residuals`; loops because numpy's calls cost more than the numbers."""
     X_B, X_C, u, b, e = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    by_C, by_B = np.zeros(3), np.zeros(3)
+    by_C, by_B, outward = np.zeros(3), np.zeros(3), np.zeros(3)
     for n in range(X_W.shape[0]):
         length = 0.0
         for i in range(3):
@@ -98,6 +98,14 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, 
         for i in range(3):
             u[i] = X_C[i] / d
             cosine[n] += u[i] * b[i]
+        # by the focal length, at the prediction: at the measurement it hangs together with the residual's noise
+        rho = math.sqrt(u[0] * u[0] + u[1] * u[1])
+        seen = math.atan2(math.sqrt(b_C[n, 0] ** 2 + b_C[n, 1] ** 2), b_C[n, 2])
+        turn = math.sqrt(by_focal[n, 0] ** 2 + by_focal[n, 1] ** 2 + by_focal[n, 2] ** 2) / seen if seen > 1e-9 else 1.0
+        angle = -turn * math.atan2(rho, u[2])  # the lens's slope hardly changes over a residual
+        for i in range(2):
+            outward[i] = angle * u[2] * u[i] / rho if rho > 1e-9 else 0.0
+        outward[2] = -angle * rho
         # e1 orthogonal to b, from the axis that is not near it; e2 = b x e1
         first = abs(b[0]) < 0.7
         a0, a1 = (1.0, 0.0) if first else (0.0, 1.0)
@@ -117,7 +125,7 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, 
                 by_B[i] = R_BC[i, 0] * by_C[0] + R_BC[i, 1] * by_C[1] + R_BC[i, 2] * by_C[2]
             out = J[n, row]
             out[6] = 0.0
-            out[7] = -(e[0] * by_focal[n, 0] + e[1] * by_focal[n, 1] + e[2] * by_focal[n, 2])
+            out[7] = -(e[0] * outward[0] + e[1] * outward[1] + e[2] * outward[2])
             for i in range(3):
                 j, k = (i + 1) % 3, (i + 2) % 3
                 out[i] = by_C[j] * X_C[k] - by_C[k] * X_C[j]       # d X_C = X_C x dtheta_c
