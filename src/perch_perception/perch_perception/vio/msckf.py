@@ -88,7 +88,7 @@ class Msckf:
         """Kalman update of the whole state with a Jacobian over some columns.
 
         The focal length is a *consider* state: its uncertainty counts in every gain and covariance, but it is not estimated
-        (Schmidt). Tracks of a pixel's noise would draw it off by 0.7 %, because triangulated points are not unbiased.
+        (Schmidt): where it was, it drifted by 0.6 %.
         """
         focal_variance = self.state.P[at.FOCAL, at.FOCAL]
         dx, self.state.P = ekf.update(self.state.P, columns, H, r, variance)
