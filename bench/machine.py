@@ -70,21 +70,29 @@ def _start(work, *arguments) -> BaseProcess:
     return process
 
 
-def _spin() -> None:
+def _schedule(policy: str, priority: int) -> None:
+    """Schedule this process so, where Linux permits it."""
     with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        os.sched_setscheduler(0, getattr(os, policy), os.sched_param(priority))
+
+
+def _sleep_until(due: int) -> None:
+    time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+
+
+def _spin() -> None:
+    _schedule("SCHED_IDLE", 0)
     while True:
         pass
 
 
 def _compute(pipe: Connection, load: float, seconds: float) -> None:
-    with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    _schedule("SCHED_FIFO", PRIORITY)
     periods = round(seconds * 1e9 / CONTROL_PERIOD_NS)
     due, late = time.monotonic_ns(), 0
     for _ in range(periods):
         due += CONTROL_PERIOD_NS
-        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+        _sleep_until(due)
         end = time.thread_time() + load
         while time.thread_time() < end:
             pass
@@ -93,12 +101,11 @@ def _compute(pipe: Connection, load: float, seconds: float) -> None:
 
 
 def _wake(pipe: Connection) -> None:
-    with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+    _schedule("SCHED_FIFO", 50)
     due, late, count = time.monotonic_ns(), 0, 0
     while not pipe.poll():
         due += CONTROL_PERIOD_NS
-        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+        _sleep_until(due)
         behind = (time.monotonic_ns() - due) // CONTROL_PERIOD_NS  # whole periods: this one and those slept over are late
         late, count, due = late + behind, count + 1 + behind, due + behind * CONTROL_PERIOD_NS
     pipe.send((late, count))

@@ -96,10 +96,10 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from perch_core import config
     from perch_core.scenario import load_scenario
+    from perch_eval.arguments import output_folder
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs, sharing
-    from perch_eval.arguments import output_folder
     from perch_eval.stack import Stack
     from perch_eval.view.address import check_free
     from ros_graph.connection import visit

@@ -49,10 +49,10 @@ def test_the_exit_code_tells_failed_claims_and_missing_rows(tmp_path, monkeypatc
     assert not [line for line in page.splitlines() if line.startswith("|") and "1 | 2" in line]  # a cell keeps its table whole
 
 
-def test_wrong_arguments_are_the_callers_mistake():
-    assert command.main(["--jobs", "0"]) == 2
+@pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"], ["--quick", "--full"]])
+def test_wrong_arguments_are_the_callers_mistake(arguments):
     with pytest.raises(SystemExit) as end:
-        command.main(["--quick", "--full"])
+        command.main(arguments)
     assert end.value.code == 2
 
 

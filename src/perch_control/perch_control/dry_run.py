@@ -17,7 +17,7 @@ from perch_control.modes import Command, State
 from perch_control.reference import FlatReference
 from perch_control.settings import GeometricGains
 from perch_core.timing import CONTROL_PERIOD
-from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import GRAVITY, Vehicle
 
 _RISE = 1.0  # [s]
@@ -33,18 +33,22 @@ class _DryRun:
         """Let periods pass."""
         for _ in range(count):
             self.time += CONTROL_PERIOD
-            m = self.flight.maneuvers
-            at = m.expected(self.time) if m.flying else None
-            p, v = (at.p, at.v) if at is not None else ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            p, v = self._expected()
             self.flight.imu(self.time, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
             self.flight.step(self.time, (*p, *v, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 
     def follow(self, id: int, end: float, at_end: AtEnd) -> None:
         """Take a trajectory to a height [m]."""
-        begin = self.flight.maneuvers.expected(self.time).p if self.flight.maneuvers.flying else (0.0, 0.0, 0.0)
         start = self.time + CONTROL_PERIOD
-        path: FlatTrajectory = rest_to_rest(np.array(begin), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE, start_time=start)
+        path = rest_to_rest(np.array(self._expected()[0]), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE, start_time=start)
         self.flight.follow(Order(id, FlatReference(path), start, at_end))
+
+    def _expected(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Position [m] and velocity [m/s]; at rest on the ground before the first order."""
+        if not self.flight.maneuvers.flying:
+            return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        at = self.flight.maneuvers.expected(self.time)
+        return at.p, at.v
 
 
 def dry_run(vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, l1: L1Settings) -> list[State]:

@@ -15,6 +15,8 @@ import numpy as np
 from perch_core import lens as kernels
 from perch_core.errors import ConfigError
 
+Region = tuple[slice, slice]  # rows and columns of an image
+
 
 @dataclass(frozen=True)
 class _Camera:

@@ -9,8 +9,8 @@ from pathlib import Path
 from perch_core.errors import ConfigError
 
 
-def positive(text: str) -> int:
-    """A count of at least one, for argparse."""
+def count(text: str) -> int:
+    """How many, at least one, for argparse."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not >= 1")

@@ -21,7 +21,7 @@ from perch_core.errors import PerchError
 from perch_core.scenario import load_scenario
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
-from perch_eval.arguments import output_folder, positive
+from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import prepare_worker
 from perch_eval.consistency import Consistency
@@ -110,8 +110,8 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="surface_90", help="perch that is flown (default: %(default)s)")
-    parser.add_argument("--runs", type=positive, default=50, metavar="N", help="flights (default: %(default)s)")
-    parser.add_argument("--first-seed", type=positive, default=100, metavar="N", help="of the seeds that follow each other (default: %(default)s)")
+    parser.add_argument("--runs", type=count, default=50, metavar="N", help="flights (default: %(default)s)")
+    parser.add_argument("--first-seed", type=count, default=100, metavar="N", help="of the seeds that follow each other (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/consistency"), metavar="DIR", help="folder of results (default: %(default)s)")
     arguments = parser.parse_args()
     try:

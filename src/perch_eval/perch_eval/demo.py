@@ -12,10 +12,10 @@ from pathlib import Path
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_core.scenario import Scenario, load_scenario
+from perch_eval.arguments import output_folder
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
-from perch_eval.arguments import output_folder
 from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
 from perch_eval.report import build_report, inspection_words
 from perch_eval.stack import Stack, StackError

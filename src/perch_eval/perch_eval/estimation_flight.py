@@ -6,7 +6,6 @@ simulator's, the motion is exact (`perch_motion`), and nothing of the truth reac
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from perch_core import so3
 from perch_core.camera import CameraMount
+from perch_core.processes import frozen_heap
 from perch_core.scenario import Scenario
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import load_vehicle
@@ -127,24 +127,22 @@ def run_vio(flight: Flight, config: VioConfig = VioConfig(),
     start = flight.motion.sample(np.array([begin]))
     vio = VisualInertialOdometry(config, flight.mount, start.p_WB[0] + flight.told_wrong[:3], float(flight.told_wrong[3]))
     steps, k = [], int(np.searchsorted(flight.truth.times, begin))
-    gc.collect()
-    gc.freeze()  # as nodes do: what the flight holds would be looked through for garbage in the middle of a frame, for 0.1 s
-    for time_, stamp, image in flight.frames:
-        if time_ < begin:
-            continue
-        while k < len(flight.truth.times) and flight.truth.times[k] < time_ + 0.02:
-            sample = flight.sample(k)
-            if tamper_imu is not None:
-                sample = tamper_imu(float(flight.truth.times[k]), sample)
-            if sample is not None:
-                vio.add_imu(sample)
-            k += 1
-        for arriving, pixels in (tamper(time_, stamp, image) if tamper else [(stamp, image)]):
-            clock = time.process_time()
-            result = vio.add_image(arriving, pixels)
-            cost = time.process_time() - clock
-            steps.append(VioStep(time_, result, cost, _vio_error(flight, result)))
-    gc.unfreeze()
+    with frozen_heap():  # as nodes do
+        for time_, stamp, image in flight.frames:
+            if time_ < begin:
+                continue
+            while k < len(flight.truth.times) and flight.truth.times[k] < time_ + 0.02:
+                sample = flight.sample(k)
+                if tamper_imu is not None:
+                    sample = tamper_imu(float(flight.truth.times[k]), sample)
+                if sample is not None:
+                    vio.add_imu(sample)
+                k += 1
+            for arriving, pixels in (tamper(time_, stamp, image) if tamper else [(stamp, image)]):
+                clock = time.process_time()
+                result = vio.add_image(arriving, pixels)
+                cost = time.process_time() - clock
+                steps.append(VioStep(time_, result, cost, _vio_error(flight, result)))
     return steps
 
 

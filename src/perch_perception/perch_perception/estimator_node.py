@@ -64,12 +64,16 @@ class EstimatorNode(PerchNode[UkfConfig]):
         velocity_covariance_B = twist[:3, :3] if twist[0, 0] > 0 else None  # all zero: not given
         pose = vio_pose(nanoseconds(msg.header.stamp), p, q, covariance, v, velocity_covariance_B)
         self._estimator.add_vio(pose, at_once=self._participant.lockstep is not False)
-        self._covariance_step = self._steps - self.params.covariance_stride
-        self._update_costs.append(time.perf_counter() - begin)
+        self._update_costs.append(0.0)
+        self._worked_on_update(begin)
 
     def _go_on(self) -> None:
         begin = time.perf_counter()
         self._estimator.go_on()
+        self._worked_on_update(begin)
+
+    def _worked_on_update(self, begin: float) -> None:
+        """An update or a part of it is done; after the last one the next message brings a new covariance."""
         if not self._estimator.behind:
             self._covariance_step = self._steps - self.params.covariance_stride
         self._update_costs[-1] += time.perf_counter() - begin

@@ -17,12 +17,12 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from perch_core.camera import CameraMount
+from perch_core.camera import CameraMount, Region
 from perch_core.processes import end_with_parent, give_way
 from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
-from perch_sim.rendering import Pose, Region, Renderer, Scene, build_scene
+from perch_sim.rendering import Pose, Renderer, Scene, build_scene
 
 NICE = 5             # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
 GREETING = b"ready"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import inspect
 import os
 import signal
@@ -24,6 +23,7 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 
 from perch_core.errors import ConfigError
+from perch_core.processes import freeze_heap
 from perch_core.ros import qos
 from perch_core.ros.backlog import Backlog
 from perch_core.ros.composition import composition
@@ -133,8 +133,7 @@ def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
 def settle() -> None:
     """Call when all nodes are there: does at once what would hold up a callback later."""
     inspect.getmodule(inspect.currentframe())  # the first line of a log looks for the files of all modules: 0.1 s
-    gc.collect()
-    gc.freeze()  # what the imports left is never garbage: looking through it again takes tens of milliseconds
+    freeze_heap()
 
 
 def close_nodes(nodes: Sequence[Node]) -> None:

@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 from perch_core.errors import PerchError
+from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
 from perch_eval.campaign.progress import Progress
@@ -17,7 +18,6 @@ from perch_eval.campaign.ranking import worst
 from perch_eval.campaign.results import Results, RunResult
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
-from perch_eval.arguments import output_folder, positive
 from perch_eval.statistics import Rate
 
 EXAMPLES = """examples:
@@ -36,8 +36,8 @@ def parser() -> argparse.ArgumentParser:
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     out.add_argument("campaign", metavar="CAMPAIGN", help="name in config/campaigns, or a YAML file")
     out.add_argument("--engine", metavar="NAME", help=f"{' or '.join(ENGINES)}, or your own as module:function (default: the file's)")
-    out.add_argument("--runs", type=positive, metavar="N", help="flights, with grids per grid point (default: the file's)")
-    out.add_argument("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes (default: %(default)s)")
+    out.add_argument("--runs", type=count, metavar="N", help="flights, with grids per grid point (default: the file's)")
+    out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes (default: %(default)s)")
     out.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler, or 'local'")
     out.add_argument("--resume", action="store_true", help="go on with the results in --out")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of results and report (default: out/campaigns/<name>)")

@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 from perch_core.errors import ConfigError, PerchError
+from perch_eval.arguments import count, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
-from perch_eval.arguments import output_folder
 
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       --quick: both papers, 5 seeds a condition, 1 on lines
@@ -84,11 +84,11 @@ def parser() -> argparse.ArgumentParser:
     size = out.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="both papers, 5 seeds a condition, 1 on lines (default)")
     size.add_argument("--full", action="store_true", help="every part, 100 seeds a condition, 10 on lines; resumable")
-    out.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
+    out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
-    out.add_argument("--seeds", type=int, default=100, metavar="N", help="flights of each perch condition with --full (default: %(default)s)")
-    out.add_argument("--line-seeds", type=int, default=10, metavar="N", help="flights of each powerline scenario with --full (default: %(default)s)")
+    out.add_argument("--seeds", type=count, default=100, metavar="N", help="flights of each perch condition with --full (default: %(default)s)")
+    out.add_argument("--line-seeds", type=count, default=10, metavar="N", help="flights of each powerline scenario with --full (default: %(default)s)")
     out.add_argument("--fresh", action="store_true", help="fly again what an earlier evaluation of the same code has flown")
     return out
 
@@ -96,10 +96,6 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    for option in ("jobs", "seeds", "line_seeds"):
-        if getattr(args, option) < 1:
-            print(f"error: --{option.replace('_', '-')} {getattr(args, option)} is not >= 1", file=sys.stderr)
-            return 2
     mode = "full" if args.full else "quick"
     effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, args.fresh, args.seeds, args.line_seeds)
     began = time.monotonic()

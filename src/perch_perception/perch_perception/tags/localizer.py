@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core import config
-from perch_core.camera import CameraMount
+from perch_core.camera import CameraMount, Region
 from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.average import average_board
@@ -21,7 +21,7 @@ from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
 from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
 from perch_perception.tags.refinement import refine_corners
-from perch_perception.tags.view import Region, VirtualView
+from perch_perception.tags.view import VirtualView
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perch_core.camera import Camera
+from perch_core.camera import Camera, Region
 
 GRID = 8          # the lens is evaluated on every 8th pixel; linear in between it is good to 0.01 px
 MAX_SIDE = 640    # [px]
 MAX_HALF_ANGLE = math.radians(60.0)  # a pinhole stretches without bound towards 90 deg
 _BORDER = np.linspace(-1.0, 1.0, 9)  # places along a side of the view; between them the lens bends it by less than a pixel
 _BORDER = np.concatenate([np.stack(pair, axis=-1) for ends in (-np.ones(9), np.ones(9)) for pair in ((_BORDER, ends), (ends, _BORDER))])
-
-Region = tuple[slice, slice]  # rows and columns of an image
 
 
 @dataclass(frozen=True)

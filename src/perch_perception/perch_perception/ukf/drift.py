@@ -101,13 +101,13 @@ def follow(belief: Belief, pose: VioPose, doubt: np.ndarray) -> Belief:
         CovarianceError: a covariance is not positive definite.
     """
     theta = at.D_ATTITUDE
-    B = np.linalg.solve(belief.P[theta, theta], belief.P[theta, at.D_ACCEL_BIAS]).T
     x = belief.x.copy()
     turn = update_kernels.take_over_pose(x)
-    x[at.ACCEL_BIAS] += B @ np.array(turn)
     J = np.zeros((6, 6))
     J[:3, :3], J[3:, 3:] = np.eye(3), so3.quat_to_matrix(x[at.QUATERNION]).T
     try:
+        B = np.linalg.solve(belief.P[theta, theta], belief.P[theta, at.D_ACCEL_BIAS]).T
+        x[at.ACCEL_BIAS] += B @ np.array(turn)
         P = _as_sure(belief.P, B, J @ (pose.covariance + doubt) @ J.T)
     except np.linalg.LinAlgError:
         raise CovarianceError("covariance after an update is not positive definite") from None

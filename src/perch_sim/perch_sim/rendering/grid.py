@@ -13,11 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from perch_core.camera import Camera, PinholeCamera
+from perch_core.camera import Camera, PinholeCamera, Region
 
 CELL = 8  # [px]
-
-Region = tuple[slice, slice]  # rows and columns of an image
 
 
 @lru_cache(maxsize=16)

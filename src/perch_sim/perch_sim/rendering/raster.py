@@ -9,9 +9,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perch_core.camera import Camera
+from perch_core.camera import Camera, Region
 from perch_sim.rendering.atlas import LEVELS_PER_OCTAVE, Atlas
-from perch_sim.rendering.grid import CELL, CellGrid, Region, sample_weights
+from perch_sim.rendering.grid import CELL, CellGrid, sample_weights
 from perch_sim.rendering.kernels import affine_of_cells, faces_behind, nearer_samples, place_texels, texels_per_pixel, uniform_samples
 from perch_sim.rendering.visibility import FaceArrays, View, look
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera import CameraMount, Region
 from perch_sim.rendering.atlas import build_atlas
 from perch_sim.rendering.cables import CablePainter
-from perch_sim.rendering.grid import Region, build_grid
+from perch_sim.rendering.grid import build_grid
 from perch_sim.rendering.raster import Rasterizer
 from perch_sim.rendering.scene import Scene
 from perch_sim.rendering.sensor import Sensor, control_exposure

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perch_core.camera import Camera, CameraMount
-from perch_sim.rendering.grid import Region
+from perch_core.camera import Camera, CameraMount, Region
 
 BLUR_REACH = 2   # of the filter that stands for it [px]
 PSF_SIGMA = 0.6  # blur of lens and pixel together [px]
