@@ -12,6 +12,7 @@ from perch_eval.flight import Flight
 from perch_eval.in_process import fly
 from perch_eval.in_process.recording import TracedFlight, write
 from perch_eval.in_process.trace import TRUTH
+from perch_eval.mcap_log import read
 from perch_eval.metrics import flight_metrics
 from perch_core.vehicle import load_vehicle
 from perch_eval.replay.command import main
@@ -89,6 +90,25 @@ def test_a_damaged_recording_is_read_as_far_as_it_goes(recorded, tmp_path):
     assert 0 < len(Flight(damaged).messages("odometry")) < count
     damaged.write_bytes(whole[:middle])
     assert 0 < len(Flight(damaged).messages("odometry")) < count
+
+
+def test_nothing_is_read_that_was_not_written(recorded, tmp_path):
+    path, _ = recorded
+    whole, damaged = path.read_bytes(), tmp_path / "damaged.mcap"
+    written = list(read(path))
+    for at in range(len(whole) // 20, len(whole), len(whole) // 10):
+        damaged.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1:])
+        seen = list(read(damaged))
+        assert seen == written[:len(seen)]
+
+
+def test_a_damaged_recording_is_said_to_be_one(recorded, tmp_path, capsys):
+    path, _ = recorded
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(path.read_bytes()[:5000])
+    assert Flight(path).damage == ""
+    assert main([str(damaged)]) == 2
+    assert "cut off or damaged" in capsys.readouterr().err
 
 
 def test_no_recording_is_the_callers_mistake(tmp_path, capsys):

@@ -37,16 +37,25 @@ class States:
 
 
 class Flight:
-    """The messages of one flight by topic (without leading slash or namespace of the vehicle)."""
+    """The messages of one flight by topic (without leading slash or namespace of the vehicle).
+
+    Attributes:
+        damage: why the recording could not be read to its end; empty if it could.
+    """
+
+    damage = ""
 
     def __init__(self, path: Path, namespace: str = "") -> None:
         self._raw: dict[str, list[tuple[float, Any]]] = {}
         prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
         classes: dict[str, Any] = {}
-        for topic, name, time, data in read(path):
+        for topic, name, time, data in read(path, on_damage=self._damaged):
             key = topic.removeprefix(prefix).lstrip("/")
             msg_type = classes.setdefault(name, message_class(name))
             self._raw.setdefault(key, []).append((time * 1e-9, deserialize_message(data, msg_type)))
+
+    def _damaged(self, why: str) -> None:
+        self.damage = why
 
     def messages(self, topic: str) -> list[tuple[float, Any]]:
         """(time [s], message) of a topic, in the order recorded; empty when there are none."""

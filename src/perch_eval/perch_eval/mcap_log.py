@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any, Iterator
+from typing import Any, Callable, Iterator
 
 from ament_index_python.packages import get_package_share_directory
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
+from mcap.stream_reader import CRCValidationError
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
@@ -76,20 +77,27 @@ class McapLog:
         self._file.close()
 
 
-def read(path: Path, topics: set[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
+def read(path: Path, topics: set[str] | None = None,
+         on_damage: Callable[[str], None] = lambda _: None) -> Iterator[tuple[str, str, int, bytes]]:
     """Messages of a file in the order written: topic, type, time [ns], data.
 
     A cut-off or damaged file is read as far as it goes; a flight that broke off before its first message has no file at all.
+    Checksums are looked at: a decompressor makes something of nearly every damage.
+
+    Args:
+        path: the file.
+        topics: only these.
+        on_damage: told why a file could not be read to its end.
     """
     if not path.exists():
         return
     with open(path, "rb") as file:
         try:
-            for schema, channel, message in NonSeekingReader(file).iter_messages(topics=list(topics) if topics else None,
-                                                                                 log_time_order=False):
+            for schema, channel, message in NonSeekingReader(file, validate_crcs=True).iter_messages(
+                    topics=list(topics) if topics else None, log_time_order=False):
                 yield channel.topic, schema.name, message.log_time, message.data
-        except (McapError, EOFError, struct.error, ZstdError, UnicodeDecodeError):
-            return
+        except (McapError, EOFError, struct.error, ZstdError, CRCValidationError, UnicodeDecodeError) as error:
+            on_damage(str(error) or type(error).__name__)
 
 
 def message_class(name: str) -> Any:

@@ -63,6 +63,8 @@ def _show(args: argparse.Namespace) -> int:
         if not 0.0 < getattr(args, name) < np.inf:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
     flight, vehicle = Flight(args.flight, args.namespace), load_vehicle(args.vehicle)
+    if flight.damage:
+        print(f"warning: {args.flight} is cut off or damaged, and shown as far as it goes ({flight.damage})", file=sys.stderr)
     try:
         view = View.of(flight)
     except LookupError as error:

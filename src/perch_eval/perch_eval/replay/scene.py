@@ -103,6 +103,8 @@ class Scene:
             getattr(axes, f"set_{name}lim")(centre - half, centre + half)
             getattr(axes, f"set_{name}label")(f"{name} [m]")
         axes.set_box_aspect((1, 1, 1))
+        axes.locator_params(nbins=5)
+        axes.tick_params(labelsize=8)
         axes.view_init(elev=14.0, azim=-62.0)
         axes.legend(fontsize=8, loc="upper left")
 
