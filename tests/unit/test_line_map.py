@@ -117,6 +117,23 @@ def test_a_sighting_of_wires_in_line_counts_only_where_its_width_tells_which_it_
     assert [a.observations - b.observations for a, b in zip(after.lines, before.lines, strict=True)] == [int(k == counted) for k in (0, 1)]
 
 
+def test_the_doubt_of_the_cameras_mount_is_counted_once():
+    """The fit's covariance has it; what the vehicle's attitude is doubted by comes on top."""
+    rng, attitude = np.random.default_rng(11), np.radians(0.5)
+    for sigma in (1e-6, attitude):
+        mapper = LineMapper(MapperConfig())
+        for k in range(16):
+            centre = np.array([0.0, 0.0, 1.8 + 0.05 * k])
+            body = BodyState(0.1 * k, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * sigma**2)
+            result = mapper.update(body.time, body, [observe(rng, WIRE, centre, 2e-4, time=body.time)])
+        line = result.lines[0]
+        estimate, middle = mapper._tracks[0].estimate, line.segment.centre
+        fit = estimate.point_covariance((middle - estimate.curve.point) @ estimate.curve.direction)
+        lever = so3.hat(middle - centre)
+        np.testing.assert_allclose(line.covariance, fit + sigma**2 * lever @ lever.T, atol=1e-5)  # once more were 2e-4
+        assert line.direction_sigma**2 == pytest.approx(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + sigma**2, rel=1e-6)
+
+
 def test_false_sightings_are_forgotten():
     rng = np.random.default_rng(9)
     mapper = LineMapper(MapperConfig(forget_after=1.0))

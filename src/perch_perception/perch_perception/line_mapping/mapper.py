@@ -227,17 +227,16 @@ class LineMapper:
         return lines
 
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
-        """Of the point at s relative to the vehicle, from the sightings, the calibration and the attitude, shape (3, 3) [m^2].
+        """Of the point at s relative to the vehicle, from the sightings and the attitude, shape (3, 3) [m^2].
 
-        The odometry's position is left out: its drift moves vehicle and wires together.
+        The sightings' part has the camera's mount in it, which the fit estimates. The odometry's position is left out: its drift
+        moves vehicle and wires together.
         """
         lever = so3.hat(estimate.curve.at(np.array(s)) - self._body.p_WB)
-        turned = self._body.covariance[3:, 3:] + np.radians(self.settings.triangulation.mount_rotation) ** 2 * np.eye(3)
-        return estimate.point_covariance(s) + lever @ turned @ lever.T
+        return estimate.point_covariance(s) + lever @ self._body.covariance[3:, 3:] @ lever.T
 
     def _direction_sigma(self, estimate: WireEstimate) -> float:
-        mount = np.radians(self.settings.triangulation.mount_rotation)
-        attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1] + mount**2
+        attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1]
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
 
 
