@@ -49,6 +49,8 @@ class Process:
             self.backlog = self.listener.create_backlog(MotorCommand, "fast", qos.CHAIN)
             self.talker = Node("talker", context=self.context)
             self.fast = self.composition.publisher(self.talker, MotorCommand, "fast", qos.CHAIN)
+            self.shown = self.composition.publisher(self.talker, MotorCommand, "shown", qos.CHAIN, urgent=False)
+            self.awaited = self.composition.publisher(self.talker, MotorCommand, "awaited", qos.CHAIN)
         self.stranger = Node("stranger", context=self.context)
         self.foreign = self.composition.publisher(self.stranger, MotorCommand, "foreign", qos.CHAIN)
         self.on_message = lambda number: None
@@ -60,9 +62,10 @@ class Process:
         self.heard.append(stamp_of(data))
         self.on_message(self.heard[-1])
 
-    def overhear(self) -> None:
-        self.stranger.create_subscription(MotorCommand, "fast", lambda data: self.overheard.append(stamp_of(data)), qos.CHAIN, raw=True)
-        self.until(lambda: self.fast.get_subscription_count() == 1)
+    def overhear(self, *topics: str) -> None:
+        for topic in topics or ("fast",):
+            self.stranger.create_subscription(MotorCommand, topic, lambda data: self.overheard.append(stamp_of(data)), qos.CHAIN, raw=True)
+            self.until(lambda topic=topic: getattr(self, topic).get_subscription_count() == 1)
 
     def until(self, done):
         last = time.monotonic() + 10.0
@@ -138,6 +141,48 @@ def test_what_leaves_waits_for_the_neighbours_unless_it_is_flushed(process):
     process.fast.publish(message(1))
     process.until(lambda: len(process.overheard) == 3)
     assert order == ["handled 1", "handled 2", "sent 1", "sent 2", "sent 3", "handled 3"]
+
+
+def test_a_process_that_holds_back_sends_several_steps_together(process):
+    """But not what strangers alone receive and answer."""
+    process.overhear("fast", "shown", "awaited")
+    process.composition.hold_back()
+    sent = []
+    for fast in (process.fast, process.shown, process.awaited):
+        fast._publisher = Spy(fast._publisher, sent)
+    for number, fast in enumerate((process.fast, process.shown, process.awaited), 1):
+        fast.publish(message(number))
+    process.until(lambda: process.heard == [1])
+    assert sent == ["sent 3"]
+    process.composition.flush()
+    assert sent == ["sent 3", "sent 1", "sent 2"]
+    process.until(lambda: sorted(process.overheard) == [1, 2, 3])
+
+
+def test_what_nobody_hears_does_not_leave(process):
+    sent = []
+    process.fast._publisher = Spy(process.fast._publisher, sent)
+    process.fast.publish(message(1))
+    process.until(lambda: process.heard == [1])
+    assert sent == []
+
+
+def test_a_dialogue_at_once_needs_no_turn_of_the_executor(process):
+    order = []
+
+    def answer(number: int) -> None:
+        process.composition.later(lambda: order.append(f"after {number}"))
+        if number < 3:
+            process.fast.publish(message(number + 1))
+
+    process.on_message = answer
+    with process.composition.at_once():
+        process.fast.publish(message(1))
+        assert process.heard == []
+    assert process.heard == [1, 2, 3] and order == ["after 1", "after 2", "after 3"]
+    process.fast.publish(message(3))
+    assert process.heard == [1, 2, 3]
+    process.until(lambda: process.heard == [1, 2, 3, 3])
 
 
 def test_what_has_time_is_done_when_the_neighbours_have_no_more_to_say(process):

@@ -34,6 +34,7 @@ from perch_sim.simulation import MOTOR_TIMEOUT, Output, Simulation
 
 MOST_WAITING = 2        # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
 CLOCK_STEPS = ROTOR_STEPS = TARGET_STEPS = 5  # 100 Hz
+SEND_STEPS = 5                                # in real time other processes hear of so many steps at a time: 10 ms
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000         # with a busy operating system in between [ns]
 
 
@@ -72,6 +73,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
         self._watch: LockstepWatch | None = None
         self._pacing: Pacing | None = None
         self._allowance = 0                    # steps that the wall clock allows a flight without controller
+        composition.hold_back(not params.lockstep)
         if params.lockstep:
             self._idle_clock = self.create_timer(CONTROL_PERIOD, self._advance, clock=steady)
             self._idle_clock.cancel()
@@ -187,9 +189,10 @@ class VehicleNode(PerchNode[VehicleParameters]):
                     frames.append((name, camera.take()))
                 else:
                     self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
-            self._publish({})
-            if frames:
-                composition.later(lambda frames=frames: self._publish_frames(frames))
+            with composition.at_once():
+                self._publish({})
+                if frames:
+                    composition.later(lambda frames=frames: self._publish_frames(frames))
 
     # -- output ------------------------------------------------------------------------------------------------------
 
@@ -213,8 +216,9 @@ class VehicleNode(PerchNode[VehicleParameters]):
         topics = self._topics
         if self._watch is None:
             self._times.end("waiting")
-        if index % TICK_STEPS == 0:
+        if index % (TICK_STEPS if self._watch is not None else SEND_STEPS) == 0:
             composition.flush()
+        if index % TICK_STEPS == 0:
             self._ticks.publish(self._step(output.time, index, self._released))
             self._released = {}
         if index % CLOCK_STEPS == 0:

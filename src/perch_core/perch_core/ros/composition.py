@@ -27,8 +27,8 @@ Receive = Callable[[bytes], None]
 class FastPublisher:
     """A publisher of serialised messages that serves its neighbours directly."""
 
-    def __init__(self, publisher: Publisher, send: Callable[[Publisher, bytes], None]) -> None:
-        self._publisher, self._send = publisher, send
+    def __init__(self, publisher: Publisher, send: Callable[[Publisher, bytes], None], urgent: bool) -> None:
+        self._publisher, self._send, self._urgent = publisher, send, urgent
         self._neighbours: list[Receive] = []
 
     @property
@@ -53,9 +53,9 @@ class FastPublisher:
         """Publish a serialised message."""
         for receive in self._neighbours:
             receive(data)
-        if not self._neighbours:
+        if self._urgent and not self._neighbours:
             self._publisher.publish(data)
-        elif self._publisher.get_subscription_count():
+        else:
             self._send(self._publisher, data)
 
 
@@ -67,7 +67,7 @@ class Composition:
     """
 
     def __init__(self) -> None:
-        self._creating = False
+        self._creating = self._gathering = self._patient = False
         self._publishers: dict[str, FastPublisher] = {}
         self._subscriptions: list[tuple[str, Receive, Callable[[], Any]]] = []
         self._messages: deque[tuple[Receive, bytes]] = deque()  # the one under way is the first
@@ -86,9 +86,9 @@ class Composition:
         finally:
             self._creating = False
 
-    def publisher(self, node: Node, msg_type: type, topic: str, profile: QoSProfile) -> FastPublisher:
-        """A publisher of a fast topic."""
-        fast = FastPublisher(node.create_publisher(msg_type, topic, profile), self._send)
+    def publisher(self, node: Node, msg_type: type, topic: str, profile: QoSProfile, urgent: bool = True) -> FastPublisher:
+        """A publisher of a fast topic; `urgent`: without neighbours somebody else needs each message to go on."""
+        fast = FastPublisher(node.create_publisher(msg_type, topic, profile), self._send, urgent)
         if self._creating:
             self._publishers[fast.topic_name] = fast
         return fast
@@ -125,8 +125,25 @@ class Composition:
     def flush(self) -> None:
         """Send what waits to leave the process. Call it before a message for which others shall know all that came before."""
         leaving, self._leaving = self._leaving, []
+        heard = {publisher: publisher.get_subscription_count() > 0 for publisher in dict.fromkeys(p for p, _ in leaving)}
         for publisher, data in leaving:
-            publisher.publish(data)
+            if heard[publisher]:
+                publisher.publish(data)
+
+    def hold_back(self, patient: bool = True) -> None:
+        """Whether messages for other processes wait for `flush`: who wants this paces the process, and flushes every few steps."""
+        self._patient = patient
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """What is published in here is handed on at its end: a turn of the executor costs 50 us."""
+        self._gathering = not self._messages
+        try:
+            yield
+        finally:
+            gathered, self._gathering = self._gathering and self._messages, False
+        if gathered:
+            self._hand_on_burst()
 
     def later(self, work: Callable[[], None]) -> None:
         """Do what nobody waits for: when the neighbours have no more to say to each other, and at once where none speaks."""
@@ -136,14 +153,14 @@ class Composition:
             work()
 
     def _send(self, publisher: Publisher, data: bytes) -> None:
-        """Send a message to other processes: at once, or when the neighbours have no more to say to each other."""
-        if self._messages:
+        """Send a message to other processes: at once, when the neighbours have no more to say to each other, or with others."""
+        if self._messages or self._patient:
             self._leaving.append((publisher, data))
         else:
             publisher.publish(data)
 
     def _queue(self, receive: Receive, data: bytes) -> None:
-        if not self._messages:
+        if not self._messages and not self._gathering:
             self._executor.create_task(self._hand_on)
         self._messages.append((receive, data))
 
@@ -170,7 +187,8 @@ class Composition:
                 break
         else:
             self._executor.create_task(self._hand_on)
-        self.flush()
+        if not self._patient:
+            self.flush()
         if not messages:
             later, self._later = self._later, []
             for work in later:

@@ -63,7 +63,7 @@ class VehicleTopics:
 
     def __init__(self, node: Node, imu: ImuConfig, mounts: Mapping[str, CameraMount]) -> None:
         self.imu = composition.publisher(node, Imu, "imu/data_raw", qos.CHAIN)
-        self.odometry = composition.publisher(node, Odometry, "ground_truth/odometry", qos.CHAIN)
+        self.odometry = composition.publisher(node, Odometry, "ground_truth/odometry", qos.CHAIN, urgent=False)
         self.target = node.create_publisher(PoseStamped, "ground_truth/target", qos.LATCHED)
         self.rotors = node.create_publisher(RotorState, "rotor_state", qos.CHAIN)
         self.contact = node.create_publisher(Contact, "contact", qos.GATED)
