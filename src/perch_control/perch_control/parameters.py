@@ -29,7 +29,8 @@ class ControllerParameters:
     gains: str = choice("vehicle", options=("vehicle", "snapdragon", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
     estimator_status: bool = quantity(True, doc="estimator/status is awaited at every 50th step; false: there is no estimator that sends it")
     blind_after: float = quantity(0.08, unit="s", above=0.0,
-                                  doc="real time: without odometry for so long while the IMU goes on, descend on the IMU alone; motors stop after 0.1 s without commands")
+                                  doc="real time: without odometry for so long while the IMU goes on, descend on the IMU alone; "
+                                      "motors stop after 0.1 s without commands")
     blind_after_lockstep: float = quantity(10.0, unit="s", above=0.0, doc="the same in lockstep, wall-clock time: a slow estimator is not a dead one")
     controller: ControllerChoice = part(ControllerChoice)
     snapdragon: GeometricGains = part(GeometricGains)

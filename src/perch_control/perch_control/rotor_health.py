@@ -33,7 +33,8 @@ class RotorHealthSettings:
     reserve: float = quantity(0.95, unit="-", above=0.0, high=1.0, doc="a trajectory may ask for this share of what is left")
     hover_least: float = quantity(1.12, unit="-", above=0.0, high=2.0, doc="greatest thrust / weight that is left, below which the vehicle lands at once")
     touch_speed: float = quantity(1.2, unit="m/s", above=0.0, doc="such a landing does not lean where it would touch the ground faster than this")
-    lean_deg: float = quantity(15.0, unit="deg", above=0.0, high=45.0, doc="it leans so far to brake its speed across, or as far as the weight is still carried ...")
+    lean_deg: float = quantity(15.0, unit="deg", above=0.0, high=45.0,
+                               doc="it leans so far to brake its speed across, or as far as the weight is still carried ...")
     lean_most_deg: float = quantity(30.0, unit="deg", above=0.0, high=60.0, doc="... but no further than this")
 
 

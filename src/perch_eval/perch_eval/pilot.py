@@ -26,10 +26,8 @@ from perch_core.scenario import Scenario
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
 """Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
 START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
-OUTCOMES = {code: name for code, name in enumerate(
-    ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed"))}
-
-
+OUTCOMES = dict(enumerate(
+    ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed")))
 SUCCESSES = ("perched", "inspected")
 """Outcomes of a flight that did what was asked."""
 
@@ -130,7 +128,8 @@ class Pilot:
         self._spin_until(self._client.server_is_ready, check, stall, "the mission's action server does not appear")
         for node, service in SERVICES.items():
             if node in scenario.nodes:
-                self._spin_until(lambda: self._node.count_services(self._node.resolve_service_name(service)) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
+                name = self._node.resolve_service_name(service)
+                self._spin_until(lambda: self._node.count_services(name) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
         self._spin_until(lambda: self._time > 0.0, check, START_PATIENCE, "simulation time does not begin")
         began, started = time.monotonic(), self._time
         sent = self._client.send_goal_async(goal_of(scenario), feedback_callback=feedback)

@@ -85,7 +85,7 @@ COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
     rows = [(t, f"mission orders {COMMANDS[m.command]}: {m.reason}") for t, m in flight.messages("controller/command")]
-    for t, m in flight.messages("trajectory"):
+    for _, m in flight.messages("trajectory"):
         start = m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
         length = sum(s.duration for s in m.segments) if m.segments else m.points[-1].time_from_start
         kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[m.at_end]

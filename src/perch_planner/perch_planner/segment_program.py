@@ -142,4 +142,4 @@ class FullSegments:
         return Judgement(coefficients, extrema, results, *found, sum(len(bounds[-1]) for bounds in cuts))
 
 
-FORMULATIONS = {"reduced": ReducedSegments, "full": FullSegments}
+FORMULATIONS: dict[str, type[SegmentProgram]] = {"reduced": ReducedSegments, "full": FullSegments}

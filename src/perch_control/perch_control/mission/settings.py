@@ -42,7 +42,8 @@ class MissionSettings:
     shift_max: float = quantity(0.15, unit="m", above=0.0, high=1.0, doc="... and less than this; beyond it the rest is planned again")
     replan_shift: float = quantity(0.3, unit="s", above=0.0, high=5.0, doc="a new plan whose contact is earlier or later by more is not flown")
     mapping_reach: float = quantity(0.8, unit="m", above=0.0, high=3.0, doc="how far the vehicle moves to see lines from other places")
-    mapping_legs: int = quantity(3, low=0, high=5, doc="moves of the pattern that are flown before a plan: up, nearer, down, back; three perch from the near place")
+    mapping_legs: int = quantity(3, low=0, high=5,
+                                 doc="moves of the pattern that are flown before a plan: up, nearer, down, back; three perch from the near place")
     mapping_approach: float = quantity(2.8, unit="m", low=0.0, high=10.0, doc="how far the vehicle goes nearer to see lines better")
     mapping_standoff: float = quantity(2.2, unit="m", above=0.0, high=50.0, doc="but not nearer to the target than this")
     plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")

@@ -117,8 +117,8 @@ def summary(found: list[RunResult]) -> str:
     """Success and causes for the terminal, most frequent first."""
     rate = Rate(sum(r.cause == SUCCESS for r in found), len(found))
     lines = [f"success: {rate}  (95 % Wilson)"]
-    for cause, count in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():
-        lines.append(f"  {count:5d}  {cause:<11} {MEANING.get(cause, '')}")
+    for cause, flights in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():
+        lines.append(f"  {flights:5d}  {cause:<11} {MEANING.get(cause, '')}")
     return "\n".join(lines)
 
 

@@ -50,11 +50,13 @@ def fault_sections(effort: Effort) -> list[Section]:
     text = ["# Faults in flight", "", out.about, "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
             f"it on the way, and nothing broke; *{NO_WAY}*: from the true state in which the fault left the vehicle, without any delay, rotors at their "
-            "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "", *table, "", "## Flights without a good end", ""]
+            "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "", *table, "",
+            "## Flights without a good end", ""]
     for r in bad or ():
         height, gap, speed, tilt = r["before"]
         text.append(f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
-                    f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg; with all thrust upwards from then on it would meet the floor with {r['best_impact']:.1f} m/s. End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
+                    f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg; with all thrust upwards "
+                    f"from then on it would meet the floor with {r['best_impact']:.1f} m/s. End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
                     + _searched(r) + " / ".join(r["events"]))
     _write(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
     out.data = {"flights": flown}
@@ -68,7 +70,8 @@ def comparison_sections(effort: Effort) -> list[Section]:
     flown = _kept(effort, "comparison", jobs, _compared)
     offset = ", ".join(f"{x:g}" for x in LINE)
     out = Section("c_comparison", "Controllers compared on the same flights",
-                  f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference (line: as commanded; perch: the plan), RMS per axis x, y, z; "
+                  f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
+                  "(line: as commanded; perch: the plan), RMS per axis x, y, z; "
                   f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
                   "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover, flies the perch with it, and the plan "
                   "is asked for with it (`thrust_max` of `plan_perch`; the node `mission` does not ask so). Every flight: comparison.md.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time as clock
 from collections import deque
 from dataclasses import dataclass
@@ -242,8 +241,3 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
             trace.outcome = "inspected"
     trace.wall_time = clock.perf_counter() - began
     return trace
-
-
-def true_contact(trace: FlightTrace) -> float:
-    """Time at which the truth first shows the vehicle attached [s]; nan: never."""
-    return next((c.time for c in trace.contacts if c.state.name == "ATTACHED"), math.nan)

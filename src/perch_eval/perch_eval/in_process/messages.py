@@ -79,7 +79,7 @@ def streams(trace: FlightTrace) -> Iterator[tuple[str, int, Any]]:
         msg.header.stamp = to_stamp(float(row[0]))
         msg.rotor_speed, msg.thrust = np.array(row[1:5]), np.array(row[5:9])
         yield "rotor_state", stamp_of(row[0]), msg
-    for time, pose in trace.vio:
+    for _, pose in trace.vio:
         row = np.concatenate([pose.p_WB, pose.q_WB, np.zeros(3) if pose.v_WB is None else pose.v_WB, np.zeros(3)])
         yield "vio/odometry", pose.stamp, _odometry(pose.stamp, row, "odom", pose.covariance)
     for time, status in trace.estimator:

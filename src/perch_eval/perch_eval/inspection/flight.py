@@ -113,8 +113,8 @@ def _take_off(flight: _Flight, scenario: Scenario) -> None:
     flight.run(0.2)
     yaw = float(np.radians(first.yaw_deg))
     duration = max(2.0, first.position[2] / 0.8)
-    flight.piloting.follow(FlownTrajectory(1, rest_to_rest(flight.sensing.odometry.estimate.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD),
-                                           AtEnd.HOLD))
+    rise = rest_to_rest(flight.sensing.odometry.estimate.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD)
+    flight.piloting.follow(FlownTrajectory(1, rise, AtEnd.HOLD))
     flight.run(duration + LEAD + SETTLE)
     if State(flight.piloting.status.state) is not State.HOVERING:
         raise PerchError(f"did not take off: {flight.piloting.status.message}")

@@ -2,8 +2,9 @@
 
 Each sighting gives a plane through the camera's centre that contains the wire: n . d = 0 and n . (p - c) = 0. Their
 intersection is the start; a robust least-squares fit to all rays, with the poses' own errors, refines it and says how
-well it is known. The odometry drifts as it flies: in its frame the wire wanders, and is estimated where it is now. Where the camera moved along the wire or towards it, all planes are the same plane, and the depth
-would be off by metres: such baselines are refused.
+well it is known. The odometry drifts as it flies: in its frame the wire wanders, and is estimated where it is now. Where
+the camera moved along the wire or towards it, all planes are the same plane, and the depth would be off by metres: such
+baselines are refused.
 
 A wire has one radius, and looks the wider the nearer it is: sin(width / 2) = radius / distance. From afar triangulation gives the
 distance, and so the radius; near the wire, where the camera flies towards it, the radius gives the distance.
@@ -160,9 +161,10 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         misfit = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
         used = misfit < 3.0 * max(1.0, float(np.median(misfit)))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
-        information, gradient = _wandering(
-            _normal_equations(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight),
-            _normal_equations(*_widths(curve, size, observations, settings, apart if known > 0.0 else apart + WIDTH_GATE**2), weight), walk, settings, curve.curvature, mount, size)
+        by_rays = _normal_equations(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight)
+        apart = apart if known > 0.0 else apart + WIDTH_GATE**2
+        by_widths = _normal_equations(*_widths(curve, size, observations, settings, apart), weight)
+        information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount, size)
         step = -np.linalg.solve(information, gradient)
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
