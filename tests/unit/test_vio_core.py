@@ -9,7 +9,7 @@ from perch_core.camera import PinholeCamera
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion
 from perch_perception.vio import bearing, ekf, lens
-from perch_perception.vio.bearing import corrected, observe, residuals
+from perch_perception.vio.bearing import observe, residuals
 from perch_perception.vio.landmark_choice import Spread, cell
 from perch_perception.vio.motion_start import solve_motion
 from perch_perception.vio.preintegration import preintegrate
@@ -35,17 +35,6 @@ def in_camera(R, p, X, R_BC=MOUNT.R_BC, p_BC=MOUNT.p_BC):
 # -- bearings ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", [MOUNT.camera, PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)])
-def test_a_wrong_focal_length_is_undone_by_the_focal_error(camera):
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)), np.ones(30)])
-    stretched = dataclasses.replace(camera, fx=camera.fx * 1.004, fy=camera.fy * 1.004)
-    measured = observe(camera, stretched.project(points)[0])
-    truth = points / np.linalg.norm(points, axis=1, keepdims=True)
-    assert np.abs(measured.b_C - truth).max() > 5e-4
-    np.testing.assert_allclose(corrected(measured, np.log(1.004)), truth, atol=5e-6)
-
-
 def test_bearings_are_those_of_the_camera():
     rng = np.random.default_rng(9)
     camera = dataclasses.replace(MOUNT.camera, angle_limit=1.3)
@@ -62,10 +51,10 @@ def test_residual_jacobians_are_those_of_finite_differences():
     assert valid.all()
     measured = observe(MOUNT.camera, pixels + rng.normal(0, 3.0, pixels.shape))
 
-    def r(R=R, p=p, X=X, R_BC=MOUNT.R_BC, p_BC=MOUNT.p_BC, focal=0.0):
-        return residuals(R, p, X, R_BC, p_BC, measured, focal).r
+    def r(R=R, p=p, X=X, R_BC=MOUNT.R_BC, p_BC=MOUNT.p_BC):
+        return residuals(R, p, X, R_BC, p_BC, measured).r
 
-    linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured, 0.0)
+    linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured)
     cases = {
         "THETA": lambda d: r(R=R @ so3.exp(d)), "POSITION": lambda d: r(p=p + d), "POINT": lambda d: r(X=X + d),
         "CAMERA_ROTATION": lambda d: r(R_BC=MOUNT.R_BC @ so3.exp(d)), "CAMERA_POSITION": lambda d: r(p_BC=MOUNT.p_BC + d)}
@@ -75,22 +64,26 @@ def test_residual_jacobians_are_those_of_finite_differences():
         np.testing.assert_allclose(linear.J[:, :, getattr(bearing, name)], numeric, atol=1e-7, err_msg=name)
 
 
-def test_the_focal_derivative_is_that_of_another_lens():
+@pytest.mark.parametrize("camera", [MOUNT.camera, PinholeCamera(640, 480, 275.0, 275.0, 320.0, 240.0)])
+@pytest.mark.parametrize("column, name", list(enumerate(("fx", "fy", "cx", "cy"))))
+def test_the_lens_derivatives_are_those_of_another_lens(camera, column, name):
     rng = np.random.default_rng(2)
     R, p, X = scene(rng)
-    stretched = dataclasses.replace(MOUNT.camera, fx=275.0 * 1.0001, fy=275.0 * 1.0001)
-    measured = observe(MOUNT.camera, stretched.project(in_camera(R, p, X))[0])
-    linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured, 0.0)
-    np.testing.assert_allclose(linear.r, linear.J[:, :, bearing.FOCAL] * np.log(1.0001), atol=2e-7)
+    error = 1e-4  # relative, or in focal lengths
+    value = {"fx": 275.0 * np.exp(error), "fy": 275.0 * np.exp(error), "cx": camera.cx + 275.0 * error, "cy": camera.cy + 275.0 * error}[name]
+    measured = observe(camera, dataclasses.replace(camera, **{name: value}).project(in_camera(R, p, X))[0])
+    linear = residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, measured)
+    assert np.abs(linear.r).max() > 3e-5
+    np.testing.assert_allclose(linear.r, linear.J[:, :, bearing.LENS.start + column] * error, atol=2e-7)
 
 
-def test_the_focal_derivative_does_not_follow_the_noise():
-    """It is that of the prediction: with the residual's own noise in it every observation would teach a longer lens."""
+def test_the_lens_derivatives_do_not_follow_the_noise():
+    """They are those of the prediction: with the residual's own noise in them every observation would teach a longer lens."""
     rng = np.random.default_rng(3)
     R, p, X = scene(rng)
     pixels = MOUNT.camera.project(in_camera(R, p, X))[0]
-    sizes = [np.linalg.norm(residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, observe(MOUNT.camera, centre + scale * (pixels - centre)), 0.0)
-                            .J[:, :, bearing.FOCAL], axis=1)
+    sizes = [np.linalg.norm(residuals(R, p, X, MOUNT.R_BC, MOUNT.p_BC, observe(MOUNT.camera, centre + scale * (pixels - centre)))
+                            .J[:, :, bearing.LENS].sum(axis=2, where=[True, True, False, False]), axis=1)
              for centre in [np.array([MOUNT.camera.cx, MOUNT.camera.cy])] for scale in (1.0, 0.99)]
     inner = sizes[0] < 1.2  # towards its rim the lens's slope changes, too
     assert inner.sum() > 2

@@ -31,7 +31,7 @@ def standing(rng, height=STANDING):
     filter = Msckf(CONFIG, state, MOUNT.camera.fx)
     noise = rng.normal(0, CONFIG.filter.pixel_noise, pixels.shape)
     wrong = rng.multivariate_normal(np.zeros(at.CORE_SIZE), state.P)
-    wrong[at.FOCAL] = 0.0
+    wrong[at.LENS] = 0.0
     state.inject(wrong)
     return filter, points, np.flatnonzero(valid), observe(MOUNT.camera, (pixels + noise)[valid])
 

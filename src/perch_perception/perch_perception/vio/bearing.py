@@ -22,16 +22,16 @@ class Bearings:
 
     Attributes:
         b_C: unit vectors in C, shape (n, 3).
-        by_focal: their derivative by the logarithm of the focal length, shape (n, 3).
+        shape: of the lens there, d theta / d r and r / theta, with r the radius in the normalised image at the angle theta, shape (n, 2).
     """
 
     b_C: np.ndarray
-    by_focal: np.ndarray
+    shape: np.ndarray
 
 
 # columns of a residual's derivatives
-CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, FOCAL = slice(0, 3), slice(3, 6), 6, 7
-THETA, POSITION, POINT = slice(8, 11), slice(11, 14), slice(14, 17)
+CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, LENS = slice(0, 3), slice(3, 6), 6, slice(7, 11)
+THETA, POSITION, POINT = slice(11, 14), slice(14, 17), slice(17, 20)
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Residuals:
 
     Attributes:
         r: measured minus predicted, shape (n, 2).
-        J: derivatives by the errors of camera rotation (3) and position (3), time offset, relative focal error, the body's
-            theta (3) and position (3), and by the point's position in W (3), shape (n, 2, 17). The time offset's are zero:
-            it acts through the poses (`State.add_clone`).
+        J: derivatives by the errors of camera rotation (3) and position (3), time offset, lens (log fx, log fy, cx / fx, cy / fy),
+            the body's theta (3) and position (3), and by the point's position in W (3), shape (n, 2, 20). The time offset's are
+            zero: it acts through the poses (`State.add_clone`).
         cosine: between measured and predicted bearing, shape (n,).
         distance: from the camera to the point [m], shape (n,).
     """
@@ -58,37 +58,23 @@ def observe(camera: Camera, pixels: np.ndarray) -> Bearings:
     if isinstance(camera, EquidistantCamera):
         return Bearings(*lens.observe(camera, pixels))
     b = camera.unproject(pixels)
-    rho = np.linalg.norm(b[:, :2], axis=1)
-    safe = np.where(rho > 1e-9, rho, 1.0)
-    e = np.where((rho > 1e-9)[:, None], b[:, :2] / safe[:, None], 0.0)
-    outward = np.column_stack([b[:, 2:] * e, -rho])  # unit tangent away from the axis
-    angle = -rho * b[:, 2]  # theta = atan(r), r shrinks as f grows
-    return Bearings(b, outward * angle[:, None])
-
-
-def corrected(measured: Bearings, focal: float) -> np.ndarray:
-    """Unit bearings for a relative focal error, shape (n, 3)."""
-    b = measured.b_C + focal * measured.by_focal
-    return b / np.linalg.norm(b, axis=1, keepdims=True)
+    theta = np.arctan2(np.hypot(b[:, 0], b[:, 1]), b[:, 2])
+    return Bearings(b, np.column_stack([np.cos(theta) ** 2, np.tan(theta + 1e-9) / (theta + 1e-9)]))
 
 
 @compiled
-def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, distance):
+def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, shape, r, J, cosine, distance):
     """Fill r, J, cosine, distance of `Residuals`; loops because numpy's calls cost more than the numbers."""
     X_B, X_C, u, b, e = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    by_C, by_B, outward = np.zeros(3), np.zeros(3), np.zeros(3)
+    by_C, by_B = np.zeros(3), np.zeros(3)
     for n in range(X_W.shape[0]):
-        length = 0.0
         for i in range(3):
-            b[i] = b_C[n, i] + focal * by_focal[n, i]
-            length += b[i] * b[i]
+            b[i] = b_C[n, i]
             X_B[i] = 0.0
             for j in range(3):
                 X_B[i] += R_WB[n, j, i] * (X_W[n, j] - p_WB[n, j])
-        length = math.sqrt(length)
         d2 = 0.0
         for i in range(3):
-            b[i] /= length
             X_C[i] = 0.0
             for j in range(3):
                 X_C[i] += R_BC[j, i] * (X_B[j] - p_BC[j])
@@ -98,14 +84,13 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, 
         for i in range(3):
             u[i] = X_C[i] / d
             cosine[n] += u[i] * b[i]
-        # by the focal length, at the prediction: at the measurement it hangs together with the residual's noise
+        # the lens at the prediction: at the measurement its derivatives hang together with the residual's noise
         rho = math.sqrt(u[0] * u[0] + u[1] * u[1])
-        seen = math.atan2(math.sqrt(b_C[n, 0] ** 2 + b_C[n, 1] ** 2), b_C[n, 2])
-        turn = math.sqrt(by_focal[n, 0] ** 2 + by_focal[n, 1] ** 2 + by_focal[n, 2] ** 2) / seen if seen > 1e-9 else 1.0
-        angle = -turn * math.atan2(rho, u[2])  # the lens's slope hardly changes over a residual
-        for i in range(2):
-            outward[i] = angle * u[2] * u[i] / rho if rho > 1e-9 else 0.0
-        outward[2] = -angle * rho
+        theta = math.atan2(rho, u[2])
+        cx, cy = (u[0] / rho, u[1] / rho) if rho > 1e-9 else (1.0, 0.0)
+        radius = shape[n, 1] * theta  # the lens's shape hardly changes over a residual
+        x, y = radius * cx, radius * cy
+        out, side = shape[n, 0], rho / radius if rho > 1e-9 else 1.0
         # e1 orthogonal to b, from the axis that is not near it; e2 = b x e1
         first = abs(b[0]) < 0.7
         a0, a1 = (1.0, 0.0) if first else (0.0, 1.0)
@@ -123,20 +108,23 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, by_focal, focal, r, J, cosine, 
                 by_C[i] = (e[i] - eu * u[i]) / d
             for i in range(3):
                 by_B[i] = R_BC[i, 0] * by_C[0] + R_BC[i, 1] * by_C[1] + R_BC[i, 2] * by_C[2]
-            out = J[n, row]
-            out[6] = 0.0
-            out[7] = -(e[0] * outward[0] + e[1] * outward[1] + e[2] * outward[2])
+            to = J[n, row]
+            to[6] = 0.0
+            along = out * (u[2] * (e[0] * cx + e[1] * cy) - e[2] * rho)
+            across = side * (e[1] * cx - e[0] * cy)
+            to[9], to[10] = along * cx - across * cy, along * cy + across * cx
+            to[7], to[8] = to[9] * x, to[10] * y
             for i in range(3):
                 j, k = (i + 1) % 3, (i + 2) % 3
-                out[i] = by_C[j] * X_C[k] - by_C[k] * X_C[j]       # d X_C = X_C x dtheta_c
-                out[3 + i] = -by_B[i]
-                out[8 + i] = by_B[j] * X_B[k] - by_B[k] * X_B[j]
+                to[i] = by_C[j] * X_C[k] - by_C[k] * X_C[j]       # d X_C = X_C x dtheta_c
+                to[3 + i] = -by_B[i]
+                to[11 + i] = by_B[j] * X_B[k] - by_B[k] * X_B[j]
                 by_W = R_WB[n, i, 0] * by_B[0] + R_WB[n, i, 1] * by_B[1] + R_WB[n, i, 2] * by_B[2]
-                out[11 + i], out[14 + i] = -by_W, by_W
+                to[14 + i], to[17 + i] = -by_W, by_W
 
 
 def residuals(R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray,
-              measured: Bearings, focal: float) -> Residuals:
+              measured: Bearings) -> Residuals:
     """Residuals of points seen from body poses.
 
     u = unit(R_BC^T (R_WB^T (X - p_WB) - p_BC)), r = B (b - u) with B the tangent basis at the measured b.
@@ -146,10 +134,9 @@ def residuals(R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, R_BC: np.ndar
         X_W: points, shape (n, 3).
         R_BC, p_BC: extrinsics, shapes (3, 3), (3,).
         measured: n bearings.
-        focal: relative focal error.
     """
     n = len(X_W)
-    out = Residuals(np.empty((n, 2)), np.empty((n, 2, 17)), np.empty(n), np.empty(n))
+    out = Residuals(np.empty((n, 2)), np.empty((n, 2, 20)), np.empty(n), np.empty(n))
     _linearise(np.ascontiguousarray(R_WB), np.ascontiguousarray(p_WB), np.ascontiguousarray(X_W), np.ascontiguousarray(R_BC),
-               p_BC, measured.b_C, measured.by_focal, float(focal), out.r, out.J, out.cosine, out.distance)
+               p_BC, measured.b_C, measured.shape, out.r, out.J, out.cosine, out.distance)
     return out

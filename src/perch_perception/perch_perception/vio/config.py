@@ -39,9 +39,9 @@ class FilterConfig:
     clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
     landmarks_per_frame: int = quantity(5, low=1, high=50, doc="most new landmarks per frame")
-    pixel_noise: float = quantity(0.15, unit="px", above=0.0, doc="1 sigma of a track, white from frame to frame")
+    pixel_noise: float = quantity(0.1, unit="px", above=0.0, doc="1 sigma of a track, white from frame to frame")
     slide_turn: float = quantity(1.2, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the angle that its bearing moves")
-    slide_zoom: float = quantity(4.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
+    slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
     tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
     least_parallax_deg: float = quantity(2.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
@@ -58,7 +58,8 @@ class CalibrationPriors:
     rotation: float = quantity(0.00838, unit="rad", low=0.0, high=0.2, doc="camera against IMU, all axes together")
     translation: float = quantity(0.002, unit="m", low=0.0, high=0.1)
     time_offset: float = quantity(0.0019, unit="s", low=0.0, high=0.05)
-    focal: float = quantity(0.0029, unit="-", low=0.0, high=0.05, doc="relative error of the focal length")
+    focal: float = quantity(0.0029, unit="-", low=0.0, high=0.05, doc="relative error of each focal length")
+    centre: float = quantity(0.48, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from perch_perception.vio import state as at
-from perch_perception.vio.bearing import POINT, Bearings, corrected, residuals
+from perch_perception.vio.bearing import POINT, Bearings, residuals
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.msckf import Msckf
-from perch_perception.vio.state import Landmark
 
 _STEEP = 0.35        # least sine of a ray below the horizon
 _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
@@ -42,7 +41,7 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
     height = float(centre[2] - floor)
     if height < least_height or not len(ids):
         return 0
-    rays = corrected(bearings, s.focal) @ (s.R_WB @ s.R_BC).T
+    rays = bearings.b_C @ (s.R_WB @ s.R_BC).T
     spread, chosen = Spread({}, limits.landmarks), []
     for k in np.flatnonzero(rays[:, 2] < -_STEEP):
         if len(chosen) < limits.landmarks and spread.admits(bearings.b_C[k]):
@@ -52,14 +51,13 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
         return 0
     X = centre - height / rays[chosen, 2:3] * rays[chosen]
     n = len(chosen)
-    seen = Bearings(bearings.b_C[chosen], bearings.by_focal[chosen])
-    linear = residuals(np.broadcast_to(s.R_WB, (n, 3, 3)), np.broadcast_to(s.p_WB, (n, 3)), X, s.R_BC, s.p_BC, seen, s.focal)
+    seen = Bearings(bearings.b_C[chosen], bearings.shape[chosen])
+    linear = residuals(np.broadcast_to(s.R_WB, (n, 3, 3)), np.broadcast_to(s.p_WB, (n, 3)), X, s.R_BC, s.p_BC, seen)
     columns, variance = np.r_[_CALIBRATION, _POSE], np.diag([filter.sigma**2, filter.sigma**2, sigma**2])
     for k, i in enumerate(chosen):
         inverse = np.linalg.inv(np.vstack([linear.J[k, :, POINT], [0.0, 0.0, 1.0]]))
         J = -inverse[:, :2] @ linear.J[k, :, : POINT.start]
         cross = J @ s.P[columns]
         own = J @ s.P[np.ix_(columns, columns)] @ J.T + inverse @ variance @ inverse.T
-        s.P = np.block([[s.P, cross.T], [cross, own]])
-        s.landmarks[int(ids[i])] = Landmark(X[k], X[k].copy())
+        s.add_landmark(int(ids[i]), X[k], np.zeros(3), cross, own)
     return n

@@ -13,12 +13,12 @@ import numpy as np
 
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
-from perch_perception.vio.bearing import POINT, Bearings, corrected, residuals
+from perch_perception.vio.bearing import POINT, Bearings, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.propagation import propagate
 from perch_perception.vio.sliding import Sliding
-from perch_perception.vio.state import Landmark, State
+from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
 
@@ -70,7 +70,7 @@ class Msckf:
         """
         report, s = FrameReport(), self.state
         s.add_clone(frame, self.w_WB_B)
-        ended = self.tracks.take_ended(ids)
+        ended = {i: t for i, t in self.tracks.take_ended(ids).items() if i not in s.landmarks}
         self.tracks.observe(frame, ids, bearings)
         self._update_landmarks(report)
         if len(s.clones) >= self.config.filter.clones:
@@ -87,12 +87,11 @@ class Msckf:
     def apply(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, variance: float | np.ndarray) -> None:
         """Kalman update of the whole state with a Jacobian over some columns.
 
-        The focal length is a *consider* state: its uncertainty counts in every gain and covariance, but it is not estimated
-        (Schmidt): where it was, it drifted by 0.6 %.
+        The lens is *considered*: its uncertainty counts in every gain and covariance, but it is not estimated (Schmidt).
         """
-        focal_variance = self.state.P[at.FOCAL, at.FOCAL]
+        lens = self.state.P[at.LENS, at.LENS]
         dx, self.state.P = ekf.update(self.state.P, columns, H, r, variance)
-        dx[at.FOCAL], self.state.P[at.FOCAL, at.FOCAL] = 0.0, focal_variance
+        dx[at.LENS], self.state.P[at.LENS, at.LENS] = 0.0, lens
         self.state.inject(dx)
 
     # -- landmarks in the state --------------------------------------------------------------------------------------
@@ -105,15 +104,16 @@ class Msckf:
             return
         m, clone = len(s.landmarks), s.clones[-1]
         tracks = [self.tracks.by_id[i] for i in s.landmarks]
-        seen = Bearings(np.array([t.b_C[-1] for t in tracks]), np.array([t.by_focal[-1] for t in tracks]))
+        seen = Bearings(np.array([t.b_C[-1] for t in tracks]), np.array([t.shape[-1] for t in tracks]))
         now = self._residuals(clone.R_WB, clone.p_WB, np.array([k.X_W for k in s.landmarks.values()]), seen)
-        first = self._residuals(clone.R_first, clone.p_first, np.array([k.X_first for k in s.landmarks.values()]), seen)
+        linear = self._residuals(clone.R_WB, clone.p_WB, np.array([k.X_linear for k in s.landmarks.values()]), seen)
         k = s.clone_at(len(s.clones) - 1)
         columns = np.concatenate([_CALIBRATION, np.arange(k, k + 6), np.arange(s.landmark_start, s.size)])
         H = np.zeros((m, 2, len(columns)))
-        H[:, :, :14] = first.J[:, :, : POINT.start]
+        H[:, :, : POINT.start] = linear.J[:, :, : POINT.start]
         for i in range(m):
-            H[i, :, 14 + 3 * i : 17 + 3 * i] = first.J[i, :, POINT]
+            k = POINT.start + 3 * i
+            H[i, :, k : k + 3] = linear.J[i, :, POINT]
         r = now.r
         self._let_slide(tracks, now.distance)
         P = s.P[np.ix_(columns, columns)]
@@ -178,8 +178,7 @@ class Msckf:
             inverse = np.linalg.inv(R_f)
             cross = -inverse @ H_1 @ s.P[columns]
             own = inverse @ (H_1 @ P @ H_1.T + self.sigma**2 * np.eye(3)) @ inverse.T
-            s.P = np.block([[s.P, cross.T], [cross, own]])
-            s.landmarks[i] = Landmark(X + inverse @ r_1, X)
+            s.add_landmark(i, X, inverse @ r_1, cross, own)
             rows.append(H_0)
             rests.append(r_0)
             report.landmarks_new += 1
@@ -230,7 +229,6 @@ class Msckf:
         s, limits = self.state, self.config.filter
         place = {c.frame: j for j, c in enumerate(s.clones)}
         R, p = s.window()
-        R_first, p_first = s.first_window()
         seen = [[k for k, f in enumerate(track.frames) if f in place] for track in tracks]
         chosen = [(n, track, ks) for n, (track, ks) in enumerate(zip(tracks, seen)) if len(ks) >= 4]
         out: list[tuple | None] = [None] * len(tracks)
@@ -238,9 +236,9 @@ class Msckf:
             return out
         js = np.array([place[track.frames[k]] for _, track, ks in chosen for k in ks])
         bearings = Bearings(np.array([track.b_C[k] for _, track, ks in chosen for k in ks]),
-                            np.array([track.by_focal[k] for _, track, ks in chosen for k in ks]))
+                            np.array([track.shape[k] for _, track, ks in chosen for k in ks]))
         centres = (p + R @ s.p_BC)[js]
-        rays = np.einsum("nij,nj->ni", (R @ s.R_BC)[js], corrected(bearings, s.focal))
+        rays = np.einsum("nij,nj->ni", (R @ s.R_BC)[js], bearings.b_C)
         X, parts, begin = np.zeros((len(js), 3)), [], 0
         for number, _, ks in chosen:
             rows = slice(begin, begin + len(ks))
@@ -252,14 +250,14 @@ class Msckf:
         if not parts:
             return out
         now = self._residuals(R[js], p[js], X, bearings)
-        first = self._residuals(R_first[js], p_first[js], X, bearings)
         walk = self.sliding.steps(bearings.b_C[:-1], bearings.b_C[1:], now.distance[:-1], now.distance[1:])
+        n = len(_CALIBRATION)
         for number, X_W, rows in parts:
             m = rows.stop - rows.start
-            A = np.zeros((m, 2, 8 + at.CLONE_SIZE * len(s.clones) + 4))
-            A[:, :, :8] = first.J[rows, :, :8]
-            A[:, :, 8:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = first.J[rows, :, 8:14]
-            A[:, :, -4:-1], A[:, :, -1] = first.J[rows, :, POINT], now.r[rows]
+            A = np.zeros((m, 2, n + at.CLONE_SIZE * len(s.clones) + 4))
+            A[:, :, :n] = now.J[rows, :, :n]
+            A[:, :, n:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = now.J[rows, :, n : POINT.start]
+            A[:, :, -4:-1], A[:, :, -1] = now.J[rows, :, POINT], now.r[rows]
             A = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1)).reshape(2 * m, -1)
             out[number] = X_W, A[:, :-4], A[:, -4:-1], A[:, -1]
         return out
@@ -296,4 +294,4 @@ class Msckf:
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)
-        return residuals(np.broadcast_to(R_WB, (n, 3, 3)), np.broadcast_to(p_WB, (n, 3)), X_W, s.R_BC, s.p_BC, bearings, s.focal)
+        return residuals(np.broadcast_to(R_WB, (n, 3, 3)), np.broadcast_to(p_WB, (n, 3)), X_W, s.R_BC, s.p_BC, bearings)

@@ -259,7 +259,7 @@ def _compile(camera: Camera) -> None:
     centres = np.array([[0.0, 0.0, 1.0], [0.75, 0.0, 1.0]])
     X = triangulate(centres, rays, 0.1, 0.01)
     seen = observe(camera, camera.project(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]))[0])
-    linear = residuals(np.broadcast_to(np.eye(3), (2, 3, 3)), centres, np.array([X, X]), np.eye(3), np.zeros(3), seen, 0.0)
+    linear = residuals(np.broadcast_to(np.eye(3), (2, 3, 3)), centres, np.array([X, X]), np.eye(3), np.zeros(3), seen)
     ekf.eliminate(linear.J[:, :, :POINT.start].reshape(4, -1), linear.J[:, :, POINT].reshape(4, 3), linear.r.ravel())
 
 

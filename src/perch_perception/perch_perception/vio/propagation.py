@@ -17,9 +17,6 @@ _G = np.array([0.0, 0.0, -GRAVITY])
 def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> np.ndarray:
     """Move the inertial part of a state along IMU steps (m, 9), m > 0; its stamp is left to the caller.
 
-    The attitude columns of the transition are formed from first estimates: p' - p - v T - g T^2/2 and
-    v' - v - g T with what these were when the covariance last passed there (Hesch et al. 2014).
-
     Returns:
         Angular velocity in B at the end, bias removed [rad/s], shape (3,).
     """
@@ -29,9 +26,9 @@ def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> np.ndarray:
     v = s.v_WB + _G * T + R @ pre.dv
     R_end = R @ pre.dR
     Phi = np.eye(at.INERTIAL_SIZE)
-    Phi[at.THETA, at.THETA] = R_end.T @ s.R_first
-    Phi[at.POSITION, at.THETA] = -so3.hat(p - s.p_first - s.v_first * T - 0.5 * _G * T * T) @ s.R_first
-    Phi[at.VELOCITY, at.THETA] = -so3.hat(v - s.v_first - _G * T) @ s.R_first
+    Phi[at.THETA, at.THETA] = pre.dR.T
+    Phi[at.POSITION, at.THETA] = -R @ so3.hat(pre.dp)
+    Phi[at.VELOCITY, at.THETA] = -R @ so3.hat(pre.dv)
     Phi[at.POSITION, at.VELOCITY] = T * np.eye(3)
     Phi[at.THETA, 9:15] = pre.J[0:3]
     Phi[at.POSITION, 9:15] = R @ pre.J[3:6]
@@ -48,7 +45,6 @@ def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> np.ndarray:
     P[:n, n:] = Phi @ P[:n, n:]
     P[n:, :n] = P[:n, n:].T
     s.p_WB, s.v_WB, s.R_WB = p, v, _orthonormal(R_end)
-    s.freeze()
     return pre.w_end
 
 

@@ -52,7 +52,8 @@ def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, p
     W[2, 3:] = W[3:, 2] = pose.covariance[3, :3]
     P[:6, :6] = J @ W @ J.T
     sigma = np.concatenate([np.repeat([velocity_sigma, gyro_sigma, config.imu.accel_bias_init, c.rotation / np.sqrt(3),
-                                       c.translation], 3), [c.time_offset, c.focal]])
+                                       c.translation], 3),
+                            [c.time_offset, c.focal, c.focal, c.centre / mount.camera.fx, c.centre / mount.camera.fy]])
     P[6:, 6:] = np.diag(sigma**2)
     return State(stamp, R_WB, pose.p_WB.copy(), v_WB, gyro_bias, np.zeros(3), mount.R_BC.copy(), mount.p_BC.copy(),
                  -mount.stamp_offset, P)
@@ -72,5 +73,4 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     H[:, at.THETA], H[:, at.ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
     dx, state.P = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, config.imu.accel_noise**2 / len(steps))
     state.inject(dx)
-    state.freeze()
     return state

@@ -1,10 +1,10 @@
 """The state of the MSCKF: inertial state, calibration, a sliding window of poses, landmarks, and their covariance.
 
-Error vector: theta, p, v, b_g, b_a (15) | camera rotation, camera position, time offset, focal (8) | clones
-(theta, p) | landmarks (X). Attitude errors are right perturbations, R_WB = R exp(theta), R_BC = R exp(theta_c).
+Error vector: theta, p, v, b_g, b_a (15) | camera rotation, camera position, time offset (7), lens (log fx, log fy,
+cx / fx, cy / fy) | clones (theta, p) | landmarks (X). Attitude errors are right perturbations, R_WB = R exp(theta), R_BC = R exp(theta_c).
 
-Each linearised quantity keeps its *first estimate* (`*_first`): Jacobians of the window and of landmarks are taken
-there, so that yaw and position in W stay unobservable for the filter, as they are (FEJ; docs/estimation.md).
+Jacobians are taken at the newest poses, and the covariance goes along when an update moves these (`State.inject`), so that yaw and
+position in W stay unobservable for the filter, as they are (docs/estimation.md).
 """
 
 from __future__ import annotations
@@ -13,30 +13,78 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from perch_core import so3
+from perch_core.jit import compiled
 
 THETA, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
-CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, FOCAL = slice(15, 18), slice(18, 21), 21, 22
-INERTIAL_SIZE, CORE_SIZE, CLONE_SIZE = 15, 23, 6
+CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, LENS = slice(15, 18), slice(18, 21), 21, slice(22, 26)
+INERTIAL_SIZE, CORE_SIZE, CLONE_SIZE = 15, 26, 6
+_POSE = np.arange(CLONE_SIZE)
+
+
+@compiled
+def _less_cross(out, a, s, w):
+    """Take s x w, w (3, n), off the rows of `out` from a on."""
+    x, y, z = s[0], s[1], s[2]
+    for c in range(out.shape[1]):
+        out[a, c] -= y * w[2, c] - z * w[1, c]
+        out[a + 1, c] -= z * w[0, c] - x * w[2, c]
+        out[a + 2, c] -= x * w[1, c] - y * w[0, c]
+
+
+@compiled
+def _carried(P, thetas, R, E, steps, v, points, onward):
+    """M P M^T for the M of `State.inject`.
+
+    Args:
+        P: covariance, shape (n, n).
+        thetas: where the poses' errors (theta, p) begin in it, the present one's first, shape (k,).
+        R: their attitudes before the step, shape (k, 3, 3); E: what these are turned by, R' = R E, shape (k, 3, 3).
+        steps: of their positions, shape (k, 3); v: of the velocity, shape (3,).
+        points: where errors of points begin, shape (m,); onward: their steps, shape (m, 3).
+    """
+    n = len(P)
+    out, other = P.copy(), np.empty((n, n))
+    w = np.empty((3, n))
+    for side in range(2):  # rows, then those of the transpose
+        for k in range(len(thetas) - 1, -1, -1):
+            a = thetas[k]
+            for i in range(3):
+                for c in range(n):
+                    w[i, c] = R[k, i, 0] * out[a, c] + R[k, i, 1] * out[a + 1, c] + R[k, i, 2] * out[a + 2, c]
+            _less_cross(out, a + 3, steps[k], w)
+            if k == 0:
+                _less_cross(out, 6, v, w)
+                for m in range(len(points)):
+                    _less_cross(out, points[m], onward[m], w)
+            for c in range(n):
+                x, y, z = out[a, c], out[a + 1, c], out[a + 2, c]
+                for i in range(3):
+                    out[a + i, c] = E[k, 0, i] * x + E[k, 1, i] * y + E[k, 2, i] * z
+        if side == 0:
+            other[:, :] = out.T
+            out, other = other, out
+    for r in range(n):
+        for c in range(r):
+            out[r, c] = out[c, r] = 0.5 * (out[r, c] + out[c, r])
+    return out
 
 
 @dataclass
 class Clone:
-    """A past pose of the body: R_WB (3, 3), p_WB (3,), both also as first estimated."""
+    """A past pose of the body: R_WB (3, 3), p_WB (3,)."""
 
     frame: int
     R_WB: np.ndarray
     p_WB: np.ndarray
-    R_first: np.ndarray
-    p_first: np.ndarray
 
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), also as first estimated; refused observations in a row."""
+    """A point in the state: position in W (3,), that at which it is linearised, and refused observations in a row."""
 
     X_W: np.ndarray
-    X_first: np.ndarray
+    X_linear: np.ndarray
     strikes: int = 0
 
 
@@ -54,16 +102,8 @@ class State:
     p_BC: np.ndarray
     time_offset: float
     P: np.ndarray
-    focal: float = 0.0
     clones: list[Clone] = field(default_factory=list)
     landmarks: dict[int, Landmark] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.freeze()
-
-    def freeze(self) -> None:
-        """Make the present inertial state the point at which the next propagation is linearised."""
-        self.R_first, self.p_first, self.v_first = self.R_WB.copy(), self.p_WB.copy(), self.v_WB.copy()
 
     @property
     def size(self) -> int:
@@ -75,31 +115,71 @@ class State:
         """Index of the first landmark in the error."""
         return CORE_SIZE + CLONE_SIZE * len(self.clones)
 
-    def clone_at(self, j: int) -> int:
-        """Index of clone j in the error."""
+    def clone_at(self, j: int | np.ndarray) -> int | np.ndarray:
+        """Index of clone j, or of several, in the error."""
         return CORE_SIZE + CLONE_SIZE * j
 
     def inject(self, dx: np.ndarray) -> None:
-        """Add an error estimate, shape (size,), to the state."""
-        self.R_WB = self.R_WB @ so3.exp(dx[THETA])
-        self.p_WB = self.p_WB + dx[POSITION]
-        self.v_WB = self.v_WB + dx[VELOCITY]
+        """Add an error estimate, shape (size,), to the state, and carry the covariance along.
+
+        An update leaves the errors as they are seen from W, R theta and dp + p x (R theta): in them a turn of everything about the
+        vertical is the same whatever the estimate. So with a step s from p to p', and from R to R',
+
+            theta := R'^T R theta,   dp := dp - s x (R theta),
+
+        likewise v and the points with the present theta, each clone with its own. Otherwise what nothing can see would be another
+        direction after each step, and the filter would learn of it by its own corrections.
+
+        A point is linearised where it is until its estimate has gone by more than 1 sigma from there; only then it is carried
+        along. Followed at each step, Jacobians hang together with the noise that has moved the point, and distances shrink.
+        """
+        thetas = self.clone_at(np.arange(-1, len(self.clones)))
+        thetas[0] = 0
+        R = np.array([self.R_WB, *(c.R_WB for c in self.clones)])
+        poses = dx[thetas[:, None] + _POSE]
+        E, steps = so3.exp(poses[:, :3]), poses[:, 3:]
+        points, onward = self._move_points(dx)
+        self.P = _carried(self.P, thetas, R, E, steps, dx[VELOCITY], points, onward)
+        R = R @ E
+        self.R_WB, self.p_WB, self.v_WB = R[0], self.p_WB + dx[POSITION], self.v_WB + dx[VELOCITY]
+        for clone, R_WB, step in zip(self.clones, R[1:], steps[1:]):
+            clone.R_WB, clone.p_WB = R_WB, clone.p_WB + step
         self.gyro_bias = self.gyro_bias + dx[GYRO_BIAS]
         self.accel_bias = self.accel_bias + dx[ACCEL_BIAS]
         self.R_BC = self.R_BC @ so3.exp(dx[CAMERA_ROTATION])
         self.p_BC = self.p_BC + dx[CAMERA_POSITION]
         self.time_offset += float(dx[TIME_OFFSET])
-        self.focal += float(dx[FOCAL])
-        n = len(self.clones)
-        if n:
-            steps = dx[CORE_SIZE : self.landmark_start].reshape(n, 6)
-            R, p = self.window()
-            for clone, R_WB, p_WB in zip(self.clones, R @ so3.exp(steps[:, :3]), p + steps[:, 3:]):
-                clone.R_WB, clone.p_WB = R_WB, p_WB
-        if self.landmarks:
-            X = np.array([m.X_W for m in self.landmarks.values()]) + dx[self.landmark_start :].reshape(-1, 3)
-            for landmark, X_W in zip(self.landmarks.values(), X):
-                landmark.X_W = X_W
+
+    def _move_points(self, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Move the points; where those that have left their linearisation begin in the error, (m,), and by how much, (m, 3)."""
+        start, marks = self.landmark_start, list(self.landmarks.values())
+        if not marks:
+            return np.zeros(0, int), np.zeros((0, 3))
+        X = np.array([m.X_W for m in marks]) + dx[start:].reshape(-1, 3)
+        gone = X - np.array([m.X_linear for m in marks])
+        left = np.flatnonzero((gone**2).sum(axis=1) > np.diag(self.P)[start:].reshape(-1, 3).sum(axis=1))
+        for m, X_W in zip(marks, X):
+            m.X_W = X_W
+        for k in left.tolist():
+            marks[k].X_linear = marks[k].X_W
+        return start + 3 * left, gone[left]
+
+    def add_landmark(self, number: int, X_W: np.ndarray, step: np.ndarray, cross: np.ndarray, own: np.ndarray) -> None:
+        """Take a point into the state.
+
+        Args:
+            number: of its feature.
+            X_W: where it was linearised, shape (3,).
+            step: from there to its estimate, shape (3,).
+            cross: covariance of its error with the state's, shape (3, size).
+            own: its covariance, shape (3, 3).
+        """
+        turned = so3.hat(step) @ self.R_WB  # as in `inject`
+        before = cross[:, THETA].copy()
+        cross = cross - turned @ self.P[THETA]
+        own = own - turned @ before.T - cross[:, THETA] @ turned.T
+        self.P = np.block([[self.P, cross.T], [cross, own]])
+        self.landmarks[number] = Landmark(X_W + step, X_W + step)
 
     def add_clone(self, frame: int, w_WB_B: np.ndarray) -> None:
         """Copy the present pose into the window.
@@ -122,7 +202,7 @@ class State:
             P[new, rows], P[rows, new] = JP[:, old], JP[:, old].T
         P[new, new] = JP @ J.T
         self.P = P
-        self.clones.append(Clone(frame, self.R_WB.copy(), self.p_WB.copy(), self.R_WB.copy(), self.p_WB.copy()))
+        self.clones.append(Clone(frame, self.R_WB.copy(), self.p_WB.copy()))
 
     def drop_clones(self, which: list[int]) -> None:
         """Marginalise clones: their rows leave the covariance."""
@@ -148,21 +228,17 @@ class State:
         """Present estimates of the clones: R_WB (n, 3, 3), p_WB (n, 3)."""
         return np.array([c.R_WB for c in self.clones]), np.array([c.p_WB for c in self.clones])
 
-    def first_window(self) -> tuple[np.ndarray, np.ndarray]:
-        """First estimates of the clones: R_WB (n, 3, 3), p_WB (n, 3)."""
-        return np.array([c.R_first for c in self.clones]), np.array([c.p_first for c in self.clones])
-
     def null_space(self) -> np.ndarray:
-        """Directions that no camera or IMU can see: position in W and yaw, shape (size, 4), at the first estimates."""
+        """Directions that no camera or IMU can see: position in W and yaw, shape (size, 4)."""
         e3, N = np.array([0.0, 0.0, 1.0]), np.zeros((self.size, 4))
         N[POSITION, :3] = np.eye(3)
-        N[THETA, 3], N[POSITION, 3] = self.R_first.T @ e3, np.cross(e3, self.p_first)
-        N[VELOCITY, 3] = np.cross(e3, self.v_first)
+        N[THETA, 3], N[POSITION, 3] = self.R_WB.T @ e3, np.cross(e3, self.p_WB)
+        N[VELOCITY, 3] = np.cross(e3, self.v_WB)
         for j, c in enumerate(self.clones):
             k = self.clone_at(j)
-            N[k : k + 3, 3], N[k + 3 : k + 6, 3] = c.R_first.T @ e3, np.cross(e3, c.p_first)
+            N[k : k + 3, 3], N[k + 3 : k + 6, 3] = c.R_WB.T @ e3, np.cross(e3, c.p_WB)
             N[k + 3 : k + 6, :3] = np.eye(3)
         for i, m in enumerate(self.landmarks.values()):
             k = self.landmark_start + 3 * i
-            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_first)
+            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_linear)
         return N
