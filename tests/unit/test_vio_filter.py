@@ -228,6 +228,22 @@ def test_a_landmark_that_starts_to_jump_is_dropped():
     assert chosen[0] not in run.filter.state.landmarks
 
 
+def test_what_a_landmark_has_told_is_not_used_again_when_its_track_ends():
+    run = Run(9)
+    filter_, again, marks = run.filter, set(), set()
+    original = filter_._update_tracks
+
+    def update(ended, report):
+        again.update(i for i in ended if i in marks and i not in filter_._used)
+        original(ended, report)
+
+    filter_._update_tracks = update
+    for _ in run.frames(60):
+        marks |= set(filter_.state.landmarks)
+    assert len(marks - set(filter_.tracks.by_id)) > 5
+    assert not again
+
+
 def test_a_clone_is_fully_correlated_with_the_pose():
     run = Run(8)
     s = run.filter.state
