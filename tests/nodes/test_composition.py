@@ -185,6 +185,36 @@ def test_a_dialogue_at_once_needs_no_turn_of_the_executor(process):
     process.until(lambda: process.heard == [1, 2, 3, 3])
 
 
+def in_a_step(process, work, until):
+    """One step of a process that is paced: a message, and in its callback pieces of work."""
+    process.on_message = lambda number: [process.composition.in_spare_time(piece) for piece in work]
+    with process.composition.at_once(until):
+        process.fast.publish(message(1))
+
+
+def test_work_waits_for_a_step_that_leaves_time_for_it(process):
+    process.composition.hold_back()
+    order, soon = [], time.monotonic_ns() + 10_000_000_000
+    in_a_step(process, [lambda: order.append("first")], until=0)
+    assert order == []
+    in_a_step(process, [lambda: order.append("second")], until=soon)
+    assert order == ["first", "second"]
+
+
+def test_work_that_never_finds_time_is_done_all_the_same(process):
+    process.composition.hold_back()
+    order = []
+    for k in range(module.MOST_SPARE + 2):
+        in_a_step(process, [lambda k=k: order.append(k)], until=0)
+    assert order == [0, 1]
+
+
+def test_spare_time_is_that_of_a_paced_process(process):
+    order = []
+    in_a_step(process, [lambda: order.append("done")], until=0)
+    assert order == ["done"]
+
+
 def test_what_has_time_is_done_when_the_neighbours_have_no_more_to_say(process):
     order = []
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from perch_core.ros.deadlines import WINDOW, Deadlines
+from perch_core.ros.deadlines import WINDOW, Deadlines, median_and_p99
 from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
 
 START = 1_000_000_000  # stamp of the first step [ns]
@@ -43,3 +43,11 @@ def test_the_delay_is_that_of_the_last_second():
     report = answer(Deadlines(), range(5000), lambda k: int(delays[k]))
     expected = np.percentile(delays[-WINDOW:], 99) - delays[-2 * WINDOW:].min()
     assert abs(1e3 * report["delay_us_p99"] - expected) < 3e4
+
+
+def test_median_and_p99_are_samples_next_to_the_quantiles():
+    samples = np.random.default_rng(3).exponential(size=500)
+    for ours, share in zip(median_and_p99(samples), (0.5, 0.99)):
+        assert ours in samples
+        assert np.quantile(samples, share - 0.002) <= ours <= np.quantile(samples, share + 0.002)
+    assert median_and_p99([7.0]) == (7.0, 7.0)

@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds, odometry_arrays, to_stamp, to_vector
-from perch_core.ros.deadlines import Deadlines
+from perch_core.ros.deadlines import Deadlines, median_and_p99
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import OdometryTemplate, read_imu
@@ -48,8 +48,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._participant.chain(Imu, "imu/data_raw", self._receive_imu, raw=True, backlog=True)
 
     def _receive_vio(self, msg: Odometry) -> None:
-        """In real time the update, which takes half a period, waits until the next sample's command has left, its further
-        parts until those after it."""
+        """In real time the update, which takes half a period, waits for a step that leaves time for it, and so does each of its
+        further parts."""
         if self._participant.lockstep is False:
             self._unused_vio.append(msg)
         else:
@@ -90,13 +90,13 @@ class EstimatorNode(PerchNode[UkfConfig]):
         if self._steps % STATUS_PERIOD == 0:
             self._participant.later(lambda: self._publish_status(sample.stamp))
         if self._steps % DIAGNOSTICS_PERIOD == DIAGNOSTICS_PHASE:
-            self._participant.later(lambda: self._publish_costs(sample.stamp * 1e-9))
+            self._participant.in_spare_time(lambda: self._publish_costs(sample.stamp * 1e-9))
         self._steps += 1
         if self._estimator.behind:
-            self._participant.later(self._go_on)
+            self._participant.in_spare_time(self._go_on)
         elif self._unused_vio:
             msg = self._unused_vio.popleft()
-            self._participant.later(lambda: self._use_vio(msg))
+            self._participant.in_spare_time(lambda: self._use_vio(msg))
 
     def _publish(self, stamp: int) -> None:
         estimate = self._estimator.estimate
@@ -125,8 +125,8 @@ class EstimatorNode(PerchNode[UkfConfig]):
                                   "updates_accepted": status.accepted, "updates_rejected": status.rejected}
         for name, costs in (("imu_step_us", self._step_costs), ("vio_update_us", self._update_costs)):
             if costs:
-                values[f"{name}_median"] = 1e6 * float(np.median(costs))
-                values[f"{name}_p99"] = 1e6 * float(np.percentile(costs, 99))
+                median, p99 = median_and_p99(costs)
+                values |= {f"{name}_median": 1e6 * median, f"{name}_p99": 1e6 * p99}
         if self._participant.lockstep is False:
             values |= self._deadlines.report()
         level = 0 if status.health.name == "RUNNING" else 2 if status.health.name == "DIVERGED" else 1

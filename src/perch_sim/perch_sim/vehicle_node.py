@@ -7,7 +7,6 @@ from collections import deque
 from typing import Any
 
 import cv2
-import numpy as np
 from perch_msgs.msg import MotorCommand, Step, StepReport
 from rclpy.clock import Clock, ClockType
 
@@ -15,6 +14,7 @@ from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds
+from perch_core.ros.deadlines import median_and_p99
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
@@ -174,7 +174,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
             problem = priority.ask()
             if problem:
                 self.get_logger().warning(problem)
-        for _ in range(self._pacing.due(time.monotonic_ns())):
+        for behind in reversed(range(self._pacing.due(time.monotonic_ns()))):
             self._times.end("waiting")
             if 0 < self._last_command < self._simulation.time:
                 self._counts["commands_missed"] += 1
@@ -189,7 +189,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
                     frames.append((name, camera.take()))
                 else:
                     self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
-            with composition.at_once():
+            with composition.at_once(until=0 if behind else self._pacing.next_due):
                 self._publish({})
                 if frames:
                     composition.later(lambda frames=frames: self._publish_frames(frames))
@@ -212,15 +212,14 @@ class VehicleNode(PerchNode[VehicleParameters]):
             composition.later(lambda: self._show(output, index))
 
     def _show(self, output: Output, index: int) -> None:
-        """Publish the tick, the clock, and what has happened in a step."""
+        """Publish what has happened in a step, and the tick."""
         topics = self._topics
         if self._watch is None:
             self._times.end("waiting")
-        if index % (TICK_STEPS if self._watch is not None else SEND_STEPS) == 0:
-            composition.flush()
-        if index % TICK_STEPS == 0:
-            self._ticks.publish(self._step(output.time, index, self._released))
-            self._released = {}
+            if index % SEND_STEPS == 0:
+                composition.in_spare_time(lambda: self._tell(output.time, index))
+        elif index % TICK_STEPS == 0:
+            self._tell(output.time, index)
         if index % CLOCK_STEPS == 0:
             topics.publish_clock(output.time)
         topics.publish_truth(output.state)
@@ -234,6 +233,13 @@ class VehicleNode(PerchNode[VehicleParameters]):
             plant = self._simulation.plant
             topics.publish_rotors(output.time, plant.rotor_speed, plant.rotor_thrust)
         self._times.end("publishing")
+
+    def _tell(self, stamp: int, index: int) -> None:
+        """Send other processes what they have not heard yet, and the tick."""
+        composition.flush()
+        if index % TICK_STEPS == 0:
+            self._ticks.publish(self._step(stamp, index, self._released))
+            self._released = {}
 
     def _publish_frames(self, frames: list[tuple[str, Delivery]]) -> None:
         """Publish camera_info and image of frames; those who use them then know everything that came before."""
@@ -258,8 +264,8 @@ class VehicleNode(PerchNode[VehicleParameters]):
                                   "motors_timed_out": self._simulation.motors.timed_out,
                                   "crashed": self._simulation.plant.crashed}
         if self._command_delays:
-            median, p99 = 1e6 * np.percentile(self._command_delays, (50, 99))
-            values |= {"command_us_median": float(median), "command_us_p99": float(p99)}
+            median, p99 = median_and_p99(self._command_delays)
+            values |= {"command_us_median": 1e6 * median, "command_us_p99": 1e6 * p99}
         level, message = 0, "ok"
         if self._watch is None:
             values["images_dropped"] = sum(camera.dropped for camera in self._simulation.cameras.values())

@@ -8,6 +8,7 @@ message that wakes a process costs 100 us, one that comes with it 30.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -19,7 +20,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-BURST = 40  # messages that are handed on before the executor looks at other events
+BURST = 40       # messages that are handed on before the executor looks at other events
+MOST_SPARE = 20  # pieces of work that wait for spare time; where there is none they are done all the same
 
 Receive = Callable[[bytes], None]
 
@@ -73,6 +75,8 @@ class Composition:
         self._messages: deque[tuple[Receive, bytes]] = deque()  # the one under way is the first
         self._leaving: list[tuple[Publisher, bytes]] = []
         self._later: list[Callable[[], None]] = []
+        self._spare: deque[Callable[[], None]] = deque()
+        self._until = 0  # spare time ends then, monotonic clock [ns]
         self._executor: EventsExecutor | None = None
 
     # -- wiring ------------------------------------------------------------------------------------------------------
@@ -135,9 +139,13 @@ class Composition:
         self._patient = patient
 
     @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """What is published in here is handed on at its end: a turn of the executor costs 50 us."""
-        self._gathering = not self._messages
+    def at_once(self, until: int = 0) -> Iterator[None]:
+        """What is published in here is handed on at its end: a turn of the executor costs 50 us.
+
+        Args:
+            until: when the next step is due, by the monotonic clock [ns]; what has time is begun before.
+        """
+        self._gathering, self._until = not self._messages, until
         try:
             yield
         finally:
@@ -151,6 +159,13 @@ class Composition:
             self._later.append(work)
         else:
             work()
+
+    def in_spare_time(self, work: Callable[[], None]) -> None:
+        """Do what may wait for steps that leave time for it; `later` where the process is not paced (`hold_back`)."""
+        if self._patient:
+            self._spare.append(work)
+        else:
+            self.later(work)
 
     def _send(self, publisher: Publisher, data: bytes) -> None:
         """Send a message to other processes: at once, when the neighbours have no more to say to each other, or with others."""
@@ -193,6 +208,9 @@ class Composition:
             later, self._later = self._later, []
             for work in later:
                 work()
+            spare = self._spare
+            while spare and (len(spare) > MOST_SPARE or time.monotonic_ns() < self._until):
+                spare.popleft()()
 
 
 composition = Composition()

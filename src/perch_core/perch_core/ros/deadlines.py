@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 from perch_core.timing import CONTROL_PERIOD_NS
 
 WINDOW = 500        # answers from which the clocks' offset and the figures are taken
+
+
+def median_and_p99(samples: Iterable[float]) -> tuple[float, float]:
+    """Of at least one sample. numpy takes ten times as long, half a control period, for the 500 of a second."""
+    ordered = sorted(samples)
+    return ordered[(len(ordered) - 1) // 2], ordered[int(0.99 * (len(ordered) - 1))]
 
 
 class Deadlines:
@@ -48,6 +55,5 @@ class Deadlines:
         """Figures for /diagnostics: counts since the start, and the delay of the last second's answers."""
         values: dict[str, int | float] = {"deadlines": self.answers, "missed_deadlines": self.missed}
         if self._lateness:
-            ordered = sorted(self._lateness)
-            values["delay_us_p99"] = 1e-3 * ordered[int(0.99 * (len(ordered) - 1))]
+            values["delay_us_p99"] = 1e-3 * median_and_p99(self._lateness)[1]
         return values

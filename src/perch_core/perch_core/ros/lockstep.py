@@ -164,6 +164,13 @@ class Participant:
         else:
             work()
 
+    def in_spare_time(self, work: Callable[[], None]) -> None:
+        """As `later`, but in real time in a step that leaves time for it."""
+        if self.lockstep is False:
+            composition.in_spare_time(work)
+        else:
+            work()
+
     def _repeat_greeting(self) -> None:
         if self.lockstep is None:
             self.report(Time())
