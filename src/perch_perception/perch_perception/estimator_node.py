@@ -38,6 +38,7 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._update_costs: deque[float] = deque(maxlen=60)
         self._deadlines = Deadlines()
         self._unused_vio: deque[Odometry] = deque()
+        self._updating = False  # a part of an update waits for spare time
         odometry = Odometry(child_frame_id="base_link")
         odometry.header.frame_id = "map"
         self._odometry = OdometryTemplate(odometry)
@@ -67,11 +68,6 @@ class EstimatorNode(PerchNode[UkfConfig]):
         self._update_costs.append(0.0)
         self._worked_on_update(begin)
 
-    def _go_on(self) -> None:
-        begin = time.perf_counter()
-        self._estimator.go_on()
-        self._worked_on_update(begin)
-
     def _worked_on_update(self, begin: float) -> None:
         """An update or a part of it is done; after the last one the next message brings a new covariance."""
         if not self._estimator.behind:
@@ -92,11 +88,19 @@ class EstimatorNode(PerchNode[UkfConfig]):
         if self._steps % DIAGNOSTICS_PERIOD == DIAGNOSTICS_PHASE:
             self._participant.in_spare_time(lambda: self._publish_costs(sample.stamp * 1e-9))
         self._steps += 1
+        if not self._updating and (self._estimator.behind or self._unused_vio):
+            self._updating = True
+            self._participant.in_spare_time(self._update)
+
+    def _update(self) -> None:
+        """In real time: the next part of an update, or the first of the next one."""
+        self._updating = False
         if self._estimator.behind:
-            self._participant.in_spare_time(self._go_on)
-        elif self._unused_vio:
-            msg = self._unused_vio.popleft()
-            self._participant.in_spare_time(lambda: self._use_vio(msg))
+            begin = time.perf_counter()
+            self._estimator.go_on()
+            self._worked_on_update(begin)
+        else:
+            self._use_vio(self._unused_vio.popleft())
 
     def _publish(self, stamp: int) -> None:
         estimate = self._estimator.estimate

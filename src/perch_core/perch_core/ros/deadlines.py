@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from perch_core.timing import CONTROL_PERIOD_NS
 
 WINDOW = 500        # answers from which the clocks' offset and the figures are taken
+MOVED = 50          # so many late answers on end: stamps have lost time to the wall clock (a vehicle catches up 25 steps at most)
 
 
 def median_and_p99(samples: Iterable[float]) -> tuple[float, float]:
@@ -22,7 +23,9 @@ class Deadlines:
     In real time stamps advance with the wall clock, so `clock - stamp` is the same for every answer but for delays. Its
     least value in the last second belongs to an undelayed answer. An answer is *missed* when it leaves more than one
     period later than that: its successor was due by then. Whoever delayed it counts: the vehicle, the node, or the
-    operating system. In lockstep there are no deadlines, and nobody calls this.
+    operating system. Where the vehicle gives up time that it cannot catch up, the stamps stay behind the wall clock for
+    good: `MOVED` answers are missed, then those count as undelayed that come as late. In lockstep there are no deadlines, and nobody
+    calls this.
     """
 
     def __init__(self) -> None:
@@ -30,6 +33,7 @@ class Deadlines:
         self.missed = 0
         self._last: int | None = None
         self._least = self._coming = self._fresh = 0  # least offset of the last window and of the present one; its length
+        self._on_end = self._on_end_least = 0  # late answers in a row and their least offset
         self._lateness: deque[int] = deque(maxlen=WINDOW)
 
     def answered(self, stamp: int, now: int) -> None:
@@ -46,8 +50,13 @@ class Deadlines:
         self._coming = min(self._coming, offset)
         lateness = offset - min(self._least, self._coming)
         self._lateness.append(lateness)
+        late = lateness > CONTROL_PERIOD_NS
+        self._on_end = self._on_end + 1 if late else 0
+        self._on_end_least = offset if self._on_end <= 1 else min(self._on_end_least, offset)
+        if self._on_end == MOVED:
+            self._least = self._coming = self._on_end_least
         skipped = 0 if self._last is None else max(0, (stamp - self._last) // CONTROL_PERIOD_NS - 1)
-        self.missed += skipped + (lateness > CONTROL_PERIOD_NS)
+        self.missed += skipped + late
         self.answers += 1 + skipped
         self._last = stamp
 
