@@ -201,6 +201,15 @@ def test_work_waits_for_a_step_that_leaves_time_for_it(process):
     assert order == ["first", "second"]
 
 
+def test_work_of_a_node_without_neighbours_is_done_too(process):
+    process.composition.hold_back()
+    order, soon = [], time.monotonic_ns() + 10_000_000_000
+    process.composition.in_spare_time(lambda: order.append("first"))
+    with process.composition.at_once(soon):
+        process.composition.in_spare_time(lambda: order.append("second"))
+    assert order == ["first", "second"]
+
+
 def test_work_that_never_finds_time_is_done_all_the_same(process):
     process.composition.hold_back()
     order = []

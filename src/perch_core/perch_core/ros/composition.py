@@ -149,9 +149,11 @@ class Composition:
         try:
             yield
         finally:
-            gathered, self._gathering = self._gathering and self._messages, False
-        if gathered:
+            gathering, self._gathering = self._gathering, False
+        if gathering and self._messages:
             self._hand_on_burst()
+        elif gathering:
+            self._catch_up()
 
     def later(self, work: Callable[[], None]) -> None:
         """Do what nobody waits for: when the neighbours have no more to say to each other, and at once where none speaks."""
@@ -205,12 +207,16 @@ class Composition:
         if not self._patient:
             self.flush()
         if not messages:
-            later, self._later = self._later, []
-            for work in later:
-                work()
-            spare = self._spare
-            while spare and (len(spare) > MOST_SPARE or time.monotonic_ns() < self._until):
-                spare.popleft()()
+            self._catch_up()
+
+    def _catch_up(self) -> None:
+        """Do what has waited until the neighbours have no more to say to each other, and as much of the rest as there is time for."""
+        later, self._later = self._later, []
+        for work in later:
+            work()
+        spare = self._spare
+        while spare and (len(spare) > MOST_SPARE or time.monotonic_ns() < self._until):
+            spare.popleft()()
 
 
 composition = Composition()
