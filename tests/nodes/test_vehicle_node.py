@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -17,8 +18,10 @@ from perch_core.ros.lockstep import Participant
 from perch_core.scenario import load_scenario
 from perch_core.timing import TICK_STEPS
 from perch_core.vehicle import load_vehicle
+from nav_msgs.msg import Odometry
 from perch_msgs.msg import Contact, MotorCommand, Step
 from rclpy.experimental import EventsExecutor
+from sensor_msgs.msg import Imu
 
 
 def test_publishes_every_topic_at_its_rate_and_flies_on_commands(flights):
@@ -136,7 +139,7 @@ def test_refuses_parameters_with_their_place_and_range(flights, ros_domain, name
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly_on_signals(ros_domain, number):
+def test_alone_in_its_process_it_is_heard_in_real_time_and_ends_cleanly_on_signals(ros_domain, number):
     code = "from perch_sim.vehicle_node import main; main()"
     arguments = ["--ros-args", "-p", "lockstep:=false", "-p", "cameras:=none"]
     context = rclpy.Context()
@@ -144,12 +147,16 @@ def test_ends_cleanly_on_signals(ros_domain, number):
     node = rclpy.create_node("listener", context=context)
     executor = EventsExecutor(context=context)
     executor.add_node(node)
-    steps = []
+    steps, ticks, samples, truth = [], [], [], []
     node.create_subscription(Step, "step", steps.append, qos.STEP)
+    node.create_subscription(Step, "tick", ticks.append, qos.STEP)
+    node.create_subscription(Imu, "imu/data_raw", samples.append, qos.CHAIN)
+    node.create_subscription(Odometry, "ground_truth/odometry", truth.append, qos.CHAIN)
     process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        for _ in range(400):
-            if len(steps) > 50:
+        end = time.monotonic() + 30.0
+        while time.monotonic() < end:
+            if len(steps) > 50 and len(ticks) > 4 and min(len(samples), len(truth)) > 50:
                 break
             executor.spin_once(timeout_sec=0.05)
         process.send_signal(number)
@@ -159,4 +166,6 @@ def test_ends_cleanly_on_signals(ros_domain, number):
         node.destroy_node()
         rclpy.shutdown(context=context)
     assert len(steps) > 50 and not steps[0].lockstep
+    assert len(ticks) > 4 and set(np.diff([t.index for t in ticks])) == {TICK_STEPS}
+    assert min(len(samples), len(truth)) > 50
     assert process.returncode == 0 and "Traceback" not in out + err
