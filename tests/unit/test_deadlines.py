@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from perch_core.ros.deadlines import MOVED, WINDOW, Deadlines, median_and_p99
+from perch_core.ros.deadlines import MOVED, WINDOW, Deadlines, durations_us, median_and_p99
 from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
 
 START = 1_000_000_000  # stamp of the first step [ns]
@@ -58,3 +58,8 @@ def test_median_and_p99_are_samples_next_to_the_quantiles():
         assert ours in samples
         assert np.quantile(samples, share - 0.002) <= ours <= np.quantile(samples, share + 0.002)
     assert median_and_p99([7.0]) == (7.0, 7.0)
+
+
+def test_durations_are_reported_in_microseconds_and_none_without_any():
+    assert durations_us("step", [0.002, 0.001, 0.003]) == {"step_us_median": 2000.0, "step_us_p99": 2000.0}
+    assert durations_us("step", []) == {}

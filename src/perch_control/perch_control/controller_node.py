@@ -27,7 +27,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import seconds, to_pose, to_stamp, to_vector
-from perch_core.ros.deadlines import Deadlines, median_and_p99
+from perch_core.ros.deadlines import Deadlines, durations_us
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.trajectories import from_message
@@ -211,9 +211,7 @@ class ControllerNode(PerchNode[ControllerParameters]):
         flight = self._flight
         values: dict[str, Any] = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
                                   "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio}
-        if self._costs:
-            median, p99 = median_and_p99(self._costs)
-            values |= {"step_us_median": 1e6 * median, "step_us_p99": 1e6 * p99}
+        values |= durations_us("step", self._costs)
         if self._participant.lockstep is False:
             values |= self._deadlines.report()
         level = 2 if flight.state.name == "FAILED" else 1 if flight.health.weak or flight.state.name in ("RECOVERING", "LANDING") else 0

@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds, odometry_arrays, to_stamp, to_vector
-from perch_core.ros.deadlines import Deadlines, median_and_p99
+from perch_core.ros.deadlines import Deadlines, durations_us
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import OdometryTemplate, read_imu
@@ -127,10 +127,7 @@ class EstimatorNode(PerchNode[UkfConfig]):
         status = self._estimator.status
         values: dict[str, Any] = {"state": status.health.name, "vio_age_s": status.vio_age,
                                   "updates_accepted": status.accepted, "updates_rejected": status.rejected}
-        for name, costs in (("imu_step_us", self._step_costs), ("vio_update_us", self._update_costs)):
-            if costs:
-                median, p99 = median_and_p99(costs)
-                values |= {f"{name}_median": 1e6 * median, f"{name}_p99": 1e6 * p99}
+        values |= durations_us("imu_step", self._step_costs) | durations_us("vio_update", self._update_costs)
         if self._participant.lockstep is False:
             values |= self._deadlines.report()
         level = 0 if status.health.name == "RUNNING" else 2 if status.health.name == "DIVERGED" else 1

@@ -14,7 +14,7 @@ from perch_core.errors import ConfigError
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import nanoseconds
-from perch_core.ros.deadlines import median_and_p99
+from perch_core.ros.deadlines import durations_us
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.priority import priority
 from perch_core.ros.wire import StepReading, read_motor_command, write_step
@@ -263,9 +263,7 @@ class VehicleNode(PerchNode[VehicleParameters]):
                                   **self._times.report(CONTROL_PERIOD), **self._counts,
                                   "motors_timed_out": self._simulation.motors.timed_out,
                                   "crashed": self._simulation.plant.crashed}
-        if self._command_delays:
-            median, p99 = median_and_p99(self._command_delays)
-            values |= {"command_us_median": 1e6 * median, "command_us_p99": 1e6 * p99}
+        values |= durations_us("command", self._command_delays)
         level, message = 0, "ok"
         if self._watch is None:
             values["images_dropped"] = sum(camera.dropped for camera in self._simulation.cameras.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from perch_core.timing import CONTROL_PERIOD_NS
 
@@ -15,6 +15,14 @@ def median_and_p99(samples: Iterable[float]) -> tuple[float, float]:
     """Of at least one sample. numpy takes ten times as long, half a control period, for the 500 of a second."""
     ordered = sorted(samples)
     return ordered[(len(ordered) - 1) // 2], ordered[int(0.99 * (len(ordered) - 1))]
+
+
+def durations_us(name: str, seconds: Collection[float]) -> dict[str, float]:
+    """Median and 99th percentile of durations [s] for /diagnostics, in microseconds; nothing without any."""
+    if not seconds:
+        return {}
+    median, p99 = median_and_p99(seconds)
+    return {f"{name}_us_median": 1e6 * median, f"{name}_us_p99": 1e6 * p99}
 
 
 class Deadlines:
