@@ -167,6 +167,15 @@ def test_what_nobody_hears_does_not_leave(process):
     assert sent == []
 
 
+def test_who_begins_to_listen_between_two_sendings_is_heard_of_at_the_next(process):
+    process.composition.hold_back()
+    assert not process.shown.heard
+    process.overhear("shown")
+    assert not process.shown.heard  # the middleware is asked once between two
+    process.composition.flush()
+    assert process.shown.heard
+
+
 def test_a_dialogue_at_once_needs_no_turn_of_the_executor(process):
     order = []
 
@@ -176,9 +185,13 @@ def test_a_dialogue_at_once_needs_no_turn_of_the_executor(process):
             process.fast.publish(message(number + 1))
 
     process.on_message = answer
-    with process.composition.at_once():
+
+    def speak() -> None:
         process.fast.publish(message(1))
-        assert process.heard == []
+        order.append(f"heard {process.heard} so far")
+
+    process.composition.at_once(speak)
+    assert order.pop(0) == "heard [] so far"
     assert process.heard == [1, 2, 3] and order == ["after 1", "after 2", "after 3"]
     process.fast.publish(message(3))
     assert process.heard == [1, 2, 3]
@@ -188,8 +201,7 @@ def test_a_dialogue_at_once_needs_no_turn_of_the_executor(process):
 def in_a_step(process, work, until):
     """One step of a process that is paced: a message, and in its callback pieces of work."""
     process.on_message = lambda number: [process.composition.in_spare_time(piece) for piece in work]
-    with process.composition.at_once(until):
-        process.fast.publish(message(1))
+    process.composition.at_once(lambda: process.fast.publish(message(1)), until)
 
 
 def test_work_waits_for_a_step_that_leaves_time_for_it(process):
@@ -205,8 +217,7 @@ def test_work_of_a_node_without_neighbours_is_done_too(process):
     process.composition.hold_back()
     order, soon = [], time.monotonic_ns() + 10_000_000_000
     process.composition.in_spare_time(lambda: order.append("first"))
-    with process.composition.at_once(soon):
-        process.composition.in_spare_time(lambda: order.append("second"))
+    process.composition.at_once(lambda: process.composition.in_spare_time(lambda: order.append("second")), soon)
     assert order == ["first", "second"]
 
 

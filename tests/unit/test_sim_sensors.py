@@ -93,7 +93,7 @@ def test_history_interpolates_a_turning_climb():
 
     for k in range(20):
         t = 0.002 * k
-        history.append(TrueState(2_000_000 * k, *truth(t), np.array([1.0, t, 0.0]), w))
+        history.append(TrueState(2_000_000 * k, np.concatenate([*truth(t), [1.0, t, 0.0], w])))
     for ns in (0, 1_234_567, 17_000_001, 38_000_000):
         p, q = truth(ns * 1e-9)
         found = history.at(ns)

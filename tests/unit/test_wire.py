@@ -5,7 +5,7 @@ import pytest
 from nav_msgs.msg import Odometry
 from perch_msgs.msg import MotorCommand, Release, Step
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import CameraInfo, Imu
 
 from perch_core.ros import wire
 from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_stamp, to_vector
@@ -73,6 +73,15 @@ def test_a_step_is_read_and_written(released, lockstep):
     reading = wire.read_step(serialize_message(msg))
     assert reading == (STAMP, 2**33 + 7, lockstep, tuple(released))
     assert deserialize_message(wire.write_step(reading), Step) == msg
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_camera_info_has_its_stamp_and_all_the_rest(frame):
+    msg = CameraInfo(height=480, width=640, distortion_model="equidistant", d=[0.1, 0.2, 0.3, 0.4], k=RNG.normal(size=9))
+    msg.header.frame_id = frame
+    template = wire.CameraInfoTemplate(msg)
+    msg.header.stamp = to_stamp(STAMP)
+    assert deserialize_message(template.fill(STAMP), CameraInfo) == msg
 
 
 def test_templates_keep_what_they_do_not_fill():

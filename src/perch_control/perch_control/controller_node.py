@@ -65,6 +65,8 @@ class ControllerNode(PerchNode[ControllerParameters]):
         self._motors = composition.publisher(self, MotorCommand, "motor_command", qos.CHAIN)
         self._references = self.create_publisher(ControlReference, "controller/reference", qos.CHAIN)
         self._status = self.create_publisher(ControllerStatus, "controller/status", qos.CHAIN)
+        self._shown = ControllerStatus()
+        self._shown.header.frame_id = "map"
         self._participant = Participant(self)
         self._participant.subscribe(Trajectory, "trajectory", self._receive_trajectory)
         self._participant.subscribe(Trajectory, "recovery", self._receive_recovery)
@@ -190,12 +192,12 @@ class ControllerNode(PerchNode[ControllerParameters]):
     def _publish_status(self, stamp: Any) -> None:
         flight, maneuvers = self._flight, self._flight.maneuvers
         running = maneuvers.order
-        msg = ControllerStatus(
-            state=int(flight.state), controller=flight.law_name, trajectory_id=maneuvers.trajectory_id,
-            trajectory_time=float(flight.trajectory_time), trajectory_duration=float(running.source.duration) if running else 0.0,
-            position_error=float(flight.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
-            thrust_margin=float(flight.margin), message=maneuvers.message)
-        msg.header.stamp, msg.header.frame_id = stamp, "map"
+        msg = self._shown  # filled anew each time: 50 new ones a second cost more than publishing them
+        msg.state, msg.controller, msg.message = int(flight.state), flight.law_name, maneuvers.message
+        msg.trajectory_id, msg.trajectory_time = maneuvers.trajectory_id, float(flight.trajectory_time)
+        msg.trajectory_duration = float(running.source.duration) if running else 0.0
+        msg.position_error, msg.odometry_age = float(flight.position_error), float(min(flight.odometry_age, 1e6))
+        msg.thrust_margin, msg.header.stamp = float(flight.margin), stamp
         self._status.publish(msg)
 
     def _publish_reference(self, stamp: Any, result: StepResult) -> None:

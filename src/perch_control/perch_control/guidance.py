@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_control.reference import Setpoint, flat_setpoints, packed_many, unpacked
+from perch_control.reference import Setpoint, fields, flat_setpoints, packed_many, unpacked
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory
 
@@ -62,7 +62,7 @@ class Polynomial:
 
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]."""
-        return unpacked(self.many(np.array([t]))[0])
+        return Setpoint._make(_moving_on_at(*self._trajectory.arrays, t, self._h))
 
 
 @compiled
@@ -77,6 +77,15 @@ def _moving_on(tables, edges, durations, choose, times, h, out):
             out[k, 6:15] = 0.0
         for i in range(3):
             out[k, 15 + i] = h[i]
+
+
+@compiled
+def _moving_on_at(tables, edges, durations, choose, t, h):
+    """`_moving_on` at one time [s], as `fields`."""
+    times, out = np.empty(1), np.empty((1, 33))
+    times[0] = t
+    _moving_on(tables, edges, durations, choose, times, h, out)
+    return fields(out[0])
 
 
 def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polynomial:

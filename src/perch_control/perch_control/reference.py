@@ -55,6 +55,16 @@ def unpacked(row: np.ndarray) -> Setpoint:
     return Setpoint._make(zip(x, x, x))
 
 
+@compiled
+def fields(row):
+    """The fields of a `Setpoint`, 11 vectors, of its packed form (33,)."""
+    return (
+        (row[0], row[1], row[2]), (row[3], row[4], row[5]), (row[6], row[7], row[8]), (row[9], row[10], row[11]),
+        (row[12], row[13], row[14]), (row[15], row[16], row[17]), (row[18], row[19], row[20]), (row[21], row[22], row[23]),
+        (row[24], row[25], row[26]), (row[27], row[28], row[29]), (row[30], row[31], row[32]),
+    )
+
+
 def _floats(v) -> Vector:
     return (float(v[0]), float(v[1]), float(v[2]))
 
@@ -123,6 +133,15 @@ def flat_setpoints(tables, edges, durations, choose, times, out):
             row[15 + i], row[18 + i], row[21 + i] = h[i], dh[i], ddh[i]
 
 
+@compiled
+def _flat_setpoint(tables, edges, durations, choose, t):
+    """`flat_setpoints` at one time [s], as `fields`: without arrays between here and the interpreter."""
+    times, out = np.empty(1), np.empty((1, 33))
+    times[0] = t
+    flat_setpoints(tables, edges, durations, choose, times, out)
+    return fields(out[0])
+
+
 @dataclass(frozen=True)
 class FlatReference:
     """A polynomial in the flat outputs."""
@@ -142,7 +161,7 @@ class FlatReference:
 
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]. Past the end the last acceleration holds: a contact is being awaited there."""
-        return unpacked(self.many(np.array([t]))[0])
+        return Setpoint._make(_flat_setpoint(*self.trajectory.arrays, t))
 
 
 @dataclass(frozen=True)

@@ -97,10 +97,10 @@ def _near(s: int, x: np.ndarray, surfaces: Surfaces, time: float, reach: float) 
 def _contact_forces(x: np.ndarray, R: np.ndarray, body: Body, surfaces: Surfaces, hold: Hold, time: float,
                     force_W: np.ndarray, torque_B: np.ndarray) -> None:
     """Springs, dampers and friction of every contact point that is inside a surface."""
-    point, velocity, f = np.empty(3), np.empty(3), np.empty(3)
     for s in range(surfaces.origin.shape[0]):
         if not _near(s, x, surfaces, time, body.reach):
             continue
+        point, velocity, f = np.empty(3), np.empty(3), np.empty(3)
         for k in range(body.points.shape[0]):
             if hold.active and hold.surface == s and k < PLATE_POINTS:
                 continue  # the velcro's own springs act there
@@ -292,7 +292,7 @@ def clearances(x: np.ndarray, body: Body, surfaces: Surfaces, time: float, out: 
 @compiled
 def advance_to_touch(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.ndarray, body: Body,
                      surfaces: Surfaces, hold: Hold, time: float, step: float, path: np.ndarray, inertial: np.ndarray,
-                     distances: np.ndarray) -> int:
+                     distances: np.ndarray) -> tuple[int, bool]:
     """Steps of `advance` until something is touched: one call per control period in free flight.
 
     Args:
@@ -301,7 +301,7 @@ def advance_to_touch(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, win
         distances: as in `clearances`, after the last step.
 
     Returns:
-        Steps made.
+        Steps made, and whether something is touched after the last one.
     """
     sample = np.empty(6)
     for k in range(path.shape[0]):
@@ -310,5 +310,5 @@ def advance_to_touch(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, win
             inertial[i] += sample[i]
         path[k] = x
         if clearances(x, body, surfaces, time + (k + 1) * step, distances) <= 0.0:
-            return k + 1
-    return path.shape[0]
+            return k + 1, True
+    return path.shape[0], False

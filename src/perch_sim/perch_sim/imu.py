@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.jit import compiled
 from perch_core.vehicle import ImuConfig
 
 
@@ -31,6 +32,7 @@ class Imu:
         self._walk = walk * np.repeat([config.accel_bias_walk, config.gyro_bias_walk], 3)
         self._range = np.repeat([config.accel_range, config.gyro_range], 3)
         self.bias = rng.standard_normal(6) * np.repeat([config.accel_bias_init, config.gyro_bias_init], 3)
+        _read(np.zeros(6), self.bias.copy(), np.zeros(12), self._walk, self._noise, self._range, np.empty(6))  # loaded now
 
     def sample(self, inertial: np.ndarray) -> ImuSample:
         """One sample.
@@ -38,7 +40,14 @@ class Imu:
         Args:
             inertial: mean specific force [m/s^2] and angular velocity [rad/s] at the IMU in B, (6,).
         """
-        draw = self._rng.standard_normal(12)
-        self.bias = self.bias + self._walk * draw[:6]
-        reading = np.minimum(np.maximum(inertial + self.bias + self._noise * draw[6:], -self._range), self._range)
+        reading = np.empty(6)
+        _read(inertial, self.bias, self._rng.standard_normal(12), self._walk, self._noise, self._range, reading)
         return ImuSample(reading[:3], reading[3:])
+
+
+@compiled
+def _read(inertial, bias, draw, walk, noise, limits, reading):
+    """A sample in `reading` (6,), of specific force and angular velocity; `bias` (6,) walks on. `draw` (12,) is white, unit variance."""
+    for i in range(6):
+        bias[i] += walk[i] * draw[i]
+        reading[i] = min(max(inertial[i] + bias[i] + noise[i] * draw[6 + i], -limits[i]), limits[i])

@@ -27,7 +27,7 @@ STEP = CONTROL_PERIOD / SUBSTEPS
 class PlantOutput(NamedTuple):
     """What happened in one period."""
 
-    states: tuple[TrueState, ...]       # at the end of each Runge-Kutta step, the last at the period's end
+    states: list[TrueState]             # at the end of each Runge-Kutta step, the last at the period's end
     inertial: np.ndarray                # mean specific force and angular velocity at the IMU in B, (6,)
     contacts: tuple[ContactEvent, ...]  # in order
 
@@ -68,8 +68,7 @@ class Plant:
     @property
     def state(self) -> TrueState:
         """The present state."""
-        x = self._x.copy()
-        return TrueState(self.time, x[:3], x[3:7], x[7:10], x[10:13])
+        return TrueState(self.time, self._x.copy())
 
     @property
     def crashed(self) -> bool:
@@ -104,18 +103,18 @@ class Plant:
             last = SUBSTEPS if self.contact.free else done + 1
             before = path[done - 1] if done else self._x.copy()
             begin = (self.time - self._start) * 1e-9 + done * STEP
-            made = advance_to_touch(
+            made, touched = advance_to_touch(
                 self._x, self.rotor_speed, np.zeros(4) if self.crashed else target, wind, self.body,
                 self.obstacles.surfaces, self.hold, begin, STEP, path[done:last], total, self._distances)
             before = path[done + made - 2] if made > 1 else before
             done += made
-            contacts += self._touches(self.time + done * CONTROL_PERIOD_NS // SUBSTEPS, before)
-        states = [TrueState(self.time + (k + 1) * CONTROL_PERIOD_NS // SUBSTEPS, x[:3], x[3:7], x[7:10], x[10:13])
-                  for k, x in enumerate(path)]
+            if touched or not self.contact.free:
+                contacts += self._touches(self.time + done * CONTROL_PERIOD_NS // SUBSTEPS, before)
+        states = [TrueState(self.time + (k + 1) * CONTROL_PERIOD_NS // SUBSTEPS, x) for k, x in enumerate(path)]
         self.time += CONTROL_PERIOD_NS
         elapsed = (self.time - self._start) * 1e-9
         contacts += [e._replace(time=self.time * 1e-9) for e in self.cables.update(elapsed, self._x)]
-        return PlantOutput(tuple(states), total / SUBSTEPS, tuple(contacts))
+        return PlantOutput(states, total / SUBSTEPS, tuple(contacts))
 
     def _warm_up(self) -> None:
         """Compile the kernels now, on a copy of the state, rather than in the first step of a flight in real time."""
@@ -124,8 +123,6 @@ class Plant:
 
     def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:
         """Judge what is touched at a time [ns]; `before` is the state one step earlier."""
-        if self.contact.free and min(self._distances.ravel().tolist(), default=1.0) > 0.0:
-            return []
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
         events = self.contact.update(elapsed, before, self._x, self._distances)
         return [event._replace(time=time * 1e-9) for event in events]

@@ -14,11 +14,28 @@ from perch_core import so3
 class TrueState(NamedTuple):
     """True state of the vehicle."""
 
-    time: int            # [ns]
-    p_WB: np.ndarray     # (3,) [m]
-    q_WB: np.ndarray     # xyzw, (4,)
-    v_WB: np.ndarray     # (3,) [m/s]
-    w_WB_B: np.ndarray   # (3,) [rad/s]
+    time: int      # [ns]
+    x: np.ndarray  # p_WB, q_WB, v_WB, w_WB_B, (13,): in one piece, as the plant makes it at every step
+
+    @property
+    def p_WB(self) -> np.ndarray:
+        """Position, (3,) [m]."""
+        return self.x[0:3]
+
+    @property
+    def q_WB(self) -> np.ndarray:
+        """Attitude xyzw, (4,)."""
+        return self.x[3:7]
+
+    @property
+    def v_WB(self) -> np.ndarray:
+        """Velocity in W, (3,) [m/s]."""
+        return self.x[7:10]
+
+    @property
+    def w_WB_B(self) -> np.ndarray:
+        """Angular velocity in B, (3,) [rad/s]."""
+        return self.x[10:13]
 
 
 class StateHistory:
@@ -39,7 +56,7 @@ class StateHistory:
         """
         a, b, s = self._around(time)
         p, q = _between([(a, b, s)])
-        return TrueState(time, p[0], q[0], a.v_WB + s * (b.v_WB - a.v_WB), a.w_WB_B + s * (b.w_WB_B - a.w_WB_B))
+        return TrueState(time, np.concatenate([p[0], q[0], a.x[7:] + s * (b.x[7:] - a.x[7:])]))
 
     def poses(self, times: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Positions (n, 3) [m] and attitudes xyzw (n, 4) at n times [ns], as `at` has them, in a fraction of its time.

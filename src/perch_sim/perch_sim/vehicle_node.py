@@ -189,10 +189,12 @@ class VehicleNode(PerchNode[VehicleParameters]):
                     frames.append((name, camera.take()))
                 else:
                     self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
-            with composition.at_once(until=0 if behind else self._pacing.next_due):
-                self._publish({})
-                if frames:
-                    composition.later(lambda frames=frames: self._publish_frames(frames))
+            composition.at_once(lambda: self._publish_paced(frames), until=0 if behind else self._pacing.next_due)
+
+    def _publish_paced(self, frames: list[tuple[str, Delivery]]) -> None:
+        self._publish({})
+        if frames:
+            composition.later(lambda: self._publish_frames(frames))
 
     # -- output ------------------------------------------------------------------------------------------------------
 

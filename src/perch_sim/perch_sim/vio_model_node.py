@@ -53,8 +53,8 @@ class VioModelNode(PerchNode[VioModelParameters]):
         self.get_logger().warning("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
 
     def _receive_truth(self, data: bytes) -> None:
-        self._newest, *state = read_odometry(data)
-        self._history.append(TrueState(self._newest, *(np.array(x) for x in state)))
+        self._newest, p_WB, q_WB, v_WB, w_WB_B = read_odometry(data)
+        self._history.append(TrueState(self._newest, np.array((*p_WB, *q_WB, *v_WB, *w_WB_B))))
         self._answer()
         while self._late and self._late[0][0] <= self._newest:
             self._publisher.publish(self._late.popleft()[1])

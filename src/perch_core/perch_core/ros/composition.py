@@ -29,8 +29,8 @@ Receive = Callable[[bytes], None]
 class FastPublisher:
     """A publisher of serialised messages that serves its neighbours directly."""
 
-    def __init__(self, publisher: Publisher, send: Callable[[Publisher, bytes], None], urgent: bool) -> None:
-        self._publisher, self._send, self._urgent = publisher, send, urgent
+    def __init__(self, publisher: Publisher, composition: Composition, urgent: bool) -> None:
+        self._publisher, self._composition, self._urgent = publisher, composition, urgent
         self._neighbours: list[Receive] = []
 
     @property
@@ -45,7 +45,7 @@ class FastPublisher:
     @property
     def heard(self) -> bool:
         """Whether anybody would receive a message now."""
-        return bool(self._neighbours) or self._publisher.get_subscription_count() > 0
+        return bool(self._neighbours) or self._composition.heard_outside(self._publisher)
 
     def add_neighbour(self, receive: Receive) -> None:
         """Hand every message to `receive` from now on."""
@@ -58,7 +58,7 @@ class FastPublisher:
         if self._urgent and not self._neighbours:
             self._publisher.publish(data)
         else:
-            self._send(self._publisher, data)
+            self._composition.send(self._publisher, data)
 
 
 class Composition:
@@ -74,6 +74,7 @@ class Composition:
         self._subscriptions: list[tuple[str, Receive, Callable[[], Any]]] = []
         self._messages: deque[tuple[Receive, bytes]] = deque()  # the one under way is the first
         self._leaving: list[tuple[Publisher, bytes]] = []
+        self._heard: dict[Publisher, bool] = {}  # outside, as of the last flush
         self._later: list[Callable[[], None]] = []
         self._spare: deque[Callable[[], None]] = deque()
         self._until = 0  # spare time ends then, monotonic clock [ns]
@@ -92,7 +93,7 @@ class Composition:
 
     def publisher(self, node: Node, msg_type: type, topic: str, profile: QoSProfile, urgent: bool = True) -> FastPublisher:
         """A publisher of a fast topic; `urgent`: without neighbours somebody else needs each message to go on."""
-        fast = FastPublisher(node.create_publisher(msg_type, topic, profile), self._send, urgent)
+        fast = FastPublisher(node.create_publisher(msg_type, topic, profile), self, urgent)
         if self._creating:
             self._publishers[fast.topic_name] = fast
         return fast
@@ -128,26 +129,34 @@ class Composition:
 
     def flush(self) -> None:
         """Send what waits to leave the process. Call it before a message for which others shall know all that came before."""
-        leaving, self._leaving = self._leaving, []
-        heard = {publisher: publisher.get_subscription_count() > 0 for publisher in dict.fromkeys(p for p, _ in leaving)}
+        leaving, self._leaving, self._heard = self._leaving, [], {}
         for publisher, data in leaving:
-            if heard[publisher]:
+            if self.heard_outside(publisher):
                 publisher.publish(data)
+
+    def heard_outside(self, publisher: Publisher) -> bool:
+        """Whether another process listens. Where messages wait for `flush`, the middleware is asked once between two: that takes 5 us."""
+        if not self._patient:
+            return publisher.get_subscription_count() > 0
+        heard = self._heard.get(publisher)
+        if heard is None:
+            heard = self._heard[publisher] = publisher.get_subscription_count() > 0
+        return heard
 
     def hold_back(self, patient: bool = True) -> None:
         """Whether messages for other processes wait for `flush`: who wants this paces the process, and flushes every few steps."""
         self._patient = patient
 
-    @contextmanager
-    def at_once(self, until: int = 0) -> Iterator[None]:
-        """What is published in here is handed on at its end: a turn of the executor costs 50 us.
+    def at_once(self, work: Callable[[], None], until: int = 0) -> None:
+        """Do `work` and hand on at its end what it has published: a turn of the executor costs 50 us.
 
         Args:
+            work: what publishes.
             until: when the next step is due, by the monotonic clock [ns]; what has time is begun before.
         """
         self._gathering, self._until = not self._messages, until
         try:
-            yield
+            work()
         finally:
             gathering, self._gathering = self._gathering, False
         if gathering and self._messages:
@@ -169,7 +178,7 @@ class Composition:
         else:
             self.later(work)
 
-    def _send(self, publisher: Publisher, data: bytes) -> None:
+    def send(self, publisher: Publisher, data: bytes) -> None:
         """Send a message to other processes: at once, when the neighbours have no more to say to each other, or with others."""
         if self._messages or self._patient:
             self._leaving.append((publisher, data))

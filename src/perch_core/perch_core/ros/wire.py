@@ -155,6 +155,15 @@ class _Template:
         _STAMP.pack_into(self._data, _HEADER, stamp // NANOSECONDS, stamp % NANOSECONDS)
 
 
+class CameraInfoTemplate(_Template):
+    """Serialised `sensor_msgs/CameraInfo`; all but the stamp are those of the message given."""
+
+    def fill(self, stamp: int) -> bytes:
+        """The message with a stamp [ns]."""
+        self._stamp(stamp)
+        return bytes(self._data)
+
+
 class ImuTemplate(_Template):
     """Serialised `sensor_msgs/Imu`; texts and covariances are those of the message given."""
 

@@ -18,7 +18,7 @@ from perch_core.camera import CameraMount
 from perch_core.ros import qos
 from perch_core.ros.composition import composition
 from perch_core.ros.conversions import to_pose, to_stamp
-from perch_core.ros.wire import ImuTemplate, OdometryTemplate
+from perch_core.ros.wire import CameraInfoTemplate, ImuTemplate, OdometryTemplate
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import ImuConfig
 from perch_sim.contact_event import ContactEvent
@@ -41,19 +41,19 @@ class CameraTopics:
         self._image.data = array.array("B", bytes(camera.height * camera.width * channels))
         self._pixels = np.frombuffer(self._image.data, np.uint8)  # a view: assigning whole images takes 18 ms
         self._image.header.frame_id = frame_id
-        self._info = CameraInfo(height=camera.height, width=camera.width, distortion_model=camera.model)
-        self._info.d = [float(k) for k in camera.distortion]
-        self._info.k = camera.K.ravel()
-        self._info.r = np.eye(3).ravel()
-        self._info.p = np.hstack([camera.K, np.zeros((3, 1))]).ravel()
-        self._info.header.frame_id = frame_id
+        info = CameraInfo(height=camera.height, width=camera.width, distortion_model=camera.model)
+        info.d = [float(k) for k in camera.distortion]
+        info.k = camera.K.ravel()
+        info.r = np.eye(3).ravel()
+        info.p = np.hstack([camera.K, np.zeros((3, 1))]).ravel()
+        info.header.frame_id = frame_id
+        self._info = CameraInfoTemplate(info)
 
     def publish(self, stamp: int, pixels: np.ndarray | None) -> None:
         """A frame: its camera_info, and its image where one was taken."""
-        self._info.header.stamp = to_stamp(stamp)
-        self.info.publish(self._info)
+        self.info.publish(self._info.fill(stamp))
         if pixels is not None:
-            self._image.header.stamp = self._info.header.stamp
+            self._image.header.stamp = to_stamp(stamp)
             np.copyto(self._pixels, pixels.ravel())
             self.image.publish(self._image)
 
@@ -96,8 +96,8 @@ class VehicleTopics:
         """The true state, where somebody listens."""
         if not self.odometry.heard:
             return
-        values = (x.tolist() for x in (state.p_WB, state.q_WB, state.v_WB, state.w_WB_B))
-        self.odometry.publish(self._odometry.fill(state.time, *values))
+        x = state.x.tolist()
+        self.odometry.publish(self._odometry.fill(state.time, x[0:3], x[3:7], x[7:10], x[10:13]))
 
     def publish_rotors(self, time: int, speed: np.ndarray, thrust: np.ndarray) -> None:
         """Rotor speeds [rad/s] and thrusts [N], (4,), where somebody listens."""
