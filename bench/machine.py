@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 
 from perch_core.ros.priority import PRIORITY
 from perch_core.timing import CONTROL_PERIOD_NS
@@ -62,6 +63,24 @@ def late_with_load(load: float, seconds: float) -> float:
     late = ours.recv()
     process.join()
     return late
+
+
+class Stolen:
+    """Processor time that the host of a virtual machine gives to others while a program here wants it, since the start; in ticks of
+    10 ms, and only as far as the host tells. Linux."""
+
+    def __init__(self, stat: Path = Path("/proc/stat")) -> None:
+        self._stat = stat
+        self._begin = time.monotonic(), self._total()
+
+    def share(self) -> float:
+        """Percentage of the time of all cores."""
+        begin, before = self._begin
+        return 100.0 * (self._total() - before) / ((time.monotonic() - begin) * (os.cpu_count() or 1))
+
+    def _total(self) -> float:
+        """Of all cores [s]: the eighth of the first line's times."""
+        return int(self._stat.read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
 def _start(work, *arguments) -> BaseProcess:

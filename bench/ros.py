@@ -14,7 +14,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
-from machine import LateWakeUps, awake, late_with_load
+from machine import LateWakeUps, Stolen, awake, late_with_load
 from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.conversions import to_seconds
@@ -133,13 +133,13 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
         counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
                      ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
         before = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
-        rates, machine, used = {topic: [] for topic in RATES}, LateWakeUps(), processor_time(stack)
+        rates, machine, host, used = {topic: [] for topic in RATES}, LateWakeUps(), Stolen(), processor_time(stack)
         for _ in range(windows):
             counts = dict(probe.counts)
             span = probe.listen(WINDOW)
             for topic in RATES:
                 rates[topic].append((probe.counts[topic] - counts[topic]) / span)
-        late, used = machine.share(), processor_time(stack) - used
+        late, stolen, used = machine.share(), host.share(), processor_time(stack) - used
         after = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
         delay = float(probe.diagnostics["vehicle"]["command_us_median"])
         load = used / max(1, after[0][1] - before[0][1])
@@ -150,7 +150,8 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
         out.append(figure(f"{where}: {part.replace('_', ' ')}, {node}", "% of steps", [share],
                           bar=0.1 if composed and part != "commands_missed" else None))
     out += [figure(f"{where}: processor time of the nodes' callbacks", "us per step", [1e6 * load]),
-            figure(f"{where}: bare timer beside it late by a period", "% of steps", [late])]
+            figure(f"{where}: bare timer beside it late by a period", "% of steps", [late]),
+            figure(f"{where}: processor time that the host took away", "% of all cores", [stolen])]
     if composed:
         with awake():
             same = late_with_load(load, windows * WINDOW)

@@ -9,6 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 import harness  # noqa: E402
+import machine  # noqa: E402
 
 
 def test_bars_are_judged_by_their_statistic():
@@ -41,3 +42,14 @@ def test_json_and_table_name_every_figure():
     assert [f["name"] for f in written["figures"]] == ["plan", "import"]
     assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written["figures"][0])
     assert "holds" in harness.table(items) and "import" in harness.table(items)
+
+
+def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
+    stat, clock = tmp_path / "stat", iter((10.0, 20.0))
+    monkeypatch.setattr(machine.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(machine.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(machine.os, "sysconf", lambda name: 100)
+    stat.write_text("cpu  1 2 3 4 5 6 7 500 0 0\ncpu0 1 2 3 4 5 6 7 250 0 0\n")
+    stolen = machine.Stolen(stat)
+    stat.write_text("cpu  9 9 9 9 9 9 9 520 0 0\ncpu0 1 2 3 4 5 6 7 270 0 0\n")
+    assert stolen.share() == pytest.approx(1.0)  # 0.2 s of 10 s of two cores

@@ -84,7 +84,7 @@ class VehicleTopics:
 
     def publish_clock(self, time: int) -> None:
         """Simulation time [ns] on /clock, where somebody listens."""
-        if not self.clock.get_subscription_count():
+        if not composition.heard_outside(self.clock):
             return
         self.clock.publish(Clock(clock=to_stamp(time)))
 
@@ -101,7 +101,7 @@ class VehicleTopics:
 
     def publish_rotors(self, time: int, speed: np.ndarray, thrust: np.ndarray) -> None:
         """Rotor speeds [rad/s] and thrusts [N], (4,), where somebody listens."""
-        if not self.rotors.get_subscription_count():
+        if not composition.heard_outside(self.rotors):
             return
         self._rotors.header.stamp = to_stamp(time)
         self._rotors.rotor_speed, self._rotors.thrust = speed, thrust
