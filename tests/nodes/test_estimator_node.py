@@ -7,8 +7,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_stamp
-from perch_msgs.msg import EstimatorStatus, Release, Step
+from perch_core.ros.conversions import fill_odometry, nanoseconds, odometry_arrays, to_point, to_quaternion, to_stamp, to_vector
+from perch_msgs.msg import EstimatorStatus, Release, Step, VioState
 from perch_perception import estimator_node
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
@@ -24,10 +24,11 @@ class Vehicle:
     def __init__(self, context, executor):
         self.node = rclpy.create_node("test_vehicle", context=context)
         executor.add_node(self.node)
-        self.executor, self.index, self.vio_count = executor, 0, 0
+        self.executor, self.index, self.vio_count, self.state_count = executor, 0, 0, 0
         self.odometry, self.status, self.diagnostics = [], [], []
         self.imu_publisher = self.node.create_publisher(Imu, "imu/data_raw", qos.CHAIN)
         self.vio_publisher = self.node.create_publisher(Odometry, "vio/odometry", qos.GATED)
+        self.state_publisher = self.node.create_publisher(VioState, "vio/state", qos.GATED)
         self.step_publisher = self.node.create_publisher(Step, "step", qos.STEP)
         self.node.create_subscription(Odometry, "odometry", self.odometry.append, qos.CHAIN)
         self.node.create_subscription(EstimatorStatus, "estimator/status", self.status.append, qos.CHAIN)
@@ -46,7 +47,8 @@ class Vehicle:
         imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = gyro
         imu.linear_acceleration.x, imu.linear_acceleration.y, imu.linear_acceleration.z = accel
         step = Step(stamp=imu.header.stamp, index=self.index, lockstep=True)
-        step.released = [Release(topic="/vio/odometry", count=self.vio_count if released is None else released)]
+        step.released = [Release(topic="/vio/odometry", count=self.vio_count if released is None else released),
+                         Release(topic="/vio/state", count=self.state_count)]
         self.imu_publisher.publish(imu)
         self.step_publisher.publish(step)
         self.index += 1
@@ -62,6 +64,13 @@ class Vehicle:
         msg.pose.covariance = (np.eye(6) * 1e-6).ravel()
         self.vio_publisher.publish(msg)
         self.vio_count += 1
+
+    def send_state(self, p, gyro_bias):
+        msg = VioState(position=to_point(np.array(p, float)), orientation=to_quaternion(LEVEL), gyro_bias=to_vector(gyro_bias))
+        msg.header.stamp = to_stamp((self.index - 5) * STEP_NS)
+        msg.covariance = (np.eye(15) * 1e-6).ravel()
+        self.state_publisher.publish(msg)
+        self.state_count += 1
 
 
 @pytest.fixture
@@ -145,3 +154,28 @@ def test_a_parameter_out_of_range_is_refused_by_name(ros_domain):
             estimator_node.create(context=context, parameter_overrides=[Parameter("gate_probability", value=2.0)])
     finally:
         rclpy.shutdown(context=context)
+
+
+def test_vios_whole_state_comes_before_its_odometry(vehicle):
+    """Its biases are taken with it; odometry beside it, which says less, is not used while states come."""
+    for _ in range(120):
+        vehicle.step()
+    vehicle.send_state([1.0, 0.0, 0.0], np.array([0.0, 0.0, 0.02]))
+    vehicle.send_vio([9.0, 0.0, 0.0])
+    for _ in range(200):
+        vehicle.step()
+    assert odometry_arrays(vehicle.odometry[-1])[0][0] == pytest.approx(1.0, abs=0.01)
+    assert vehicle.status[-1].gyro_bias.z == pytest.approx(0.02, abs=1e-6)
+    assert (vehicle.status[-1].updates_accepted, vehicle.status[-1].updates_rejected) == (1, 0)
+
+
+def test_odometry_counts_again_when_states_have_ended(vehicle):
+    for _ in range(120):
+        vehicle.step()
+    vehicle.send_state([1.0, 0.0, 0.0], np.zeros(3))
+    for _ in range(520):
+        vehicle.step()
+    vehicle.send_vio([1.01, 0.0, 0.0])
+    for _ in range(60):
+        vehicle.step()
+    assert vehicle.status[-1].updates_accepted == 2

@@ -94,7 +94,7 @@ def vehicle(ros_domain):
 def test_greets_with_its_gated_topic(vehicle):
     greeting = vehicle.reports[0]
     assert greeting.node == "vio" and nanoseconds(greeting.trigger) == 0
-    assert [(r.topic, r.count) for r in greeting.published] == [("/vio/odometry", 0)]
+    assert [(r.topic, r.count) for r in greeting.published] == [("/vio/state", 0), ("/vio/odometry", 0)]
 
 
 def test_stands_where_it_was_told_at_the_exposures_time(vehicle):

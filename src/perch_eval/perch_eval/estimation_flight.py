@@ -19,8 +19,8 @@ from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import load_vehicle
 from perch_eval.consistency import attitude_error
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
-from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
-from perch_perception.ukf.odometry import vio_pose
+from perch_perception.ukf import Estimator, ImuSample, Inertial, UkfConfig, VioPose
+from perch_perception.ukf.odometry import vio_state
 from perch_perception.vio import VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
 from perch_sim.calibration import true_mount
 from perch_sim.rendering import Renderer, build_scene
@@ -156,8 +156,8 @@ def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:
 
 
 def received(e: VioPoseEstimate) -> VioPose:
-    """What the estimator node makes of VIO's odometry."""
-    return vio_pose(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.pose_covariance, e.v_WB, e.velocity_covariance)
+    """What the estimator node makes of VIO's state."""
+    return vio_state(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, Inertial(e.gyro_bias, e.accel_bias, e.P))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Node `vio`: images of the downward camera and the IMU in, odometry at 30 Hz out."""
+"""Node `vio`: images of the downward camera and the IMU in, odometry and the whole state at 30 Hz out."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from nav_msgs.msg import Odometry
 from perch_core import config, so3
 from perch_core.errors import ConfigError
 from perch_core.ros import qos
-from perch_core.ros.conversions import fill_odometry, nanoseconds, to_stamp
+from perch_core.ros.conversions import fill_odometry, nanoseconds, to_point, to_quaternion, to_stamp, to_vector
 from perch_core.ros.lockstep import Participant
 from perch_core.ros.node import PerchNode, spin_main
 from perch_core.ros.wire import read_imu
 from perch_core.timing import TICK_STEPS
 from perch_core.vehicle import load_vehicle
+from perch_msgs.msg import VioState
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image, Imu
+from std_msgs.msg import Header
 
 from perch_perception.images import ImageError, mono_image
 from perch_perception.ukf import ImuSample
+from perch_perception.ukf.odometry import covariances
 from perch_perception.vio import FrameOutcome, VioConfig, VioResult, VisualInertialOdometry
 from perch_perception.vio.drawing import TrackPainter
 
@@ -44,7 +47,7 @@ class VioNodeConfig(VioConfig):
 
 
 class VioNode(PerchNode[VioNodeConfig]):
-    """Publishes `vio/odometry` for every frame that gives a pose, and reports every frame to the lockstep."""
+    """Publishes `vio/odometry` and `vio/state` for every frame that gives a pose, and reports every frame to the lockstep."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("vio", VioNodeConfig, **kwargs)
@@ -68,6 +71,7 @@ class VioNode(PerchNode[VioNodeConfig]):
         self._painter = TrackPainter()
         self._outcome: FrameOutcome | None = None
         self._participant = Participant(self, lambda _: self._work(), every=TICK_STEPS)
+        self._state = self._participant.publisher(VioState, "vio/state")
         self._odometry = self._participant.publisher(Odometry, "vio/odometry")
         self._debug = self.create_publisher(Image, "vio/debug_image", qos.IMAGE)
         self._imu = self.create_backlog(Imu, "imu/data_raw", qos.CHAIN)
@@ -121,13 +125,15 @@ class VioNode(PerchNode[VioNodeConfig]):
             self._publish_diagnostics(stamp, result)
 
     def _publish(self, result: VioResult) -> None:
-        e, msg = result.estimate, Odometry(child_frame_id="base_link")
-        msg.header.stamp, msg.header.frame_id = to_stamp(e.stamp), "odom"
-        fill_odometry(msg, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, e.w_WB_B)
-        twist = np.zeros((6, 6))
-        twist[:3, :3] = e.velocity_covariance
-        twist[3:, 3:] = self.params.imu.gyro_noise**2 * np.eye(3)
-        msg.pose.covariance, msg.twist.covariance = e.pose_covariance.ravel(), twist.ravel()
+        e = result.estimate
+        header, q_WB = Header(stamp=to_stamp(e.stamp), frame_id="odom"), so3.quat_from_matrix(e.R_WB)
+        self._state.publish(VioState(
+            header=header, position=to_point(e.p_WB), orientation=to_quaternion(q_WB), velocity=to_vector(e.v_WB),
+            gyro_bias=to_vector(e.gyro_bias), accel_bias=to_vector(e.accel_bias), covariance=e.P.ravel()))
+        msg = Odometry(header=header, child_frame_id="base_link")
+        fill_odometry(msg, e.p_WB, q_WB, e.v_WB, e.w_WB_B)
+        pose, twist = covariances(e.R_WB, e.v_WB, e.P, self.params.imu.gyro_noise)
+        msg.pose.covariance, msg.twist.covariance = pose.ravel(), twist.ravel()
         self._odometry.publish(msg)
 
     def _publish_debug(self, source: Image, image: np.ndarray, result: VioResult) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_core import so3
 from perch_eval.in_process.wire import received_velocity
 from perch_perception.pose_buffer import BodyState
 from perch_perception.ukf import Estimate, Estimator, ImuSample, Status, UkfConfig, VioPose
@@ -58,7 +59,7 @@ class Estimation:
         self._estimator.add_imu(imu)
         estimate = self._estimator.estimate
         if self._steps - self._covariance_step >= self._config.covariance_stride:
-            self._covariance, _ = covariances(estimate, self._config.imu.gyro_noise)
+            self._covariance, _ = covariances(so3.quat_to_matrix(estimate.q_WB), estimate.v_WB, estimate.P)
             self._covariance_step = self._steps
         self._steps += 1
         return Odometry(estimate, self._covariance, received_velocity(estimate.q_WB, estimate.v_WB))

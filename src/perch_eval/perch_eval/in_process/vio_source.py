@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_core import so3
 from perch_core.camera import CameraMount
+from perch_eval.estimation_flight import received
 from perch_eval.in_process.wire import received_velocity
 from perch_perception.ukf import ImuSample, VioPose
 from perch_perception.ukf.odometry import vio_pose
@@ -44,7 +44,8 @@ class ModelledVio:
         except LookupError:
             return None
         e = self._model.degrade(state.time * 1e-9, state.p_WB, state.q_WB, state.v_WB)
-        return _received(state.time, e.p_WB, e.q_WB, np.diag(e.pose_variance), e.v_WB, e.velocity_variance * np.eye(3))
+        v_WB = received_velocity(e.q_WB, e.v_WB)
+        return vio_pose(state.time, e.p_WB, e.q_WB, np.diag(e.pose_variance), v_WB, e.velocity_variance * np.eye(3))
 
 
 class RenderedVio:
@@ -69,10 +70,4 @@ class RenderedVio:
         e = result.estimate
         if e is None:
             return None
-        return _received(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.pose_covariance, e.v_WB, e.velocity_covariance)
-
-
-def _received(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray,
-              velocity_covariance_B: np.ndarray) -> VioPose:
-    """A pose as the estimator takes it from `vio/odometry`."""
-    return vio_pose(stamp, p_WB, q_WB, covariance, received_velocity(q_WB, v_WB), velocity_covariance_B)
+        return received(e)

@@ -3,7 +3,7 @@
 from perch_perception.ukf.config import ImuFaults, ImuNoise, UkfConfig, VioNoise
 from perch_perception.ukf.estimator import Estimator
 from perch_perception.ukf.imu_buffer import ImuOutcome, ImuSample
-from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
+from perch_perception.ukf.measurement import Estimate, Health, Inertial, Status, VioOutcome, VioPose
 
-__all__ = ["Estimate", "Estimator", "Health", "ImuFaults", "ImuNoise", "ImuOutcome", "ImuSample", "Status",
-           "UkfConfig", "VioNoise", "VioOutcome", "VioPose"]
+__all__ = ["Estimate", "Estimator", "Health", "ImuFaults", "ImuNoise", "ImuOutcome", "ImuSample", "Inertial",
+           "Status", "UkfConfig", "VioNoise", "VioOutcome", "VioPose"]

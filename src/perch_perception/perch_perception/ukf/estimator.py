@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.stats import chi2
 
-from perch_perception.ukf import drift, kernels, start, tracklet
+from perch_perception.ukf import drift, handover, kernels, start, tracklet
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
@@ -172,7 +172,8 @@ class Estimator:
     def _begin(self, pose: VioPose) -> VioOutcome:
         steps = self._imu.run(max(self._imu.oldest, pose.stamp - round(self.config.rest_time * 1e9)), pose.stamp)
         self._doubt[:] = 0.0
-        self._rest = self._settle(start.from_vio(self.config, pose, steps), pose)
+        belief = start.from_vio(self.config, pose, steps) if pose.inertial is None else handover.take_over(pose, self._doubt)
+        self._rest = self._settle(belief, pose)
         self._broken = False
         return VioOutcome.STARTED
 
@@ -192,7 +193,10 @@ class Estimator:
                 return VioOutcome.GATED
             prior = self._jumped(prior, innovation)
             innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
-        self._rest = self._follow(self._transform.correct(prior, innovation), pose)
+        if self.config.use_velocity and handover.knows_more(pose, prior):
+            self._rest = self._settle(handover.take_over(pose, self._doubt), pose)
+        else:
+            self._rest = self._follow(self._transform.correct(prior, innovation), pose)
         return outcome
 
     def _follow(self, belief: Belief, pose: VioPose) -> Iterator[None]:

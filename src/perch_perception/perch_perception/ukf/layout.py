@@ -18,7 +18,7 @@ GYRO_BIAS, ACCEL_BIAS, DRIFT = slice(10, 13), slice(13, 16), slice(16, 22)
 NOMINAL_SIZE = 22
 
 D_POSITION, D_VELOCITY, D_ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
-D_GYRO_BIAS, D_ACCEL_BIAS = slice(9, 12), slice(12, 15)
+D_GYRO_BIAS, D_ACCEL_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
 D_DRIFT, D_DRIFT_POSITION, D_DRIFT_ATTITUDE = slice(15, 21), slice(15, 18), slice(18, 21)
 VEHICLE_SIZE, ERROR_SIZE = 15, 21
 

@@ -43,6 +43,20 @@ class Health(enum.Enum):
 
 
 @dataclass(frozen=True)
+class Inertial:
+    """What VIO knows beside its pose and velocity, and what hangs together in all of it.
+
+    Attributes:
+        gyro_bias, accel_bias: [rad/s], [m/s^2], shape (3,).
+        P: covariance of (p, v, theta, b_g, b_a), theta a rotation vector in B, as in `Estimate`, shape (15, 15).
+    """
+
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+    P: np.ndarray
+
+
+@dataclass(frozen=True)
 class VioPose:
     """A pose of the body from VIO.
 
@@ -54,6 +68,7 @@ class VioPose:
         v_WB: velocity in W [m/s], shape (3,), or None.
         velocity_covariance: of the velocity in B, turned into W's axes, shape (3, 3), or None; what the attitude's error makes
             of v_WB is not in it.
+        inertial: VIO's biases and the covariance of its whole state, where it gives them; the velocity is given then.
     """
 
     stamp: int
@@ -62,13 +77,15 @@ class VioPose:
     covariance: np.ndarray
     v_WB: np.ndarray | None = None
     velocity_covariance: np.ndarray | None = None
+    inertial: Inertial | None = None
 
     def problem(self) -> VioOutcome | None:
         """Why the pose cannot be used, or None."""
-        numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_WB, self.velocity_covariance) if n is not None]
+        state = (self.inertial.gyro_bias, self.inertial.accel_bias, self.inertial.P) if self.inertial else ()
+        numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_WB, self.velocity_covariance, *state) if n is not None]
         if not math.isfinite(sum(n.sum() for n in numbers)) or abs(math.hypot(*self.q_WB) - 1) > 1e-3:
             return VioOutcome.NOT_FINITE
-        covariances = [C for C in (self.covariance, self.velocity_covariance) if C is not None]
+        covariances = [C for C in (self.covariance, self.velocity_covariance, *state[2:]) if C is not None]
         return None if all(_is_covariance(np.ascontiguousarray(C)) for C in covariances) else VioOutcome.BAD_COVARIANCE
 
 

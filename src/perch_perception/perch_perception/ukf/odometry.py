@@ -1,4 +1,4 @@
-"""To and from the axes of nav_msgs/Odometry: the estimate's covariances, VIO's pose."""
+"""To and from the axes of nav_msgs/Odometry: a state's covariances, VIO's pose."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.jit import compiled
-from perch_perception.ukf.measurement import Estimate, VioPose
+from perch_perception.ukf.measurement import Inertial, VioPose
 
 
-def covariances(estimate: Estimate, gyro_noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose and twist covariance of an estimate.
+def covariances(R_WB: np.ndarray, v_WB: np.ndarray, P: np.ndarray, gyro_noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Pose and twist covariance of an inertial state.
 
     Args:
-        estimate: the state.
+        R_WB: its attitude, shape (3, 3).
+        v_WB: its velocity [m/s], shape (3,).
+        P: covariance of (p, v, theta, b_g, b_a), theta a rotation vector in B, shape (15, 15).
         gyro_noise: 1 sigma of one gyro sample [rad/s].
 
     Returns:
         pose: covariance of (position in W, rotation about W's axes), shape (6, 6).
         twist: covariance of (velocity in B, angular velocity in B), shape (6, 6).
     """
-    R_WB = so3.quat_to_matrix(estimate.q_WB)
-    return _covariances(R_WB, so3.hat(R_WB.T @ estimate.v_WB), np.ascontiguousarray(estimate.P), gyro_noise)
+    return _covariances(R_WB, so3.hat(R_WB.T @ v_WB), np.ascontiguousarray(P), gyro_noise)
 
 
 @compiled
@@ -53,3 +54,10 @@ def vio_pose(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndar
         return VioPose(stamp, p_WB, q_WB, covariance, v_WB)
     R_WB = so3.quat_to_matrix(q_WB)
     return VioPose(stamp, p_WB, q_WB, covariance, v_WB, R_WB @ velocity_covariance_B @ R_WB.T)
+
+
+def vio_state(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray, inertial: Inertial) -> VioPose:
+    """VIO's whole state as the estimator takes it; arguments as in `VioPose`."""
+    R_WB = so3.quat_to_matrix(q_WB)
+    pose, twist = covariances(R_WB, v_WB, inertial.P)
+    return VioPose(stamp, p_WB, q_WB, pose, v_WB, R_WB @ twist[:3, :3] @ R_WB.T, inertial)

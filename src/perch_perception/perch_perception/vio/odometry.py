@@ -26,6 +26,7 @@ from perch_perception.vio.tracker import Features, Tracker
 from perch_perception.vio.triangulation import triangulate
 
 _FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
+_INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
 
 
 class VisualInertialOdometry:
@@ -191,10 +192,9 @@ class VisualInertialOdometry:
             self._views.popleft()
         result = self._result(FrameOutcome.RESTING, features, FrameReport())
         # what is said of now, not of `until`: a take-off may just have begun
-        doubt = self.config.start.unnoticed_velocity**2 * np.eye(3)
-        return replace(result, blind_for=0.0, estimate=replace(
-            result.estimate, stamp=exposed, w_WB_B=np.zeros(3),
-            velocity_covariance=result.estimate.velocity_covariance + doubt))
+        P = result.estimate.P.copy()
+        P[3:6, 3:6] += self.config.start.unnoticed_velocity**2 * np.eye(3)
+        return replace(result, blind_for=0.0, estimate=replace(result.estimate, stamp=exposed, w_WB_B=np.zeros(3), P=P))
 
     def _stand_on(self, features: Features) -> None:
         """What was seen of the ground while the vehicle stood, and still is, becomes its first landmarks."""
@@ -235,9 +235,8 @@ class VisualInertialOdometry:
         """Keep what is known of position and yaw, and start again in motion."""
         s = self.filter.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
-            covariance = pose_covariance(s)
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
-            self._known = KnownPose(s.p_WB.copy(), float(so3.yaw_of(s.R_WB)), covariance[rows])
+            self._known = KnownPose(s.p_WB.copy(), float(so3.yaw_of(s.R_WB)), self._estimate().pose_covariance[rows])
             self._gyro_bias = s.gyro_bias.copy()
         self._moving = motion_start.MotionStart(self.config, self.mount)
         self.filter, self.restarts = None, self.restarts + 1
@@ -245,10 +244,13 @@ class VisualInertialOdometry:
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
         s = self.filter.state
-        estimate = VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), self.filter.w_WB_B.copy(),
-                                   pose_covariance(s), velocity_covariance(s)) if outcome.has_pose else None
-        return VioResult(outcome, estimate, len(features.ids), report.used, report.refused, report.nis,
-                         report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
+        return VioResult(outcome, self._estimate() if outcome.has_pose else None, len(features.ids), report.used, report.refused,
+                         report.nis, report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
+
+    def _estimate(self) -> VioPoseEstimate:
+        s = self.filter.state
+        return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), self.filter.w_WB_B.copy(), s.gyro_bias.copy(),
+                               s.accel_bias.copy(), s.P[np.ix_(_INERTIAL, _INERTIAL)])
 
 
 def _compile(camera: Camera) -> None:
@@ -261,18 +263,3 @@ def _compile(camera: Camera) -> None:
     seen = observe(camera, camera.project(np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]))[0])
     linear = residuals(np.broadcast_to(np.eye(3), (2, 3, 3)), centres, np.array([X, X]), np.eye(3), np.zeros(3), seen)
     ekf.eliminate(linear.J[:, :, :POINT.start].reshape(4, -1), linear.J[:, :, POINT].reshape(4, 3), linear.r.ravel())
-
-
-def pose_covariance(state: at.State) -> np.ndarray:
-    """Covariance of (position, rotation about W's axes), shape (6, 6)."""
-    J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = np.eye(3), state.R_WB
-    return J @ state.P[:6, :6] @ J.T
-
-
-def velocity_covariance(state: at.State) -> np.ndarray:
-    """Covariance of the velocity in B, shape (3, 3): v_B = R^T v, whose attitude error turns it."""
-    J = np.zeros((3, 9))
-    J[:, at.THETA] = so3.hat(state.R_WB.T @ state.v_WB)
-    J[:, at.VELOCITY] = state.R_WB.T
-    return J @ state.P[:9, :9] @ J.T

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_perception.ukf.odometry import covariances
+
 
 class FrameOutcome(enum.Enum):
     """What became of a frame."""
@@ -38,8 +40,8 @@ class VioPoseEstimate:
         p_WB, v_WB: [m], [m/s], shape (3,).
         R_WB: shape (3, 3).
         w_WB_B: bias removed [rad/s], shape (3,).
-        pose_covariance: of (position, rotation about W's axes), shape (6, 6).
-        velocity_covariance: of the velocity in B, shape (3, 3).
+        gyro_bias, accel_bias: [rad/s], [m/s^2], shape (3,).
+        P: covariance of (p, v, theta, b_g, b_a), theta a rotation vector in B, shape (15, 15).
     """
 
     stamp: int
@@ -47,8 +49,19 @@ class VioPoseEstimate:
     R_WB: np.ndarray
     v_WB: np.ndarray
     w_WB_B: np.ndarray
-    pose_covariance: np.ndarray
-    velocity_covariance: np.ndarray
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+    P: np.ndarray
+
+    @property
+    def pose_covariance(self) -> np.ndarray:
+        """Covariance of (position, rotation about W's axes), shape (6, 6)."""
+        return covariances(self.R_WB, self.v_WB, self.P)[0]
+
+    @property
+    def velocity_covariance(self) -> np.ndarray:
+        """Covariance of the velocity in B, shape (3, 3)."""
+        return covariances(self.R_WB, self.v_WB, self.P)[1][:3, :3]
 
 
 @dataclass(frozen=True)
