@@ -168,7 +168,8 @@ class VisualInertialOdometry:
         quiet = features.disparity < s.rest_disparity or len(features.ids) < self.config.loss.least_tracks
         span = 0.1 if self._resting else s.rest_time  # leaving is believed at once, coming back is not
         recent = self._imu.run(max(self._imu.oldest, exposed - round(span * 1e9)), exposed)
-        return quiet and rest.looks_at_rest(s, recent, self.filter.state.gyro_bias, self._rest_accel)
+        return (quiet and rest.looks_at_rest(s, recent, self.filter.state.gyro_bias, self._rest_accel)
+                and (self._resting or rest.can_stand(self.filter.state)))
 
     def _hold(self, exposed: int, features: Features) -> VioResult:
         """Tell the filter that the vehicle stood still, up to a little before now.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from perch_core import so3
 from perch_core.vehicle import GRAVITY
+from scipy.stats import chi2
 
 from perch_perception.ukf.unscented import ACCEL, GYRO
 from perch_perception.vio import state as at
@@ -16,6 +17,7 @@ from perch_perception.vio.config import StartConfig
 from perch_perception.vio.msckf import Msckf
 
 _HOLD = 0.0002  # 1 sigma of "the pose has not changed": [m] and [rad]
+_STANDS = float(chi2.ppf(1.0 - 1e-6, 3))
 
 
 def looks_at_rest(config: StartConfig, steps: np.ndarray, gyro_bias: np.ndarray, accel: np.ndarray | None) -> bool:
@@ -32,6 +34,12 @@ def looks_at_rest(config: StartConfig, steps: np.ndarray, gyro_bias: np.ndarray,
     w, f = steps[:, GYRO].mean(axis=0) - gyro_bias, steps[:, ACCEL].mean(axis=0)
     change = abs(np.linalg.norm(f) - GRAVITY) if accel is None else np.linalg.norm(f - accel)
     return bool(np.linalg.norm(w) < config.rest_gyro and change < config.rest_accel)
+
+
+def can_stand(state: at.State) -> bool:
+    """Whether zero lies within what the filter knows of its velocity (chi2): a slow, steady flight is as quiet as the ground."""
+    v = state.v_WB
+    return bool(v @ np.linalg.solve(state.P[at.VELOCITY, at.VELOCITY], v) < _STANDS)
 
 
 def hold(filter: Msckf, config: StartConfig) -> None:
