@@ -16,7 +16,8 @@ from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import prepare_worker
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
-from perch_perception.ukf import Estimator, ImuSample, VioPose
+from perch_perception.ukf import Estimator, ImuSample, Inertial, VioPose
+from perch_perception.ukf.odometry import vio_state
 
 SCENARIOS = (("surface_60", "60 deg, 1.7 m"), ("surface_90", "90 deg, 1.7 m"),
              ("surface_60_far", "60 deg, 3 m"), ("surface_90_far", "90 deg, 3 m"))
@@ -73,20 +74,31 @@ def _rmse(flight: estimation_flight.Flight, track: estimation_flight.EstimatorTr
 
 
 def _ukf(quick: bool) -> list[Figure]:
-    """One IMU step, and one VIO update with the replay of 40 ms."""
+    """One IMU step, and one VIO update with the replay of 40 ms: with VIO's whole state, as in flight, and with a pose alone."""
     imu, motion = load_vehicle("snapdragon").imu, PerchMotion()
     truth = motion.sample(np.arange(0.0, motion.duration - 0.003, 0.002))
     readings = read_imu(truth, imu, np.random.default_rng(1))
-    estimator, q, updates, steps = Estimator(), truth.q_WB, [], []
-    for k in range(len(truth.times)):
-        begin = time.perf_counter()
-        estimator.add_imu(ImuSample(k * 2_000_000, tuple(readings.gyro[k].tolist()), tuple(readings.accel[k].tolist())))
-        steps.append(1e6 * (time.perf_counter() - begin))
-        if k > 150 and k % 17 == 0:
-            pose = VioPose((k - 20) * 2_000_000, truth.p_WB[k - 20], q[k - 20], np.eye(6) * 1e-5)
+    q, steps, updates = truth.q_WB, [], {"whole state": [], "pose": []}
+
+    def state(k: int) -> VioPose:
+        return vio_state(k * 2_000_000, truth.p_WB[k], q[k], truth.v_WB[k],
+                         Inertial(readings.gyro_bias[k], readings.accel_bias[k], np.eye(15) * 1e-5))
+
+    def pose(k: int) -> VioPose:
+        return VioPose(k * 2_000_000, truth.p_WB[k], q[k], np.eye(6) * 1e-5)
+
+    for took, seen in zip(updates.values(), (state, pose)):
+        estimator = Estimator()
+        for k in range(len(truth.times)):
             begin = time.perf_counter()
-            estimator.add_vio(pose)
-            updates.append(1e3 * (time.perf_counter() - begin))
+            estimator.add_imu(ImuSample(k * 2_000_000, tuple(readings.gyro[k].tolist()), tuple(readings.accel[k].tolist())))
+            steps.append(1e6 * (time.perf_counter() - begin))
+            if k > 150 and k % 17 == 0:
+                vio = seen(k - 20)
+                begin = time.perf_counter()
+                estimator.add_vio(vio)
+                took.append(1e3 * (time.perf_counter() - begin))
     read = measure(lambda: estimator.estimate, 100 if quick else 2000)
-    return [figure("ukf: IMU step", "us", steps[500:], 30.0), figure("ukf: update with 40 ms of replay", "ms", updates[3:], 3.0),
+    return [figure("ukf: IMU step", "us", steps[500:], 30.0),
+            *(figure(f"ukf: update with VIO's {kind}, 40 ms of replay", "ms", took[3:], 3.0) for kind, took in updates.items()),
             figure("ukf: reading the estimate", "us", 1e6 * read)]
