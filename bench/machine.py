@@ -24,7 +24,7 @@ def awake() -> Iterator[None]:
     A sleeping core of a virtual machine has been given away by its host and is back after milliseconds; on real machines for
     real time idle=poll or the governor does this.
     """
-    processes = [_start(_spin) for _ in range(os.cpu_count() or 1)]
+    processes = [_start(_spin, os.getpid()) for _ in range(os.cpu_count() or 1)]
     try:
         yield
     finally:
@@ -99,10 +99,11 @@ def _sleep_until(due: int) -> None:
     time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
 
 
-def _spin() -> None:
+def _spin(parent: int) -> None:
     _schedule("SCHED_IDLE", 0)
-    while True:
-        pass
+    while os.getppid() == parent:  # one that was killed cannot end this process
+        for _ in range(100_000):
+            pass
 
 
 def _compute(pipe: Connection, load: float, seconds: float) -> None:

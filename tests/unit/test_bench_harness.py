@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -53,3 +56,29 @@ def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
     stolen = machine.Stolen(stat)
     stat.write_text("cpu  9 9 9 9 9 9 9 520 0 0\ncpu0 1 2 3 4 5 6 7 270 0 0\n")
     assert stolen.share() == pytest.approx(1.0)  # 0.2 s of 10 s of two cores
+
+
+def test_spinning_processes_end_with_a_bench_that_was_killed():
+    code = """
+import machine, multiprocessing, time
+with machine.awake():
+    print(*[p.pid for p in multiprocessing.active_children()], flush=True)
+    time.sleep(60)
+"""
+    bench = subprocess.Popen([sys.executable, "-c", code], cwd=Path(machine.__file__).parent, stdout=subprocess.PIPE, text=True)
+    pids = [int(pid) for pid in bench.stdout.readline().split()]
+    bench.kill()
+    bench.wait()
+    assert len(pids) == os.cpu_count()
+    for _ in range(300):
+        if not any(_alive(pid) for pid in pids):
+            return
+        time.sleep(0.1)
+    raise AssertionError("still spinning")
+
+
+def _alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
