@@ -30,8 +30,8 @@ class ModelledVio:
     def see(self, state: TrueState, imu: ImuSample) -> None:
         """Take in what one step shows."""
         self._newest = state.time
-        received = received_velocity(state.q_WB, state.v_WB)
-        self._history.append(TrueState(state.time, np.concatenate([state.x[:7], received, state.x[10:]])))
+        v_WB = received_velocity(state.q_WB, state.v_WB)
+        self._history.append(TrueState(state.time, np.concatenate([state.x[:7], v_WB, state.x[10:]])))
 
     def covers(self, delivery: Delivery) -> bool:
         """Whether a frame's exposure has passed on the board's clock."""
