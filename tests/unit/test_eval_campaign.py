@@ -1,6 +1,8 @@
 """Campaign files, draws, causes of failure, results and their ranking."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from perch_core.errors import ConfigError
 from perch_core.scenario import Adhesion
 from perch_eval import demo
 from perch_eval.campaign import command as campaign
+from perch_eval.campaign import workers
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.distributions import parse
 from perch_eval.campaign.engines import Task, carry_out
@@ -202,3 +205,24 @@ def test_a_run_leaves_the_other_cores_to_other_runs():
         assert (result.outcome, cv2.getNumThreads()) == ("failed", 1)
     finally:
         cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize("broken_at", range(1, 13))
+def test_a_run_that_a_broken_pool_refuses_goes_on_waiting(monkeypatch, broken_at):
+    """A worker's death is noticed in between two calls, so that `submit` is what says so."""
+    submitted = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, jobs, mp_context, initializer):
+            super().__init__(jobs)
+
+        def submit(self, function, task):
+            submitted.append(task)
+            if len(submitted) == broken_at:
+                raise BrokenProcessPool
+            return super().submit(function, task)
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(workers, "carry_out", lambda task: RunResult(task.run.number, task.run.seed, "perched", "perched", ""))
+    tasks = [Task(Run(n, 0, {}), {}, "", "") for n in range(12)]
+    assert {r.number for r in workers.in_pool(tasks, 2)} == set(range(12))

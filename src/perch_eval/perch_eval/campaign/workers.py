@@ -53,8 +53,9 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < 2 * jobs:
-                    task = waiting.pop()
-                    under_way[pool.submit(_carry_out, task)] = task
+                    task = waiting[-1]
+                    under_way[pool.submit(_carry_out, task)] = task  # raises where the pool has broken: the task goes on waiting
+                    waiting.pop()
                 done, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in done:
                     result = future.result()
