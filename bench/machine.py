@@ -14,6 +14,8 @@ from pathlib import Path
 from perch_core.ros.priority import PRIORITY
 from perch_core.timing import CONTROL_PERIOD_NS
 
+AWAKE, REST = 0.004, 0.001  # s; a core that spins, and then sleeps for as long as a host does not mind
+
 _spawn = multiprocessing.get_context("spawn")
 
 
@@ -22,7 +24,8 @@ def awake() -> Iterator[None]:
     """Keep the cores from falling asleep, by work that yields to everything else.
 
     A sleeping core of a virtual machine has been given away by its host and is back after milliseconds; on real machines for
-    real time idle=poll or the governor does this.
+    real time idle=poll or the governor does this. Not all of the time: a host that grants so many cores' time in each 100 ms takes
+    them away for the rest of it, for up to 10 ms, once all are busy throughout (docs/real_time.md).
     """
     processes = [_start(_spin, os.getpid()) for _ in range(os.cpu_count() or 1)]
     try:
@@ -102,8 +105,10 @@ def _sleep_until(due: int) -> None:
 def _spin(parent: int) -> None:
     _schedule("SCHED_IDLE", 0)
     while os.getppid() == parent:  # one that was killed cannot end this process
-        for _ in range(100_000):
+        rest = time.monotonic() + AWAKE
+        while time.monotonic() < rest:
             pass
+        time.sleep(REST)
 
 
 def _compute(pipe: Connection, load: float, seconds: float) -> None:
