@@ -9,6 +9,7 @@ position in W stay unobservable for the filter, as they are (docs/estimation.md)
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,7 @@ GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, LENS = slice(15, 18), slice(18, 21), 21, slice(22, 26)
 INERTIAL_SIZE, CORE_SIZE, CLONE_SIZE = 15, 26, 6
 _POSE = np.arange(CLONE_SIZE)
+_FORCES = 5  # propagations whose mean force tells the scale by the next one
 
 
 @compiled
@@ -70,6 +72,20 @@ def _carried(P, thetas, R, E, steps, v, points, onward):
     return out
 
 
+@compiled
+def _gone_along(P, direction, scale):
+    """M P M^T, M = I + direction scale^T, both of shape (n,)."""
+    n = len(P)
+    q = P @ scale
+    variance = scale @ q
+    out = np.empty((n, n))
+    for r in range(n):
+        for c in range(r + 1):
+            out[r, c] = P[r, c] + direction[r] * q[c] + q[r] * direction[c] + variance * direction[r] * direction[c]
+            out[c, r] = out[r, c]
+    return out
+
+
 @dataclass
 class Clone:
     """A past pose of the body: R_WB (3, 3), p_WB (3,)."""
@@ -104,6 +120,7 @@ class State:
     P: np.ndarray
     clones: list[Clone] = field(default_factory=list)
     landmarks: dict[int, Landmark] = field(default_factory=dict)
+    forces: deque[tuple[float, np.ndarray]] = field(default_factory=lambda: deque(maxlen=_FORCES))  # (T, mean of f_B) of the last propagations
 
     @property
     def size(self) -> int:
@@ -132,7 +149,10 @@ class State:
 
         A point is linearised where it is until its estimate has gone by more than 1 sigma from there; only then it is carried
         along. Followed at each step, Jacobians hang together with the noise that has moved the point, and distances shrink.
+
+        The direction of a scale (`scale_error`) moves with the estimate as well, and is carried along.
         """
+        before = self._metric()
         thetas = self.clone_at(np.arange(-1, len(self.clones)))
         thetas[0] = 0
         R = np.array([self.R_WB, *(c.R_WB for c in self.clones)])
@@ -149,6 +169,40 @@ class State:
         self.R_BC = self.R_BC @ so3.exp(dx[CAMERA_ROTATION])
         self.p_BC = self.p_BC + dx[CAMERA_POSITION]
         self.time_offset += float(dx[TIME_OFFSET])
+        scale = self.scale_error()
+        if scale is not None:
+            self.carry_scale(self._metric() - before, scale / (scale @ before))
+
+    def scale_error(self) -> np.ndarray | None:
+        """What all lengths are relatively too short by, s = scale^T dx: the mean over the landmarks of d ln |X - p|.
+
+        Vision alone does not see it: N_s = (.. p_k - p, v, X - p ..), scale^T N_s = 1. It is blind to position and yaw.
+
+        Returns:
+            Shape (size,); None with fewer than three landmarks.
+        """
+        if len(self.landmarks) < 3:
+            return None
+        rays = np.array([m.X_linear for m in self.landmarks.values()]) - self.p_WB
+        part = rays / (rays**2).sum(axis=1, keepdims=True) / len(rays)
+        out = np.zeros(self.size)
+        out[self.landmark_start :], out[POSITION] = part.ravel(), -part.sum(axis=0)
+        return out
+
+    def carry_scale(self, direction: np.ndarray, scale: np.ndarray) -> None:
+        """Let what a wrong scale does to the state go by `direction`, shape (size,): dx := dx + direction (scale^T dx)."""
+        self.P = _gone_along(self.P, direction, scale)
+
+    def _metric(self) -> np.ndarray:
+        """All that a scale stretches: positions, velocity and the points where they are linearised, shape (size,)."""
+        out = np.zeros(self.size)
+        out[POSITION], out[VELOCITY] = self.p_WB, self.v_WB
+        poses = out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE)
+        for pose, clone in zip(poses, self.clones):
+            pose[3:] = clone.p_WB
+        if self.landmarks:
+            out[self.landmark_start :] = np.concatenate([m.X_linear for m in self.landmarks.values()])
+        return out
 
     def _move_points(self, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Move the points; where those that have left their linearisation begin in the error, (m,), and by how much, (m, 3)."""
@@ -174,12 +228,15 @@ class State:
             cross: covariance of its error with the state's, shape (3, size).
             own: its covariance, shape (3, 3).
         """
+        scale = self.scale_error()
         turned = so3.hat(step) @ self.R_WB  # as in `inject`
         before = cross[:, THETA].copy()
         cross = cross - turned @ self.P[THETA]
         own = own - turned @ before.T - cross[:, THETA] @ turned.T
         self.P = np.block([[self.P, cross.T], [cross, own]])
         self.landmarks[number] = Landmark(X_W + step, X_W + step)
+        if scale is not None:
+            self.carry_scale(np.concatenate([np.zeros(len(scale)), step]), np.concatenate([scale, np.zeros(3)]))
 
     def add_clone(self, frame: int, w_WB_B: np.ndarray) -> None:
         """Copy the present pose into the window.
