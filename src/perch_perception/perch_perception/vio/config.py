@@ -42,6 +42,8 @@ class FilterConfig:
     pixel_noise: float = quantity(0.085, unit="px", above=0.0, doc="1 sigma of a track, white from frame to frame")
     slide_turn: float = quantity(0.9, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the angle that its bearing moves")
     slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
+    slide_free_turn: float = quantity(0.06, unit="rad", low=0.0, high=0.5, doc="change of bearing that a patch bears without a walk")
+    slide_free_zoom: float = quantity(0.02, unit="-", low=0.0, high=0.5, doc="as much of its distance's logarithm")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
     tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
     least_parallax_deg: float = quantity(2.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")

@@ -285,12 +285,15 @@ class Msckf:
         s = self.state
         if len(s.clones) < 2:
             return
-        before, X = s.clones[-2], np.array([k.X_W for k in s.landmarks.values()])
-        last = np.linalg.norm(X - before.p_WB - before.R_WB @ s.p_BC, axis=1)
-        seen = np.array([t.b_C[-2] if len(t.b_C) > 1 else t.b_C[-1] for t in tracks])
-        b_C = np.array([t.b_C[-1] for t in tracks])
+        before, landmarks = s.clones[-2], list(s.landmarks.values())
+        last = np.linalg.norm(np.array([k.X_W for k in landmarks]) - before.p_WB - before.R_WB @ s.p_BC, axis=1)
+        views = [k.view or (t.b_C[-2] if len(t.b_C) > 1 else t.b_C[-1], d) for k, t, d in zip(landmarks, tracks, last)]
+        b_held, d_held = np.array([b for b, _ in views]), np.array([d for _, d in views])
+        b_next, d_next = self.sliding.dragged(b_held, d_held, np.array([t.b_C[-1] for t in tracks]), distance)
+        for k, b, d in zip(landmarks, b_next, d_next.tolist()):
+            k.view = b, d
         rows = s.landmark_start + np.arange(3 * len(tracks)).reshape(-1, 3)
-        s.P[rows[:, :, None], rows[:, None, :]] += self.sliding.of_points(seen, b_C, last, distance, s.clones[-1].R_WB @ s.R_BC)
+        s.P[rows[:, :, None], rows[:, None, :]] += self.sliding.of_points(b_held, b_next, d_held, d_next, s.clones[-1].R_WB @ s.R_BC)
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)

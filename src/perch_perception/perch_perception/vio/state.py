@@ -97,11 +97,15 @@ class Clone:
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), that at which it is linearised, and refused observations in a row."""
+    """A point in the state: position in W (3,), that at which it is linearised, refused observations in a row, and the view that is held.
+
+    The view is a bearing in C (3,) and a distance [m], see `Sliding.dragged`; None before the first frame with the point in the state.
+    """
 
     X_W: np.ndarray
     X_linear: np.ndarray
     strikes: int = 0
+    view: tuple[np.ndarray, float] | None = None
 
 
 @dataclass
@@ -120,7 +124,7 @@ class State:
     P: np.ndarray
     clones: list[Clone] = field(default_factory=list)
     landmarks: dict[int, Landmark] = field(default_factory=dict)
-    forces: deque[tuple[float, np.ndarray]] = field(default_factory=lambda: deque(maxlen=_FORCES))  # (T, mean of f_B) of the last propagations
+    forces: deque[tuple[float, np.ndarray]] = field(default_factory=lambda: deque(maxlen=_FORCES))  # (T, mean of f_B), the last ones
 
     @property
     def size(self) -> int:
