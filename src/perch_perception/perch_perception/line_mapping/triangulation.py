@@ -165,7 +165,10 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         apart = apart if known > 0.0 else apart + WIDTH_GATE**2
         by_widths = _normal_equations(*_widths(curve, size, observations, settings, apart), weight)
         information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount, size)
-        step = -np.linalg.solve(information, gradient)
+        try:
+            step = -np.linalg.solve(information, gradient)
+        except np.linalg.LinAlgError:  # the sightings that are left say nothing of one direction
+            raise DegenerateBaseline(ratio, settings.min_ratio) from None
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
