@@ -22,6 +22,14 @@ if [ ! -f "$_perch_root/.venv/bin/activate" ] ||
   return 1
 fi
 
+# Every socket of ROS is bound to this address (SECURITY.md). One that Fast DDS cannot read would open them all.
+if [[ ! "${PERCH_NETWORK:-127.0.0.1}" =~ ^((25[0-5]|2[0-4][0-9]|1?[0-9]?[0-9])(\.|$)){4}$ ]]; then
+  echo "PERCH_NETWORK=$PERCH_NETWORK is not an address such as 127.0.0.1" >&2
+  unset -f _perch_prepend
+  unset _perch_root
+  return 1
+fi
+
 # A workspace that was built with a ROS installation needs it also where it is not sourced yet.
 if [ -z "${ROS_DISTRO:-}" ] && [ -f "$_perch_root/.perch/ros_prefix" ]; then
   source "$(cat "$_perch_root/.perch/ros_prefix")/setup.bash"
@@ -49,9 +57,14 @@ for _perch_folder in "$_perch_root"/install/perch_*/lib/perch_*; do
 done
 
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-42}"
-export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
-# Acknowledgements in bundles: a file of the caller's own stays.
+export PERCH_NETWORK="${PERCH_NETWORK:-127.0.0.1}"
 export FASTRTPS_DEFAULT_PROFILES_FILE="${FASTRTPS_DEFAULT_PROFILES_FILE:-$_perch_root/config/fastdds.xml}"
+# With our profile the address is the limit (LOCALHOST would add a socket on every interface); a file of the caller's own may have none.
+if [ "$FASTRTPS_DEFAULT_PROFILES_FILE" = "$_perch_root/config/fastdds.xml" ]; then
+  export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
+else
+  export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
+fi
 # The matrices here are small: threads inside numpy only take the cores from other nodes.
 export OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 

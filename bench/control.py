@@ -30,10 +30,10 @@ from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings  # noqa
 from perch_control.reference import FlatReference  # noqa: E402
 from perch_control.rotor_lag import RotorEstimate  # noqa: E402
 from perch_control.settings import GeometricGains  # noqa: E402
-from perch_core.scenario import load_scenario  # noqa: E402
 from perch_core.vehicle import load_vehicle  # noqa: E402
 from perch_eval.inspection.flight import fly  # noqa: E402
 from perch_eval.inspection.layout import random_layout  # noqa: E402
+from perch_sim.scenario import load_scenario  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 LOADED = "wind 5 m/s, mass +20 %"

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from harness import Figure, figure
 from perch_core import so3
-from perch_core.scenario import load_scenario
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import BoardLocalizer
 from perch_sim.rendering import Renderer, build_scene
+from perch_sim.scenario import load_scenario
 
 # scenario, name, bars on position [cm] and attitude [deg]
 PLACES = (("surface_60", "60 deg, 1.7 m", 0.5, 0.3), ("surface_90", "90 deg, 1.7 m", 0.5, 0.3),

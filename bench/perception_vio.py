@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from harness import Figure, figure, measure
-from perch_core.scenario import load_scenario
 from perch_eval import estimation_flight
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import prepare_worker
@@ -18,6 +17,7 @@ from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import Estimator, ImuSample, Inertial, VioPose
 from perch_perception.ukf.odometry import vio_state
+from perch_sim.scenario import load_scenario
 
 SCENARIOS = (("surface_60", "60 deg, 1.7 m"), ("surface_90", "90 deg, 1.7 m"),
              ("surface_60_far", "60 deg, 3 m"), ("surface_90_far", "90 deg, 3 m"))

@@ -1,4 +1,4 @@
-"""Speed bars of the perching planner: plans with certificates, the OSQP path, wrong verdicts, the nonlinear comparison."""
+"""Speed bars of the perching planner as it is shipped: plans with certificates, the OSQP path, wrong verdicts."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import planner_nonlinear
 from harness import Figure, figure
 from planner_verdicts import wrong_verdicts
-from random_perches import paper_like_problem
+from random_perches import paper_like_problem, shipped_settings
 
 from perch_core.vehicle import load_vehicle
 from perch_planner.planner import plan
@@ -61,24 +61,6 @@ def _additions() -> float:
     return time.process_time() - begin
 
 
-def _nonlinear_ratios(waypoints: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """CPU time of SLSQP over that of the plan with its certificates, and of SLSQP alone [ms], on problems both solve."""
-    vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
-    ratios, times = [], []
-    for seed in range(count):
-        problem = paper_like_problem(np.random.default_rng(seed), waypoints)
-        try:
-            planned = plan(problem, settings, vehicle)
-            fast = planner_nonlinear.plan_time(problem, settings, vehicle)
-        except PerchRefusal:
-            continue
-        slow, converged, _ = planner_nonlinear.solve(problem, settings, vehicle, 0.95 * planned.trajectory.durations)
-        if converged:
-            ratios.append(slow / fast)
-            times.append(1e3 * slow)
-    return np.array(ratios), np.array(times)
-
-
 def _first_plan(fresh: bool) -> tuple[float, float]:
     """Import time and time of the first plan of a new process [s]; fresh: without cached kernels."""
     with tempfile.TemporaryDirectory() as folder:
@@ -96,30 +78,18 @@ def _say(what: str) -> None:
 def figures(quick: bool) -> list[Figure]:
     """Measure the group; what counts by the clock first, and alone."""
     count = 60 if quick else 400
-    out = []
+    out, shipped = [], shipped_settings()
     _say(f"plans of {count} problems")
-    for waypoints, median, p99 in ((3, 0.5, 1.0), (10, 1.0, 2.0)):
-        times, cpu, refused = _plan_times(waypoints, PerchSettings(), count)
-        name = f"plan with certificates, {waypoints} waypoints"
+    for waypoints, median, p99 in ((0, 0.25, 1.0), (3, 0.5, 1.5), (10, 0.8, 2.5)):
+        times, cpu, refused = _plan_times(waypoints, shipped, count)
+        name = f"plan as shipped, {waypoints} waypoints"
         out += [figure(name, "ms", times, median), figure(f"{name}, p99", "ms", times, p99, "p99 <="),
                 figure(f"{name}, CPU time", "ms", cpu), figure(f"{name}: refused of {count}", "problems", [refused])]
     _say("plans with OSQP")
-    for waypoints, bar in ((3, 15.0), (10, 30.0)):
-        times, _, _ = _plan_times(waypoints, PerchSettings(solver="osqp"), count // 4)
-        out.append(figure(f"plan with OSQP, {waypoints} waypoints", "ms", times, bar))
-    _say("plans without waypoints and within single rotors' limits")
-    times, _, _ = _plan_times(0, PerchSettings(), count)
-    out.append(figure("plan with certificates, no waypoints", "ms", times))
-    times, cpu, _ = _plan_times(3, PerchSettings(rotors="preferred"), count // 4)
-    out += [figure("plan within single rotors' limits, 3 waypoints", "ms", times),
-            figure("plan within single rotors' limits, 3 waypoints, CPU time", "ms", cpu)]
+    for waypoints in (0, 3):
+        times, _, _ = _plan_times(waypoints, replace(shipped, solver="osqp"), count // 10)
+        out.append(figure(f"plan with OSQP, {waypoints} waypoints", "ms", times))
     out.append(figure("ten million additions in plain Python, CPU time: the machine's speed", "s", [_additions()]))
-    _say("SLSQP")
-    for waypoints in (3, 10):
-        ratios, times = _nonlinear_ratios(waypoints, 4 if quick else 12)
-        if len(ratios):
-            out += [figure(f"SLSQP with sampled thrust, {waypoints} waypoints", "ms", times),
-                    figure(f"SLSQP / plan, {waypoints} waypoints", "x", ratios, 50.0, "median >=")]
     _say("first plans of a process")
     imported, first = _first_plan(fresh=False)
     out += [figure("import", "s", [imported]), figure("first plan of a process, kernels cached", "s", [first])]

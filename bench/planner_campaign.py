@@ -32,7 +32,7 @@ from perch_planner.verifier import verify
 
 _RELAXED = {
     "thrust": {"thrust_min": 1e-3, "thrust_max": 1e3}, "body_rate": {"body_rate_max": 1e3}, "speed": {"speed_max": 1e3},
-    "rotor_thrust": {"rotors": "free"}, "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3},
+    "rotor_thrust": {"rotors": "preferred"}, "height": {"height_min": -1e3, "height_max": 1e3}, "clearance": {"clearance_min": -1e3},
 }
 
 
@@ -54,12 +54,12 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=10000, help="problems (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
     parser.add_argument("--step", type=float, default=1e-4, help="sampling of the verifier [s] (default: %(default)s)")
-    parser.add_argument("--rotors", action="store_true", help="the thrust of each rotor keeps its range, too")
+    parser.add_argument("--rotors", action="store_true", help="the thrust of each rotor keeps its range in every plan")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     arguments = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    vehicle, settings = load_vehicle("snapdragon"), PerchSettings(rotors="required" if arguments.rotors else "free")
+    vehicle, settings = load_vehicle("snapdragon"), PerchSettings(rotors="required" if arguments.rotors else "preferred")
     codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
     begin = time.time()
     try:

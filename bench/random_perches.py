@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core import config
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import Vehicle
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.verifier import Requirements, Rotors
+
+
+def shipped_settings() -> PerchSettings:
+    """The planner's settings in `config/perching_planner.yaml`."""
+    content = config.read_yaml(config.config_dir() / "perching_planner.yaml")
+    return config.from_mapping(PerchSettings, content["/**"]["ros__parameters"], "perching_planner.yaml")
 
 
 def random_problem(rng: np.random.Generator, waypoints: int | None = None, moving_start: bool = True) -> PerchProblem:
@@ -52,7 +59,6 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         tube=(settings.tube_time, settings.tube_step, settings.tube_tolerance, settings.tube_floor), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
         rotors=each if rotors else None)
-
 
 
 def paper_like_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:

@@ -19,13 +19,13 @@ from nav_msgs.msg import Odometry
 from perch_core.ros import qos
 from perch_core.ros.conversions import to_seconds
 from perch_core.ros.trajectories import flat_message
-from perch_core.scenario import Scenario, load_scenario
 from perch_core.trajectory import rest_to_rest
 from perch_eval.demo import fly
 from perch_eval.domain import reserved_domain
 from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
 from perch_eval.stack import Stack
 from perch_msgs.msg import ControllerCommand, MotorCommand, Step, Trajectory
+from perch_sim.scenario import Scenario, load_scenario
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import Imu
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from harness import Figure, figure, measure
 from perch_core import so3
-from perch_core.scenario import Cable, Scenario, World, load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim.rendering import Renderer, build_scene
+from perch_sim.scenario import Cable, Scenario, World, load_scenario
 
 WIRES = tuple(Cable(start=(5.0 + 0.5 * i, -4.0, 2.2 + 0.4 * i), end=(5.0 + 0.5 * i, 4.0, 2.3 + 0.4 * i), sag=0.15)
               for i in range(3))

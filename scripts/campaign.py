@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import sys
 
-from perch_setup import enter
+from perch_setup import enter, quiet_on_interrupt
 
 
 def main() -> int:
     """Set up, then fly; the options are those of `perch_eval.campaign.command`."""
     enter()
-    from perch_eval.campaign.command import main as fly
+    with quiet_on_interrupt():
+        from perch_eval.campaign.command import main as fly
 
     return fly()
 

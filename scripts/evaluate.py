@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import sys
 
-from perch_setup import enter
+from perch_setup import enter, quiet_on_interrupt
 
 
 def main() -> int:
     """Set up, then evaluate; the options are those of `perch_eval.evaluation.command`."""
     enter()
-    from perch_eval.evaluation.command import main as evaluate
+    with quiet_on_interrupt():
+        from perch_eval.evaluation.command import main as evaluate
 
     return evaluate()
 

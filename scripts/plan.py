@@ -35,7 +35,7 @@ def _plan_perch(mapping: dict, source: str, out: Path) -> int:
     plan_output.draw(out / "plan.png", planned, problem, Limits.of(settings, vehicle), vehicle)
     print(f"contact after {planned.duration:.3f} s; {planned.iterations} programs in {1e3 * planned.solve_time:.2f} ms")
     for certificate in planned.certificates:
-        print(f"  {certificate.describe()}")
+        print(f"  {certificate}")
     return 0
 
 
@@ -70,7 +70,7 @@ ANIMATED = {"powerline": _animate_powerline}
 
 def _apply(mapping: dict, changes: list[str]) -> None:
     """Put `key=value` pairs into the section `settings`."""
-    import yaml
+    from perch_core.config import parse_yaml
     from perch_core.errors import ConfigError
 
     for change in changes:
@@ -80,10 +80,7 @@ def _apply(mapping: dict, changes: list[str]) -> None:
         settings = mapping.get("settings") or {}
         if not isinstance(settings, dict):
             return  # refused with the rest of the file
-        try:
-            mapping["settings"] = {**settings, key: yaml.safe_load(value)}
-        except yaml.YAMLError:
-            raise ConfigError("--set", change, "is not valid YAML after the =") from None
+        mapping["settings"] = {**settings, key: parse_yaml(value, f"--set: {change}")}
 
 
 def main() -> int:

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import sys
 
-from perch_setup import enter
+from perch_setup import enter, quiet_on_interrupt
 
 
 def main() -> int:
     """Set up, then draw; the options are those of `perch_eval.replay.command`."""
     enter()
-    from perch_eval.replay.command import main as show
+    with quiet_on_interrupt():
+        from perch_eval.replay.command import main as show
 
     return show()
 

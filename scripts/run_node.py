@@ -30,17 +30,20 @@ def main() -> int:
     )
     parser.add_argument("node", metavar="NODE", help="as in config/scenarios: vehicle, controller, ...")
     parser.add_argument("--no-config", action="store_true", help="do not pass config/<node>.yaml")
+    parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     arguments, for_node = parser.parse_known_args()
     enter()
     from perch_core.errors import PerchError
-    from perch_eval.node_launch import PACKAGES
+    from perch_eval.arguments import open_network
+    from perch_eval.node_launch import NODES
     from perch_eval.nodes import executable
 
-    if arguments.node not in PACKAGES:
-        print(f"error: node {arguments.node!r} is not one of {', '.join(PACKAGES)}", file=sys.stderr)
+    if arguments.node not in NODES:
+        print(f"error: node {arguments.node!r} is not one of {', '.join(NODES)}", file=sys.stderr)
         return 2
     try:
-        path = executable(PACKAGES[arguments.node], arguments.node)
+        open_network(arguments.network)
+        path = executable(NODES[arguments.node].package, arguments.node)
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from perch_setup import ROOT, enter
+from perch_setup import ROOT, enter, quiet_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/start_stack.py                                       scenario surface_90
@@ -45,6 +45,7 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--view", nargs="?", type=int, const=8765, metavar="PORT",
                         help="serve the flight to Foxglove at ws://localhost:PORT (8765); layout: config/foxglove_layout.json")
     parser.add_argument("--domain", type=int, metavar="N", help="ROS domain id, 0 to 101 (default: $ROS_DOMAIN_ID)")
+    parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
     parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>)")
     parser.add_argument("--ready-timeout", type=float, default=180.0, metavar="S", help="how long nodes may take to come up (default: %(default)g s)")
@@ -69,8 +70,11 @@ def main() -> int:
     if arguments.domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(arguments.domain)
     enter()
-    from perch_core.errors import PerchError
-    from perch_eval.stack import StackError
+    with quiet_on_interrupt():
+        import ros_graph.connection  # noqa: F401  (what takes long, before anything is started)
+        from perch_core.errors import PerchError
+        from perch_eval.flyable import check_names  # noqa: F401
+        from perch_eval.stack import StackError
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # stops like Ctrl-C
     try:
@@ -95,8 +99,8 @@ def run(arguments: argparse.Namespace) -> None:
         StackError: a node ended, or did not get ready.
     """
     from perch_core import config
-    from perch_core.scenario import load_scenario
-    from perch_eval.arguments import output_folder
+    from perch_sim.scenario import load_scenario
+    from perch_eval.arguments import open_network, output_folder
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs, sharing
@@ -104,6 +108,7 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_eval.view.address import check_free
     from ros_graph.connection import visit
 
+    open_network(arguments.network)
     source = config.find("scenarios", arguments.scenario).resolve()
     scenario = load_scenario(source)
     check_names(scenario, source)
@@ -126,17 +131,12 @@ def run(arguments: argparse.Namespace) -> None:
     try:
         stack.start()
         with visit() as graph:
-            stack.wait_until_ready(
-                lambda: {f"{ns.rstrip('/')}/{name}" for name, ns in graph.node.get_node_names_and_namespaces()},
-                arguments.ready_timeout,
-            )
+            stack.wait_until_ready(graph.nodes, arguments.ready_timeout)
         names = ", ".join(launch.name for launch in launches)
         print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {names}. Logs: {folder}. Ctrl-C stops all.", flush=True)
         stack.wait()
         stack.raise_if_ended()
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the stopping
         stack.stop()
 
 

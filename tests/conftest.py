@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, settings
 
 # Before the first message class is imported: by default a wrong type becomes silent garbage on the wire.
 os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 # No luck and no stop-watch: the same examples in each run, on slow machines too.
 settings.register_profile(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from .environment import variables
 from .errors import SetupError
@@ -41,9 +43,19 @@ def leave_quietly_on_interrupt() -> None:
     signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
 
 
+@contextmanager
+def quiet_on_interrupt() -> Iterator[None]:
+    """Around imports, which take seconds: Ctrl-C ends the script without a traceback."""
+    before = signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+
+
 def _say(error: SetupError) -> int:
     print(f"perch: {error}", file=sys.stderr)
     return error.exit_code
 
 
-__all__ = ["INTERRUPTED", "ROOT", "enter", "leave_quietly_on_interrupt"]
+__all__ = ["INTERRUPTED", "ROOT", "enter", "leave_quietly_on_interrupt", "quiet_on_interrupt"]

@@ -47,7 +47,7 @@ def prepare(clean: bool = False) -> Platform:
 def _install(wanted: Platform, done: dict[str, str]) -> None:
     """Install the locked packages, unless they are."""
     environment = stamps.environment_stamp(wanted)
-    if done.get("environment") == environment and VENV_PYTHON.exists():
+    if done.get("environment") == environment and virtualenv.usable():
         return
     identity = f"{wanted.ros} in {ROOT}"
     fresh = done.get("identity", identity) != identity or not virtualenv.usable()
@@ -68,6 +68,9 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
     current = {folder: stamps.package_stamp(folder, environment) for folder in stamps.packages()}
     stale = [folder for folder in current if not _is_built(folder, current[folder], done)]
     if stale:
+        for folder in stale:
+            done.pop(folder.name, None)
+        stamps.save(done)
         workspace.build(stale, wanted, fresh)
         done.update({folder.name: current[folder] for folder in stale}, built_with=environment)
         stamps.save(done)
@@ -93,7 +96,7 @@ def _warm_up(wanted: Platform, done: dict[str, str]) -> None:
 def _nothing_to_do(wanted: Platform, done: dict[str, str]) -> bool:
     """Whether every stamp is up to date and the folders are still there."""
     environment = stamps.environment_stamp(wanted)
-    if done.get("environment") != environment or not VENV_PYTHON.exists() or done.get("warmed") != stamps.kernel_stamp(environment):
+    if done.get("environment") != environment or not virtualenv.usable() or done.get("warmed") != stamps.kernel_stamp(environment):
         return False
     return (INSTALL / "setup.bash").exists() and all(
         _is_built(folder, stamps.package_stamp(folder, environment), done)

@@ -45,15 +45,17 @@ def kernel_stamp(environment: str) -> str:
 
 
 def packages() -> list[Path]:
-    """The folders of all packages in the workspace."""
-    return sorted(file.parent for file in SOURCES.glob("*/package.xml"))
+    """The folders of all packages to build: those of ROS itself only where the sourced ROS lacks them."""
+    prefixes = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix and not prefix.startswith(str(ROOT))]
+    return sorted(file.parent for file in SOURCES.glob("*/package.xml")
+                  if file.parent.name.startswith("perch_") or not any((prefix / "share" / file.parent.name).is_dir() for prefix in prefixes))
 
 
 def load() -> dict[str, str]:
     """Stamps of everything that is done; empty where nothing is, or where the file is damaged."""
     try:
         stamps = json.loads(_FILE.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return stamps if isinstance(stamps, dict) else {}
 

@@ -14,7 +14,7 @@ from .progress import Step
 from .wheel_paths import mend_wheels
 
 _UNFINISHED = STATE / "installing"
-"""Exists while pip works. A killed pip leaves packages that look installed and are not."""
+"""Exists from before the environment is made until pip is done. A killed venv leaves a Python without pip, a killed pip packages that are none."""
 _USER_SETTINGS = ("PIP_TARGET", "PIP_PREFIX", "PIP_REQUIRE_VIRTUALENV", "PYTHONHOME", "PYTHONSTARTUP")
 
 
@@ -30,12 +30,13 @@ def install(wanted: Platform, fresh: bool) -> None:
     """
     environment = _environment(wanted)
     STATE.mkdir(exist_ok=True)
-    if fresh or not usable():
+    fresh = fresh or not usable()
+    _UNFINISHED.touch()
+    if fresh:
         with Step("virtual environment") as step:
             shutil.rmtree(VENV, ignore_errors=True)
             sight = [] if wanted.uses_wheels else ["--system-site-packages"]
             step.run([_base_python(), "-m", "venv", *sight, VENV], "venv", environment)
-    _UNFINISHED.touch()
     total = sum(_pins(lock.read_text()) for lock in wanted.locks)
     with Step(f"installing {total} packages") as step:
         arguments = [word for lock in wanted.locks for word in ("-r", str(lock))]
@@ -49,8 +50,8 @@ def install(wanted: Platform, fresh: bool) -> None:
 
 
 def usable() -> bool:
-    """Whether there is an environment that pip can go on from."""
-    return VENV_PYTHON.exists() and not _UNFINISHED.exists()
+    """Whether there is an environment that was finished; what venv writes last is there."""
+    return VENV_PYTHON.exists() and (VENV_PYTHON.parent / "activate").exists() and not _UNFINISHED.exists()
 
 
 def _base_python() -> str:

@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Callable, Iterable, Optional
 
 from .environment import variables
-from .errors import SetupError
 from .layout import BUILD, INSTALL, ROOT, SOURCES, STATE, VENV, VENV_PYTHON
 from .machine import Platform
 from .progress import Step
 
-_UNFINISHED = STATE / "building"
-"""Names the packages that are being built. After a kill, those start from an empty folder."""
 _COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
 """Started through our Python, so that the executables it writes run in our Python too."""
 
@@ -32,14 +29,9 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
         SetupError: with the last lines of the compiler where a package does not build.
     """
     names = sorted(folder.name for folder in selected)
-    doubtful = _UNFINISHED.read_text().split() if _UNFINISHED.exists() else []
-    for name in doubtful:
-        shutil.rmtree(BUILD / name, ignore_errors=True)
-        shutil.rmtree(INSTALL / name, ignore_errors=True)
-    if fresh:
-        shutil.rmtree(BUILD, ignore_errors=True)
-        shutil.rmtree(INSTALL, ignore_errors=True)
-    _UNFINISHED.write_text("\n".join(names))
+    # Each from an empty folder: what a killed build left is not sound, nor is typesupport that was linked with a message that has gone.
+    for folder in (BUILD, INSTALL) if fresh else [base / name for base in (BUILD, INSTALL) for name in names]:
+        shutil.rmtree(folder, ignore_errors=True)
     with Step(f"building {len(names)} package{'s' * (len(names) != 1)}") as step:
         command = [
             *(VENV_PYTHON, "-c", _COLCON, "--log-base", STATE / "log" / "colcon", "build"),
@@ -48,12 +40,7 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
             *("--packages-select", *names),
             *("--cmake-args", "-DCMAKE_BUILD_TYPE=Release", "--no-warn-unused-cli"),
         ]
-        try:
-            step.run(command, "build", _environment(wanted), _narrator())
-        except SetupError:  # the compiler refused something; what it built is sound
-            _UNFINISHED.unlink()
-            raise
-    _UNFINISHED.unlink()
+        step.run(command, "build", _environment(wanted), _narrator())
 
 
 def _environment(wanted: Platform) -> dict[str, str]:

@@ -70,11 +70,13 @@ def run(command: Callable[[], int]) -> int:
     Returns:
         The exit code: that of the command, or 2 for the caller's mistakes.
     """
+    from perch_core.errors import PerchError  # there is one inside the environment only
+
     try:
         code = command()
         sys.stdout.flush()
         return code
-    except GraphError as error:
+    except (GraphError, PerchError) as error:
         print(f"error: {error}", file=sys.stderr)
         return CALLERS_MISTAKE
     except KeyboardInterrupt:

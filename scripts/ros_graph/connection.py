@@ -33,6 +33,17 @@ class Visit:
         """End the present wait. (An exception out of a signal handler would end in the executor's callbacks.)"""
         self._interrupted = True
 
+    def check(self) -> None:
+        """Raise KeyboardInterrupt where Ctrl-C has come."""
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt
+
+    def nodes(self) -> set[str]:
+        """Fully qualified names of the nodes in the graph."""
+        self.check()
+        return {f"{namespace.rstrip('/')}/{name}" for name, namespace in self.node.get_node_names_and_namespaces()}
+
     def spin_until(self, done: Callable[[], bool], timeout: float | None = None) -> bool:
         """Handle what arrives until `done`.
 
@@ -44,9 +55,7 @@ class Visit:
         """
         last = None if timeout is None else time.monotonic() + timeout
         while not done():
-            if self._interrupted:
-                self._interrupted = False
-                raise KeyboardInterrupt
+            self.check()
             if last is not None and time.monotonic() > last:
                 return False
             self._executor.spin_once(timeout_sec=0.05)
@@ -111,6 +120,7 @@ def visit() -> Iterator[Visit]:
     before = {number: signal.signal(number, lambda *_: guest.interrupt()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield guest
+        guest.check()  # an interrupt that nobody has looked for must not be lost with the handlers
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -6,7 +6,7 @@ import importlib
 from typing import Any
 
 import numpy as np
-import yaml
+from perch_core.config import parse_yaml
 
 from ros_graph.commands import GraphError
 
@@ -15,12 +15,10 @@ def parse(text: str, what: str) -> dict[str, Any]:
     """A mapping in YAML, as in `{armed: true}`; nothing for an empty text.
 
     Raises:
-        GraphError: not YAML, or not a mapping.
+        ConfigError: not YAML.
+        GraphError: not a mapping.
     """
-    try:
-        values = yaml.safe_load(text) if text else {}
-    except yaml.YAMLError as error:
-        raise GraphError(f"{what} is not valid YAML: {' '.join(str(error).split())}") from None
+    values = parse_yaml(text, what) if text else {}
     if not isinstance(values or {}, dict):
         raise GraphError(f"{what}: expected fields as in '{{name: value}}', got {text!r}")
     return values or {}

@@ -6,12 +6,16 @@ import argparse
 from typing import Any
 
 import yaml
-from rcl_interfaces.msg import ParameterType
+from perch_core.config import parse_yaml
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from ros_graph.commands import GraphError
 from ros_graph.connection import Visit, hidden, visit
+
+TYPES = {getattr(ParameterType, f"PARAMETER_{kind.upper().replace(' ', '_')}"): kind for kind in (
+    "bool", "integer", "double", "string", "byte array", "bool array", "integer array", "double array", "string array")}
 
 
 def list_parameters(arguments: argparse.Namespace) -> int:
@@ -38,7 +42,7 @@ def get_parameter(arguments: argparse.Namespace) -> int:
 
 
 def describe_parameters(arguments: argparse.Namespace) -> int:
-    """`param.py describe`: what each parameter means, in which unit, and what is allowed."""
+    """`param.py describe`: what each parameter means, its type and unit, and what is allowed."""
     with visit() as graph:
         node = graph.absolute(arguments.node)
         client = _client(graph, node, arguments.spin_time)
@@ -48,19 +52,29 @@ def describe_parameters(arguments: argparse.Namespace) -> int:
     for name, value, descriptor in zip(names, values, found):
         if value.type == ParameterType.PARAMETER_NOT_SET and not descriptor.description:
             raise GraphError(f"{node} has no parameter {name!r}; 'param.py list {node}' shows all")
-        fixed = " (fixed after the start)" if descriptor.read_only else ""
-        print(f"{name}: {_plain(parameter_value_to_python(value))!r}{fixed}")
+        print(f"{name}: {_plain(parameter_value_to_python(value))!r}")
+        print(f"    {_allowed(descriptor)}")
         if descriptor.description:
             print(f"    {descriptor.description}")
     return 0
 
 
+def _allowed(descriptor: ParameterDescriptor) -> str:
+    """Type, range, unit and other limits of a parameter, and whether it can change."""
+    parts = [TYPES.get(descriptor.type, "of any type")]
+    for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
+        above = "> " in descriptor.additional_constraints  # an exclusive bound: the range begins with the next number
+        parts.append(f"to {limits.to_value:g}" if above else f"from {limits.from_value:g} to {limits.to_value:g}")
+    if descriptor.additional_constraints:
+        parts.append(descriptor.additional_constraints)
+    if descriptor.read_only:
+        parts.append("read-only: fixed after the start")
+    return ", ".join(parts)
+
+
 def set_parameter(arguments: argparse.Namespace) -> int:
     """`param.py set`: 1 where the node refuses the value."""
-    try:
-        value = yaml.safe_load(arguments.value)
-    except yaml.YAMLError:
-        raise GraphError(f"value {arguments.value!r} is not valid YAML") from None
+    value = parse_yaml(arguments.value, "value")
     with visit() as graph:
         node = graph.absolute(arguments.node)
         client = _client(graph, node, arguments.spin_time)

@@ -33,4 +33,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
+    entry_points={"console_scripts": ["description = perch_core.description_node:main"]},
 )

@@ -1,30 +1,37 @@
-"""The controller in closed loop with the plant, without ROS: what the unit tests and the benchmark fly."""
+"""The controller's component in closed loop with a plant of the tests: what the unit tests and the benchmark fly."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from closed_loop.plant import Disturbances, EstimationError, Plant
+from closed_loop.plant import Disturbances, EstimationError, Plant, PlantVehicle, believed
 from perch_control.admission import AtEnd, Order
+from perch_control.controller import Controller
 from perch_control.flight import FlightController
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.guidance import Hold
 from perch_control.modes import Command, State
 from perch_control.nmpc import NmpcController, NmpcSettings
+from perch_control.parameters import ControllerChoice, ControllerParameters
 from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_core.values import OdometryState, seconds
 from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.in_process import Loop as FlightLoop
+from perch_eval.in_process.stand_ins import TruthEstimator
+from perch_sim.lockstep import Task
 
 PERIOD = 0.002
+EVERY_STEP = ControllerChoice(standby=False, reference_period=PERIOD)
 _PLANS = Path(__file__).with_name("perches.json")
 
 
@@ -44,36 +51,54 @@ def perch(name: str) -> Perch:
                  np.array(plan["normal"]), np.array(plan["contact"]))
 
 
-@dataclass
+class Believed(TruthEstimator):
+    """Gives the controller what `Loop.odometry` makes of the plant."""
+
+    loop: Loop
+
+    def believed(self, state: OdometryState) -> OdometryState:
+        """In the place of a true state."""
+        return believed(state.stamp, self.loop.odometry(self.loop.plant))
+
+
 class Loop:
-    """A flight: plant, controller, clock; records what happens.
+    """A flight: plant, odometry, controller; records what happens.
 
     Attributes:
+        controller: the flight controller in its component.
+        flight: the loop that moves the components.
         odometry: what the controller is told, from the plant; by default the truth.
         events: (time, state, text).
         states, references: true state and reference position at each step in flight.
     """
 
-    controller: FlightController
-    plant: Plant
-    odometry: Callable[[Plant], tuple[float, ...]] = lambda plant: plant.state
-    time: float = 0.0
-    events: list[tuple[float, str, str]] = field(default_factory=list)
-    states: list[np.ndarray] = field(default_factory=list)
-    references: list[np.ndarray] = field(default_factory=list)
+    def __init__(self, component: Controller, plant: Plant) -> None:
+        self.controller: FlightController = component.flight
+        self.plant = plant
+        self.odometry: Callable[[Plant], tuple[float, ...]] = lambda plant: plant.state
+        self.events: list[tuple[float, str, str]] = []
+        self.states: list[np.ndarray] = []
+        self.references: list[np.ndarray] = []
+        estimator = Believed()
+        estimator.loop = self
+        self.flight = FlightLoop(PlantVehicle(plant), {"estimator": estimator, "controller": component},
+                                 {"estimator": Task(), "controller": Task()}, {})
+        component.log.receivers.append(lambda line: self.events.append((self.flight.time, self.controller.state.name, line.text)))
+        component.reference.receivers.append(self._follows)
+
+    def _follows(self, reference: Any) -> None:
+        self.states.append(np.array(self.plant.state))
+        self.references.append(np.array(reference.p))
+
+    @property
+    def time(self) -> float:
+        """Of the next step [s]."""
+        return seconds(self.flight.vehicle.next)
 
     def run(self, duration: float, until: Callable[[Loop], bool] | None = None) -> bool:
         """Fly on; True when `until` became true before the time was over."""
         for _ in range(round(duration / PERIOD)):
-            self.controller.imu(self.time, tuple(self.plant.w.tolist()), tuple(self.plant.specific_force_B.tolist()))
-            result = self.controller.step(self.time, self.odometry(self.plant))
-            if result.event:
-                self.events.append((self.time, self.controller.state.name, result.event))
-            if result.setpoint is not None:
-                self.states.append(np.array(self.plant.state))
-                self.references.append(np.array(result.setpoint.p))
-            self.plant.advance(np.array(result.rotor_speed) if result.armed else np.zeros(4))
-            self.time += PERIOD
+            self.flight.step()
             if until is not None and until(self):
                 return True
         return False
@@ -88,11 +113,11 @@ class Loop:
         plant, maneuvers = self.plant, self.controller.maneuvers
         plant.p, hover = np.array(p, float), plant.vehicle.mass * 9.81 / 4 / plant.vehicle.thrust_coefficient
         plant.speed = np.full(4, np.sqrt(hover))
-        self.controller.step(self.time, self.odometry(plant))
+        self.run(PERIOD)
+        self.flight.vehicle.command = None
         maneuvers.enter(State.HOVERING, "in the air")
         maneuvers.rotors = RotorEstimate(tuple(plant.speed.tolist()), tuple(plant.speed.tolist()))
         maneuvers.run(Hold.at(plant.p, (0.0, 1.0, 0.0)))
-        self.time += PERIOD
         self.run(0.3)
 
     def take_off(self, height: float = 1.2) -> None:
@@ -130,9 +155,11 @@ def make_loop(vehicle: Vehicle | None = None, p=(0.0, 0.0, 0.0), disturbances: D
     """A vehicle at rest on the ground with its controller."""
     vehicle = vehicle or load_vehicle("snapdragon")
     gains = GeometricGains()
-    flight = FlightController(vehicle, law or GeometricController(vehicle, gains), gains, settings or FlightSettings())
+    component = Controller(ControllerParameters(vehicle=vehicle.name, controller=EVERY_STEP, flight=settings or FlightSettings()))
+    if law is not None:
+        component.flight.use(law, gains, settings or FlightSettings())
     body = Plant(vehicle, p, speed=np.zeros(4), disturbances=disturbances or Disturbances(), **plant)
-    loop = Loop(flight, body)
+    loop = Loop(component, body)
     if noise_seed is not None:
         loop.odometry = EstimationError(noise_seed)
     return loop

@@ -4,10 +4,13 @@ but the vehicle's numbers."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from perch_core.component import Component, Input, Output
+from perch_core.values import NANOSECONDS, ImuSample, MotorCommand, OdometryState, rotated
 from perch_core.vehicle import Vehicle
 
 G = np.array([0.0, 0.0, -9.81])
@@ -108,6 +111,50 @@ class Plant:
     def state(self) -> tuple[float, ...]:
         """p, v, q (xyzw), w as the controller takes them, 13 floats."""
         return tuple(float(x) for x in (*self.p, *self.v, *Rotation.from_matrix(self.R).as_quat(), *self.w))
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """Of a component that has none."""
+
+
+class PlantVehicle(Component[NoParameters]):
+    """A plant as the vehicle of a flight loop: IMU and truth at every step, a motor command moves it to the next step.
+
+    Attributes:
+        time, next: stamps of the present and of the next step [ns].
+    """
+
+    config_type = NoParameters
+
+    motor_command = Input(MotorCommand, "motor_command")
+    imu = Output(ImuSample, "imu/data_raw")
+    truth = Output(OdometryState, "ground_truth/odometry")
+
+    def __init__(self, plant: Plant) -> None:
+        super().__init__(NoParameters())
+        self._plant, self.command = plant, None
+        self.time, self.next = 0, NANOSECONDS
+
+    def on_motor_command(self, command: MotorCommand) -> None:
+        """Speeds for the period that begins now."""
+        self.command = np.array(command.rotor_speed) if command.armed else np.zeros(4)
+
+    def advance(self) -> list[Any]:
+        """One control period; there are no cameras."""
+        self.time, self.next = self.next, self.next + 2_000_000
+        plant = self._plant
+        if self.command is not None:
+            plant.advance(self.command)
+        self.imu(ImuSample(self.time, tuple(plant.w.tolist()), tuple(plant.specific_force_B.tolist())))
+        self.truth(believed(self.time, plant.state))
+        return []
+
+
+def believed(stamp: int, state: tuple[float, ...]) -> OdometryState:
+    """Odometry of 13 floats p, v in W, q, w."""
+    p, v, q, w = state[0:3], state[3:6], state[6:10], state[10:13]
+    return OdometryState(stamp, p, q, rotated(q, v, -1.0), w, np.zeros((6, 6)), np.zeros((6, 6)))
 
 
 class EstimationError:

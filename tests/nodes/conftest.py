@@ -1,19 +1,32 @@
-"""What the tests of nodes share."""
+"""The nodes that a vehicle flies with, each alone in a process, without the simulator."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+
 import pytest
-from nodes.vehicle_flight import Flight
+from nodes.node_process import Running, nodes
+from perch_eval.domain import reserved_domain
+
+FREE = ("estimator", "vio", "target_localizer", "powerline_mapper", "controller", "perching_planner", "powerline_planner", "mission", "description")
+
+
+@pytest.fixture(scope="session")
+def free(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
+    """Every node but those of simulation and evaluation; the mapper, which looks through another vehicle's camera, is in `/lines`."""
+    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        with nodes(FREE, tmp_path_factory.mktemp("free"), {"powerline_mapper": "/lines"}) as running:
+            yield running
 
 
 @pytest.fixture
-def flights(ros_domain):
-    opened = []
-
-    def start(**arguments) -> Flight:
-        opened.append(Flight(ros_domain, **arguments))
-        return opened[-1]
-
-    yield start
-    for flight in opened:
-        flight.close()
+def graph(free: dict[str, Running], monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Running]]:
+    """The same, in the domain of this test's processes; afterwards all of them still work."""
+    with open(f"/proc/{free['estimator'].process.pid}/environ", "rb") as file:
+        environment = dict(entry.split(b"=", 1) for entry in file.read().split(b"\0") if b"=" in entry)
+    monkeypatch.setenv("ROS_DOMAIN_ID", environment[b"ROS_DOMAIN_ID"].decode())
+    yield free
+    for node in free.values():
+        node.check()

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_core import so3
 from perch_core.rigid_body import accelerations
-from perch_core.scenario import Disturbance, load_scenario
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim.body import make_body
 from perch_sim.contact import FREE
 from perch_sim.dynamics import advance, derivative, lagged
 from perch_sim.obstacles import make_obstacles
+from perch_sim.scenario import Disturbance, load_scenario
 
 SURFACES = make_obstacles(load_scenario("surface_90")).surfaces
 UNIT = st.floats(-1.0, 1.0)

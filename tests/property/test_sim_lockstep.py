@@ -1,182 +1,439 @@
-"""The vehicle's side of the lockstep under random schedules: nothing counts early, nothing waits for ever."""
+"""The order of a simulated flight: answer times never change who sees what at which step; the silent are named, dropped and rejoin."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from perch_core.errors import ConfigError
-from perch_core.scenario import Latency
-from perch_sim.lockstep_master import LockstepMaster
+from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Wake
+from perch_core.errors import PerchError
+from perch_core.values import CameraImage
+from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Owed, Packet, Schedule, Task, local_servers
 from perch_sim.pacing import LONGEST_CATCH_UP, Pacing
-from perch_sim.participants import triggers
 
-PERIOD = 2
-
-
-@dataclass
-class Worker:
-    """A slow participant that finishes work in order, whenever the schedule lets it."""
-
-    name: str
-    latency: int
-    every: int
-    queue: list[int] = field(default_factory=list)
-    published: int = 0
-    finished: dict[int, int] = field(default_factory=dict)  # trigger -> count at its report
+MS = 1_000_000
+STEP = 2 * MS
 
 
-class Play:
-    """A flight of the master against workers, with the events in an order that the test chooses."""
-
-    def __init__(self, workers: list[Worker]) -> None:
-        self.master = LockstepMaster(tuple(w.name for w in workers), controller=True)
-        self.workers, self.time, self.index = workers, PERIOD, 0
-        self.visible: dict[str, list[int]] = {w.name: [] for w in workers}
-        self.triggered: dict[str, list[tuple[int, int]]] = {w.name: [] for w in workers}
-        self.seen = {w.name: 0 for w in workers}
-        for worker in workers:
-            self.master.report(worker.name, 0, {f"/{worker.name}": 0})
-
-    def try_step(self) -> bool:
-        """Publish the next step if the master allows it."""
-        if self.master.missing_command or self.master.missing_results(self.time):
-            return False
-        for worker in self.workers:
-            if self.index % worker.every == 0:
-                self.master.trigger(worker.name, self.time, self.time + worker.latency)
-                self.triggered[worker.name].append((self.time, self.time + worker.latency))
-                worker.queue.append(self.time)
-        for topic, count in self.master.begin(self.time).items():
-            self.seen[topic[1:]] = count
-        for worker in self.workers:
-            self.visible[worker.name].append(self.seen[worker.name])
-        return True
-
-    def answer(self) -> bool:
-        """The controller answers the present step, and physics goes on."""
-        if not self.master.missing_command:
-            return False
-        assert self.master.command(self.time)
-        self.time, self.index = self.time + PERIOD, self.index + 1
-        return True
-
-    def work(self, worker: Worker, results: int) -> bool:
-        """A participant finishes its oldest work with so many messages."""
-        if not worker.queue:
-            return False
-        trigger = worker.queue.pop(0)
-        worker.published += results
-        worker.finished[trigger] = worker.published
-        self.master.report(worker.name, trigger, {f"/{worker.name}": worker.published})
-        return True
+@dataclass(frozen=True)
+class Nothing:
+    """No parameters."""
 
 
-WORKERS = st.lists(st.tuples(st.integers(1, 30), st.integers(1, 6)), min_size=1, max_size=4)
+class Vehicle(Component[Nothing]):
+    """An IMU sample at each step, a frame every `every` steps that arrives 4 ms after its exposure."""
+
+    motor_command = Input(tuple, "motor_command")
+    imu = Output(int, "imu/data_raw")
+    image, info = Output(CameraImage, "camera_down/image_raw"), Output(int, "camera_down/camera_info")
+
+    def __init__(self, every: int = 4, draw=None) -> None:
+        super().__init__(Nothing())
+        self.time, self.every, self.draw = 0, every, draw
+        self.commands: list[tuple] = []
+
+    def advance(self) -> list[Arrival]:
+        self.time += STEP
+        arrivals = []
+        if self.time // STEP % self.every == 0:
+            pixels, ready = self.draw(self.time) if self.draw else (np.zeros((1, 1), np.uint8), None)
+            image = CameraImage(self.time, "camera", 1, 1, "mono8", pixels, ready)
+            self.info(self.time), self.image(image)
+            arrivals = [Arrival("down", self.time, self.time - 4 * MS, image)]
+        self.imu(self.time)
+        return arrivals
+
+    def on_motor_command(self, command: tuple) -> None:
+        self.commands.append((self.time, command))
 
 
-@given(WORKERS, st.lists(st.integers(0, 9), min_size=50, max_size=300))
-def test_results_count_exactly_from_when_they_are_due(kinds, schedule):
-    """Whatever the order of events, step by step each consumer sees what a list of dues says, no more and no less."""
-    play = Play([Worker(f"w{i}", latency, every) for i, (latency, every) in enumerate(kinds)])
-    for choice in schedule:
-        worker = play.workers[choice % len(play.workers)]
-        if choice < 4:
-            play.work(worker, results=choice % 3)
-        elif choice < 7:
-            play.answer()
+class Vio(Component[Nothing]):
+    imu, image = Input(int, "imu/data_raw"), Input(CameraImage, "camera_down/image_raw")
+    info = Input(int, "camera_down/camera_info")
+    state, odometry = Output(tuple, "vio/state"), Output(tuple, "vio/odometry")
+
+    def __init__(self) -> None:
+        super().__init__(Nothing())
+        self.newest = 0
+
+    def on_imu(self, stamp: int) -> None:
+        self.newest = stamp
+
+    def on_info(self, stamp: int) -> None:
+        pass
+
+    def on_image(self, image: CameraImage) -> None:
+        self.state((image.stamp, self.newest)), self.odometry((image.stamp, self.newest))
+
+
+class Estimator(Component[Nothing]):
+    imu, state, vio = Input(int, "imu/data_raw"), Input(tuple, "vio/state"), Input(tuple, "vio/odometry")
+    odometry = Output(tuple, "odometry")
+
+    def __init__(self) -> None:
+        super().__init__(Nothing())
+        self.last = 0
+
+    def on_state(self, pose: tuple) -> None:
+        self.last = pose[0]
+
+    on_vio = on_state
+
+    def on_imu(self, stamp: int) -> None:
+        self.odometry((stamp, self.last))
+
+
+class Controller(Component[Nothing]):
+    odometry, order = Input(tuple, "odometry"), Input(int, "trajectory")
+    motor_command = Output(tuple, "motor_command")
+
+    def __init__(self) -> None:
+        super().__init__(Nothing())
+        self.order_now = 0
+
+    def on_order(self, order: int) -> None:
+        self.order_now = order
+
+    def on_odometry(self, state: tuple) -> None:
+        self.motor_command((*state, self.order_now))
+
+
+class Mission(Component[Nothing]):
+    odometry, line = Input(tuple, "odometry"), Input(int, "powerlines")
+    trajectory = Output(int, "trajectory")
+    tick = Wake(0.02)
+
+    def __init__(self) -> None:
+        super().__init__(Nothing())
+        self.seen = 0
+
+    def on_odometry(self, state: tuple) -> None:
+        self.seen += 1
+
+    def on_line(self, line: int) -> None:
+        self.seen += 1000
+
+    def on_tick(self, now: int) -> None:
+        self.trajectory(now + self.seen)
+
+
+class Mapper(Component[Nothing]):
+    powerlines = Output(int, "powerlines")
+    look = Wake(0.05)
+
+    def on_look(self, now: int) -> None:
+        self.powerlines(now)
+
+
+class Logged:
+    """A participant that answers after so many calls, and what it was given at which step."""
+
+    def __init__(self, inner: LocalParticipant, waits=()) -> None:
+        self.inner, self.name, self.inputs, self.waits = inner, inner.name, inner.inputs, list(waits)
+        self.log: list = []
+        self.left, self.dead = 0, False
+
+    def begin(self, now, batch):
+        assert self.left == 0
+        self.log.append((now, [(p.channel, p.value.stamp if isinstance(p.value, CameraImage) else p.value) for p in batch]))
+        self.left = self.waits.pop(0) if self.waits else 0
+        self.inner.begin(now, batch)
+
+    def results(self):
+        if self.dead:
+            return None
+        if self.left:
+            self.left -= 1
+            return None
+        return self.inner.results()
+
+    def listen(self, taken):
+        self.inner.listen(taken)
+
+
+def tasks(vio: int, mission: int) -> dict[str, Task]:
+    return {"estimator": Task(), "controller": Task(), "vio": Task(vio * 1e-3), "mapper": Task(0.003, 25),
+            "mission": Task(mission * 1e-3, 10)}
+
+
+COMPONENTS = {"vio": Vio, "estimator": Estimator, "controller": Controller, "mission": Mission, "mapper": lambda: Mapper(Nothing())}
+
+
+def logged(name: str, waits=()) -> Logged:
+    return Logged(LocalParticipant(COMPONENTS[name](), name=name), waits)
+
+
+def flown(latencies, every, waits, events=(), steps=60, draw=None):
+    """Who saw what, and what the vehicle was commanded. `events`: step -> list of (drop or join, name)."""
+    crew = [logged(name, waits.get(name, ())) for name in ("mission", "vio", "controller", "estimator", "mapper")]
+    vehicle = Vehicle(every, draw)
+    schedule = Schedule(vehicle, crew, tasks(*latencies))
+    late = {}
+    for index in range(steps):
+        for what, name in dict(events).get(index, ()):
+            if what == "drop":
+                schedule.drop(name)
+            else:
+                late.setdefault(name, []).append(logged(name, waits.get(name, ())))
+                schedule.join(late[name][-1])
+        for _ in range(10_000):
+            if schedule.advance():
+                break
+            assert schedule.owed()
         else:
-            play.try_step()
-    for worker in play.workers:
-        for index, seen in enumerate(play.visible[worker.name]):
-            now = PERIOD * (index + 1)
-            due = [worker.finished[trigger] for trigger, when in play.triggered[worker.name] if when <= now]
-            assert seen == (due[-1] if due else 0)
+            raise AssertionError("it waits for ever")
+        assert schedule.index == index + 1
+    return [(c.name, c.log) for c in crew], [(name, c.log) for name, cs in late.items() for c in cs], vehicle.commands
 
 
-@given(WORKERS, st.lists(st.integers(0, 100), min_size=20, max_size=100))
-def test_it_never_deadlocks(kinds, picks):
-    """While workers work and the controller answers, time goes on: some event is always possible."""
-    play = Play([Worker(f"w{i}", latency, every) for i, (latency, every) in enumerate(kinds)])
-    for pick in picks:
-        events = [play.try_step, play.answer] + [lambda w=w: play.work(w, 1) for w in play.workers]
-        first = pick % len(events)
-        assert any(event() for event in events[first:] + events[:first])
-    steps = play.index
-    for _ in range(10 * len(play.workers) + 10):
-        for event in [play.try_step, play.answer] + [lambda w=w: play.work(w, 1) for w in play.workers]:
-            event()
-    assert play.index > steps
+def same(flight, at_once):
+    """The same for everybody, but that slow ones may have begun less when the flight or their part in it ended."""
+    assert flight[2] == at_once[2]
+    for one, other in zip(flight[0] + flight[1], at_once[0] + at_once[1], strict=True):
+        name, log = one
+        assert log == (other[1] if name in ("estimator", "controller") else other[1][:len(log)])
+        assert len(other[1]) - len(log) <= 5
 
 
-def test_first_step_names_every_topic_and_later_ones_what_changed():
-    master = LockstepMaster(("vio", "mission"), controller=False)
-    assert master.missing_greetings() == ("vio", "mission")
-    master.report("vio", 0, {"/vio/odometry": 0})
-    master.report("mission", 0, {"/trajectory": 0, "/controller/command": 0})
-    assert master.missing_greetings() == ()
-    assert master.begin(2) == {"/vio/odometry": 0, "/trajectory": 0, "/controller/command": 0}
-    master.trigger("mission", 2, 6)
-    assert master.begin(4) == {}
-    assert master.missing_results(6) == ("mission",)
-    master.report("mission", 2, {"/trajectory": 1, "/controller/command": 0})
-    assert master.begin(6) == {"/trajectory": 1}
+WAITS = st.dictionaries(st.sampled_from(sorted(COMPONENTS)), st.lists(st.integers(0, 40), max_size=60))
+LATENCIES = st.tuples(st.integers(2, 40), st.integers(2, 40))
+EVENTS = st.dictionaries(st.integers(1, 59), st.lists(st.tuples(st.sampled_from(["drop", "join"]), st.sampled_from(sorted(COMPONENTS))),
+                                                     min_size=1, max_size=2), max_size=5)
 
 
-def test_a_step_cannot_begin_early():
-    master = LockstepMaster(("vio",), controller=True)
-    master.trigger("vio", 2, 4)
-    master.begin(2)
-    with pytest.raises(RuntimeError, match="command"):
-        master.begin(3)
-    assert not master.command(1) and master.command(2)
-    with pytest.raises(RuntimeError, match="vio"):
-        master.begin(4)
+@given(LATENCIES, st.integers(1, 12), WAITS)
+def test_answer_times_never_change_who_sees_what_at_which_step(latencies, every, waits):
+    same(flown(latencies, every, waits), flown(latencies, every, {}))
 
 
-def test_a_late_greeting_is_no_report():
-    """Participants greet until they see a step: a greeting on its way then must not pass for finished work."""
-    master = LockstepMaster(("mission",), controller=False)
-    master.report("mission", 0, {"/trajectory": 0})
-    master.trigger("mission", 2, 4)
-    master.begin(2)
-    master.report("mission", 0, {"/trajectory": 0})
-    assert master.missing_results(4) == ("mission",)
+@given(LATENCIES, st.integers(1, 12), WAITS, EVENTS)
+def test_nor_do_they_where_participants_leave_and_rejoin(latencies, every, waits, events):
+    same(flown(latencies, every, waits, events.items()), flown(latencies, every, {}, events.items()))
 
 
-def test_reports_beyond_what_was_triggered_change_nothing():
-    master = LockstepMaster(("mission",), controller=False)
-    master.trigger("mission", 2, 6)
-    master.report("mission", 4, {"/trajectory": 7})
-    master.report("mission", 2, {"/trajectory": 1})
-    assert master.begin(6) == {"/trajectory": 1}
-    with pytest.raises(KeyError):
-        master.report("stranger", 2, {})
+@given(LATENCIES, st.integers(1, 12), st.lists(st.integers(0, 30), max_size=60))
+def test_nor_does_the_time_that_images_are_drawn_in(latencies, every, looks):
+    """An image is there after so many looks at it."""
+    def draw_slowly():
+        left = list(looks)
+
+        def draw(stamp):
+            count = [left.pop(0) if left else 0]
+
+            def ready(timeout):
+                count[0] -= 1
+                return count[0] < 0
+
+            return np.zeros((1, 1), np.uint8), ready
+        return draw
+
+    same(flown(latencies, every, {}, draw=draw_slowly()), flown(latencies, every, {}))
 
 
-def test_the_dropped_are_not_waited_for_until_they_are_back():
-    master = LockstepMaster(("vio",), controller=True)
-    master.trigger("vio", 2, 4)
-    master.begin(2)
-    master.drop("vio")
-    master.drop_controller()
-    assert not master.missing_command and master.missing_results(4) == ()
-    master.begin(4)
-    master.trigger("vio", 4, 8)
-    assert master.missing_results(8) == ()
-    assert master.report("vio", 2, {"/vio/odometry": 1})
-    master.take_back_controller()
-    master.trigger("vio", 6, 8)
-    master.begin(6)
-    assert master.missing_command and master.missing_results(8) == ("vio",)
+@given(LATENCIES, st.integers(1, 12))
+def test_results_count_exactly_from_when_they_are_due(latencies, every):
+    """Against a list of dues: a pose counts from max(middle + latency, arrival + one period), an order from tick + latency."""
+    crew, _, commands = flown(latencies, every, {})
+    vio, mission = latencies
+    poses = [(max(t - 4 * MS + vio * MS, t + STEP), t) for t in range(STEP, 61 * STEP, STEP) if t // STEP % every == 0]
+    ticks = [STEP + k * 10 * STEP for k in range(6)]
+    for now, (stamp, pose, order) in commands:
+        assert stamp == now
+        assert pose == max((t for due, t in poses if due <= now), default=0)
+        assert (order > 0) == any(t + max(mission * MS, STEP) <= now for t in ticks)
+    batches = dict(crew)["estimator"]
+    for now, batch in batches:
+        channels = [channel for channel, _ in batch]
+        assert channels == sorted(channels[:-1]) + ["imu/data_raw"]
 
 
-def test_unknown_participants_are_refused_with_those_there_are():
-    with pytest.raises(ConfigError, match="participants: 'vi0' is not one of controller, vio, vio_model"):
-        triggers(("vi0",), Latency())
-    assert [t.node for t in triggers(("controller", "mission", "vio"), Latency())] == ["mission", "vio"]
+def test_a_fast_participant_that_is_silent_is_named_and_the_flight_goes_on_without_it():
+    mute = logged("controller")
+    schedule = Schedule(Vehicle(), [logged("estimator"), mute], tasks(10, 10))
+    assert schedule.advance()
+    mute.dead = True
+    assert not schedule.advance() and not schedule.advance()
+    assert schedule.owed() == [Owed("controller", "its answer to the present step", 2 * STEP)]
+    schedule.drop("controller")
+    assert schedule.advance() and schedule.advance() and schedule.names == ["estimator"]
+
+
+def test_a_fast_participant_that_rejoins_while_it_is_awaited_gets_the_present_batch_again():
+    mute, vehicle = logged("controller"), Vehicle()
+    schedule = Schedule(vehicle, [logged("estimator"), mute], tasks(10, 10))
+    mute.dead = True
+    assert not schedule.advance()
+    back = logged("controller")
+    schedule.join(back)
+    assert schedule.advance() and back.log == mute.log
+    assert vehicle.commands == [(STEP, (STEP, 0, 0))]
+
+
+def test_a_slow_one_that_hangs_is_named_with_the_trigger_of_what_it_owes():
+    vio = logged("vio")
+    vio.dead = True
+    schedule = Schedule(Vehicle(every=3), [logged("estimator"), logged("controller"), vio], tasks(10, 10))
+    steps = 0
+    while schedule.advance():
+        steps += 1
+    assert steps == 5  # the frame of step 3, exposed at 2 ms, counts from 12 ms, step 6
+    assert schedule.owed() == [Owed("vio", "its results", 3 * STEP)]
+    schedule.drop("vio")
+    assert all(schedule.advance() for _ in range(20))
+
+
+def test_a_rejoined_participant_gets_what_is_latched_and_its_inbox_anew():
+    schedule = Schedule(Vehicle(every=5), [logged(name) for name in ("estimator", "controller", "mapper", "vio")], tasks(10, 10))
+    assert all(schedule.advance() for _ in range(32))
+    mission, vio = logged("mission"), logged("vio")
+    schedule.join(mission), schedule.join(vio)
+    assert all(schedule.advance() for _ in range(10))
+    assert mission.log[0][1][0] == ("powerlines", 26 * STEP)  # the newest, once
+    assert [channel for channel, _ in mission.log[0][1]].count("powerlines") == 1
+    assert mission.log[0][1][1] == ("odometry", (33 * STEP, 25 * STEP))  # the last pose went with the old vio
+    assert vio.log[0][1][:2] == [("camera_down/camera_info", 30 * STEP), ("imu/data_raw", 33 * STEP)]
+
+
+def test_an_image_that_never_comes_is_dropped_with_its_trigger_and_nothing_else():
+    lost = {8 * STEP}
+    vio = logged("vio")
+    schedule = Schedule(Vehicle(draw=lambda stamp: ((lambda region=None: None) if stamp in lost else np.zeros((1, 1), np.uint8),
+                                                    lambda timeout: True)), [vio], tasks(10, 10))
+    assert all(schedule.advance() for _ in range(13))
+    assert [now for now, _ in vio.log] == [4 * STEP, 12 * STEP]
+    stamps = [value for _, batch in vio.log for channel, value in batch if channel == "imu/data_raw"]
+    assert stamps == [STEP * k for k in range(1, 13)]
+    assert [value for channel, value in vio.log[1][1] if channel.endswith("image_raw")] == [12 * STEP]
+
+
+def test_the_flight_waits_for_the_third_undrawn_image_of_a_camera_even_where_nobody_takes_it():
+    drawn: set[int] = set()
+    schedule = Schedule(Vehicle(every=2, draw=lambda t: (np.zeros((1, 1), np.uint8), lambda timeout: t in drawn)), [], tasks(10, 10))
+    assert all(schedule.advance() for _ in range(5)) and not schedule.advance()
+    assert schedule.owed() == [Owed("camera_down", "an image", 2 * STEP)] and schedule.await_image(0.0)
+    drawn.add(2 * STEP)
+    assert schedule.advance() and not schedule.await_image(0.0)
+
+
+def test_a_participant_whose_camera_sends_nothing_is_given_what_came_all_the_same():
+    vio = logged("vio")
+    schedule = Schedule(Vehicle(every=10**6), [vio], tasks(10, 10))
+    assert all(schedule.advance() for _ in range(1100))
+    assert [len(batch) for _, batch in vio.log] == [501, 500]
+
+
+def test_nobody_joins_without_a_task():
+    with pytest.raises(PerchError, match="'vi0' is not one of estimator, controller, vio"):
+        Schedule(Vehicle(), [LocalParticipant(Vio(), name="vi0")], tasks(10, 10))
+
+
+# -- components in this process ----------------------------------------------------------------------------------------
+
+
+class Planner(Component[Nothing]):
+    plan = Service(int, int, "plan_perch")
+
+    def on_plan(self, request, reply):
+        if request < 0:
+            raise PerchError("below zero")
+        reply(2 * request), reply(-1)
+
+
+class Asking(Component[Nothing]):
+    number, said = Input(int, "number"), Output(str, "said")
+    plan = Client(int, int, "plan_perch")
+    perch = Action(int, int, int, "perch")
+    tick = Wake(0.02)
+
+    def on_number(self, number):
+        self.plan(number, number)
+
+    def on_plan(self, answer):
+        self.said(f"answer {answer.reason if isinstance(answer, Unavailable) else answer}")
+
+    def on_perch(self, goal):
+        self.said(f"goal {goal}")
+        return "" if goal > 0 else "not positive"
+
+    def on_tick(self, now):
+        self.said(f"tick {now}")
+
+
+def said(participant, now, *numbers):
+    participant.begin(now, [Packet("number", n) for n in numbers])
+    results = participant.results()
+    return None if results is None else [packet.value for packet in results]
+
+
+def test_answers_come_in_the_first_batch_in_which_they_count():
+    asking = LocalParticipant(Asking(Nothing()), ask=local_servers([LocalParticipant(Planner(Nothing()))]))
+    assert asking.name == "asking"
+    assert said(asking, 0, 30 * MS) == ["tick 0"]
+    assert said(asking, 20 * MS) == ["tick 20000000"]
+    assert said(asking, 40 * MS) == ["answer 60000000", "tick 40000000"]
+    assert said(LocalParticipant(Asking(Nothing())), 0, 0) == ["tick 0"]
+
+
+def test_a_batch_waits_for_an_answer_that_counts_from_its_stamp_or_before():
+    answers = []
+
+    def ask(channel, request):
+        answers.append(Answer())
+        return answers[-1]
+
+    asking = LocalParticipant(Asking(Nothing()), ask=ask)
+    assert said(asking, 0, 30 * MS) == ["tick 0"] and said(asking, 20 * MS) == ["tick 20000000"]
+    assert said(asking, 40 * MS) is None and asking.results() is None
+    answers[0]("there")
+    assert [packet.value for packet in asking.results()] == ["answer there", "tick 40000000"]
+
+
+def test_servers_that_are_missing_or_fail_answer_all_the_same():
+    asking = LocalParticipant(Asking(Nothing()), ask=local_servers([]))
+    said(asking, 0, 1)
+    assert said(asking, 2)[0] == "answer nobody serves 'plan_perch'"
+    failed = Answer()
+    failed.result = lambda: 1 // 0
+    failed(0)
+    asking = LocalParticipant(Asking(Nothing()), ask=lambda channel, request: failed)
+    said(asking, 0, 1)
+    assert said(asking, 2)[0].startswith("answer ZeroDivisionError")
+
+
+def test_a_first_batch_waits_for_the_goal_that_holds_it_and_goals_go_in_front_of_batches():
+    asking, verdicts = LocalParticipant(Asking(Nothing()), hold="perch"), []
+    assert said(asking, 0) is None
+    asking.goal("perch", 1, verdicts.append)
+    assert [packet.value for packet in asking.results()] == ["goal 1", "tick 0"]
+    asking.goal("perch", -1, verdicts.append)
+    assert said(asking, 20 * MS) == ["goal -1", "tick 20000000"] and verdicts == ["", "not positive"]
+    early = LocalParticipant(Asking(Nothing()), hold="perch")
+    early.goal("perch", 2)
+    assert said(early, 0) == ["goal 2", "tick 0"]
+    with pytest.raises(PerchError, match="'park' is none of its"):
+        LocalParticipant(Asking(Nothing()), hold="park")
+
+
+def test_packets_make_the_form_that_is_asked_for_once():
+    class Codec:
+        calls = 0
+
+        def encode(self, channel, value):
+            self.calls += 1
+            return str(value).encode()
+
+        def decode(self, channel, data):
+            self.calls += 1
+            return int(data)
+
+    codec = Codec()
+    assert (packet := Packet("a", 3, codec)).data == packet.data == b"3" and codec.calls == 1
+    assert (packet := Packet.received("a", b"4", codec)).value == packet.value == 4 and codec.calls == 2
+    with pytest.raises(TypeError, match="a: a packet without a codec"):
+        Packet("a", 3).data
 
 
 @given(st.lists(st.integers(0, 200), min_size=1, max_size=60))

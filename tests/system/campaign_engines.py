@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import time
@@ -33,3 +34,12 @@ def broken(task) -> RunResult:
     if task.run.number % 4 == 0:
         raise RuntimeError("the simulator is out of fuel")
     return quick(task)
+
+
+def threads(task) -> RunResult:
+    """Says on how many threads BLAS adds here."""
+    with open("/proc/self/maps") as file:
+        path = next(line.split()[-1] for line in file if "openblas" in line and "numpy" in line)
+    library = ctypes.CDLL(path)
+    name = next(name for name in ("scipy_openblas_get_num_threads64_", "openblas_get_num_threads64_", "openblas_get_num_threads") if hasattr(library, name))
+    return RunResult(task.run.number, task.run.seed, "perched", "perched", str(getattr(library, name)()))

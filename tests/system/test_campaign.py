@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -87,8 +88,42 @@ def test_results_are_those_of_an_undisturbed_campaign(campaign, tmp_path):
     assert all((r.cause == "perched") == (r.values["wind.gust_sigma"] < 0.5) for r in found)
 
 
-@pytest.mark.parametrize("where", [(), ("--cluster", "local")], ids=["pool", "dask"])
-def test_a_killed_worker_loses_no_result(campaign, tmp_path, where):
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def cluster(campaign, tmp_path) -> Iterator[str]:
+    """Address of a Dask scheduler with two workers, whose environment gives BLAS four threads."""
+    script = tmp_path / "cluster.py"
+    script.write_text(CLUSTER)
+    with subprocess.Popen([sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                          env=os.environ | {"OPENBLAS_NUM_THREADS": "4"}) as process:
+        yield process.stdout.readline().strip()
+        process.stdin.close()
+
+
+def test_a_killed_worker_loses_no_result(campaign, tmp_path):
+    lost_none(campaign, tmp_path)
+
+
+def test_a_killed_worker_of_a_cluster_loses_no_result(campaign, tmp_path, cluster):
+    lost_none(campaign, tmp_path, "--cluster", cluster)
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="BLAS has one thread")
+def test_runs_on_a_cluster_add_on_one_thread(campaign, tmp_path, cluster):
+    assert run(campaign("threads", 4, "--cluster", cluster)).returncode == 0
+    assert {r.message for r in read_results(tmp_path / "out" / "results.sqlite")} == {"1"}
+
+
+def lost_none(campaign, tmp_path, *where: str) -> None:
     finished = run(campaign("mortal", 40, *where))
     assert (tmp_path / "killed").exists()
     assert finished.returncode == 0, finished.stderr

@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from perch_eval import demo
-from perch_eval.flight import HASHED, Flight
+from perch_eval import demo, in_process
+from perch_eval.flight import HASHED, Flight, numbers
+from perch_eval.in_process.flights import Sensing
 from perch_eval.nodes import ALL_NODES
+from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_sim.scenario import load_scenario
 
 SCENARIO, SEED = "surface_90", 1
 
@@ -59,7 +62,7 @@ def test_the_nodes_hold_their_rates(flight):
     for topic, rate in (("imu/data_raw", 500.0), ("odometry", 500.0), ("motor_command", 500.0), ("ground_truth/odometry", 500.0),
                         ("rotor_state", 100.0), ("controller/status", 50.0), ("estimator/status", 10.0)):
         assert rates[topic] == pytest.approx(rate, rel=0.05), topic
-    until_contact = [t for t, _ in Flight(folder / "flight.mcap").messages("vio/odometry") if t <= report["window_s"][1]]
+    until_contact = [t for t, _ in RecordedFlight(folder / "flight.mcap").values("vio/odometry") if t <= report["window_s"][1]]
     assert len(until_contact) > 100  # at the wall it is blind, and says nothing
     assert np.ptp(until_contact) / (len(until_contact) - 1) == pytest.approx(1.0 / 30.0, rel=0.03)
 
@@ -96,14 +99,20 @@ def test_one_process_per_node_and_a_busy_core_give_the_same_flight(flight, tmp_p
         busy.wait()
     assert again["outcome"] == report["outcome"]
     if again["flight_hash"] != report["flight_hash"]:
-        pytest.fail(first_difference(Flight(folder / "flight.mcap"), Flight(tmp_path / "flight.mcap")))
+        pytest.fail(first_difference(RecordedFlight(folder / "flight.mcap"), RecordedFlight(tmp_path / "flight.mcap")))
+
+
+def test_without_ros_it_is_the_same_flight(flight):
+    report, _ = flight
+    trace = in_process.fly(load_scenario(SCENARIO), SEED, Sensing("rendered", "rendered"), linger=0.5)
+    assert trace.flight.digest(trace.end_time) == report["flight_hash"]
 
 
 def first_difference(a: Flight, b: Flight) -> str:
     """Where two recordings part, topic by topic."""
     lines = []
     for topic in HASHED:
-        one, other = a.messages(topic), b.messages(topic)
-        parted = next((t for (t, x), (_, y) in zip(one, other) if x != y), None)
-        lines.append(f"{topic}: {len(one)} and {len(other)} messages, " + ("equal" if parted is None else f"different from {parted:.3f} s on"))
+        one, other = a.values(topic), b.values(topic)
+        parted = next((t for (t, x), (_, y) in zip(one, other) if numbers(x) != numbers(y)), None)
+        lines.append(f"{topic}: {len(one)} and {len(other)} values, " + ("equal" if parted is None else f"different from {parted:.3f} s on"))
     return "\n".join(lines)

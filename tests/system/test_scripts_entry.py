@@ -42,7 +42,7 @@ def test_sourcing_gives_a_shell_in_which_everything_is_found():
     assert result.returncode == 0, result.stderr
     module, shell, count = result.stdout.splitlines()
     assert module.startswith(str(ROOT))
-    assert shell.split() == [f"{ROOT}/install/perch_sim/lib/perch_sim/vehicle", "LOCALHOST", "1", "42",
+    assert shell.split() == [f"{ROOT}/install/perch_sim/lib/perch_sim/vehicle", "SUBNET", "1", "42",
                              f"{ROOT}/config/fastdds.xml"]
     assert count == "1"
 

@@ -67,6 +67,20 @@ def test_ready_then_stopped_without_leftovers(start, tmp_path, mode, number):
     assert "Traceback" not in logs
 
 
+def test_ctrl_c_during_start_up_ends_it(domain, tmp_path):
+    process = start_script("start_stack.py", "--domain", domain, "--log-dir", str(tmp_path))
+    try:
+        while not children(process):
+            assert process.poll() is None
+        started = children(process)
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    assert (process.returncode, error) == (0, "") and out.endswith("stopped\n") and "ready in" not in out
+    assert not any(child.is_running() for child in started.values())
+
+
 def test_a_killed_node_is_named_and_the_others_are_stopped(start):
     process = start()
     started = children(process)

@@ -12,7 +12,7 @@ import psutil
 import pytest
 import rclpy
 from perch_core import config
-from perch_eval.node_launch import PACKAGES
+from perch_eval.node_launch import NODES
 from perch_eval.nodes import executable
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -64,7 +64,7 @@ def start(node: str, folder: Path) -> subprocess.Popen:
         arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
     if node == "viewer":
         arguments += ["-p", "port:=0"]
-    return subprocess.Popen([executable(PACKAGES[node], node), *arguments], env=dict(os.environ), stdin=subprocess.DEVNULL,
+    return subprocess.Popen([executable(NODES[node].package, node), *arguments], env=dict(os.environ), stdin=subprocess.DEVNULL,
                             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=folder)
 
 
@@ -78,7 +78,7 @@ def works(process: psutil.Process) -> bool:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_every_executable_stops_cleanly(number, ros_domain, tmp_path, record_property, capsys):
-    processes = {node: start(node, tmp_path) for node in PACKAGES}
+    processes = {node: start(node, tmp_path) for node in NODES}
     durations, problems = {}, []
     watch = Watch()
     try:

@@ -13,7 +13,7 @@ from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
 DT = 0.002
 IMU = load_vehicle("snapdragon").imu
 MS = 1_000_000
-WHITE = (0.002, 0.002)          # VIO's white noise of the tests [m, rad]
+WHITE = (0.002, 0.002)          # VIO's white noise of the tests [m, rad]: what `VioNoise` adds to a covariance
 DRIFT = (0.010, 0.004)          # VIO's drift of the tests [m/sqrt(s), rad/sqrt(s)]
 
 
@@ -30,6 +30,7 @@ class Flight:
     seed: int = 0
     latency: float = 0.040
     config: UkfConfig = UkfConfig()
+    drift: bool = True  # VIO's map walks away; else its errors are new in every pose
 
     def __post_init__(self):
         self.rng = np.random.default_rng(self.seed)
@@ -41,15 +42,15 @@ class Flight:
 
     def make_poses(self):
         n, h = len(self.truth.times), 17 * DT
-        d = self.rng.normal(0, 1, 6) * np.repeat([0.002, 0.003], 3)
-        C = np.diag(np.repeat([0.002**2, 0.003**2], 3))
+        white = np.diag(np.repeat([WHITE[0] ** 2, WHITE[1] ** 2], 3))
+        d, C = self.rng.normal(0, 1, 6) * np.repeat([0.002, 0.003], 3) * self.drift, np.diag(np.repeat([0.002**2, 0.003**2], 3)) * self.drift
         poses = {}
         for k in range(160, n, 17):
-            W = np.diag(np.repeat([DRIFT[0] ** 2 * h, DRIFT[1] ** 2 * h], 3))
+            W = np.diag(np.repeat([DRIFT[0] ** 2 * h, DRIFT[1] ** 2 * h], 3)) * self.drift
             d, C = d + self.rng.multivariate_normal(np.zeros(6), W), C + W
-            p = self.truth.p_WB[k] + d[:3] + self.rng.normal(0, WHITE[0], 3)
-            q = so3.quat_multiply(so3.quat_exp(d[3:] + self.rng.normal(0, WHITE[1], 3)), self.q[k])
-            poses[k] = VioPose(k * 2 * MS, p, q, C, self.truth.v_WB[k])
+            e = d + self.rng.multivariate_normal(np.zeros(6), white)
+            q = so3.quat_multiply(so3.quat_exp(e[3:]), self.q[k])
+            poses[k] = VioPose(k * 2 * MS, self.truth.p_WB[k] + e[:3], q, C, so3.quat_to_matrix(q).T @ self.truth.v_WB[k])
         return poses
 
     def sample(self, k):

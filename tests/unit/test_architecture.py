@@ -32,15 +32,34 @@ def test_imports_follow_the_arrows(path):
         first = name.split(".")[0]
         if first.startswith("perch_") and first != "perch_msgs":
             assert first in ALLOWED[package], f"{path}: imports {name}"
-        if first in ROS and package != "perch_eval":
+        if first in ROS:
             assert path.name.endswith("_node.py") or "ros" in path.relative_to(ROOT / "src" / package).parts, \
-                f"{path}: imports {name}; ROS belongs in *_node.py and perch_core/ros"
+                f"{path}: imports {name}; ROS belongs in *_node.py and folders ros/"
 
 
-@pytest.mark.parametrize("path", [p for p in SOURCES if not {"perch_sim", "perch_eval"} & set(p.parts)],
+TABLE = Path("perch_core", "ros", "topics.py")  # names every channel
+
+
+@pytest.mark.parametrize("path", [p for p in SOURCES if not {"perch_sim", "perch_eval"} & set(p.parts) and p.parts[-3:] != TABLE.parts],
                          ids=lambda p: str(p.relative_to(ROOT / "src")))
 def test_only_simulator_and_evaluation_know_the_truth(path):
     assert "ground_truth" not in path.read_text()
+
+
+OUTSIDE = [p for p in SOURCES if not {"perch_sim", "perch_eval"} & set(p.parts)]
+HOST = {Path("perch_core", *parts) for parts in (("component.py",), ("ros", "node.py"), ("ros", "wiring.py"), ("ros", "parameters.py"))}
+"""What may mention the lockstep outside the simulator: the list of hosts, the place that chooses one, and what neighbours share with one."""
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda p: str(p.relative_to(ROOT / "src")))
+def test_the_simulator_alone_knows_of_its_lockstep(path):
+    if path.relative_to(ROOT / "src" / path.relative_to(ROOT / "src").parts[0]) not in HOST:
+        assert "lockstep" not in path.read_text().lower()
+
+
+def test_the_lockstep_has_no_messages():
+    """Its batches are the simulator's own business: nothing of them is on the graph, where others could write, too."""
+    assert not [file.name for file in (ROOT / "src" / "perch_msgs").rglob("*.msg") if "step" in file.name.lower() or "packet" in file.name.lower()]
 
 
 def test_every_source_is_seen():

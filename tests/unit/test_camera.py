@@ -10,12 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera, looking_along
+from perch_core.camera import (CameraMount, EquidistantCamera, PinholeCamera, RadialTangentialCamera, camera_of, camera_parameters,
+                               looking_along)
 from perch_core.errors import ConfigError
 
 SNAPDRAGON = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.003908, -0.009574, 0.010173, -0.003329))
 PINHOLE = PinholeCamera(640, 480, 615.0, 612.0, 319.0, 241.0)
-CAMERAS = pytest.mark.parametrize("camera", [SNAPDRAGON, PINHOLE], ids=["equidistant", "pinhole"])
+PLUMB_BOB = RadialTangentialCamera(752, 480, 458.7, 457.3, 367.2, 248.4, (-0.2834, 0.0739, 0.00019, 1.76e-5, 0.0))  # EuRoC's cam0
+RATIONAL = RadialTangentialCamera(1280, 720, 612.4, 612.1, 640.2, 361.0,  # a wide-angle lens as OpenCV calibrates it
+                                  (0.412, -2.61, 3.1e-4, -2.4e-4, 1.55, 0.295, -2.43, 1.48))
+RADTAN = pytest.mark.parametrize("camera", [PLUMB_BOB, RATIONAL], ids=["plumb_bob", "rational_polynomial"])
+CAMERAS = pytest.mark.parametrize("camera", [SNAPDRAGON, PINHOLE, PLUMB_BOB, RATIONAL],
+                                  ids=["equidistant", "pinhole", "plumb_bob", "rational_polynomial"])
 
 
 def points_in_front(n: int, max_angle: float, seed: int = 0) -> np.ndarray:
@@ -40,13 +46,81 @@ def test_pinhole_projection_is_opencv_project_points():
     np.testing.assert_allclose(PINHOLE.project(points)[0], expected[:, 0], atol=1e-8)
 
 
+@RADTAN
+def test_radial_tangential_projection_is_opencv_project_points(camera):
+    points = points_in_front(2000, 0.95 * min(camera.max_angle, 1.2))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, camera.distortion)
+    pixels, valid = camera.project(points)
+    assert valid.mean() > 0.99
+    np.testing.assert_allclose(pixels[valid], expected[valid, 0], atol=1e-8)
+
+
+@pytest.mark.parametrize("coefficients", [
+    (-0.35, 0.0, 0.0, 0.0, 0.0), (-0.3, 0.02, 1e-3, -2e-3, 0.0), (0.1, -0.4, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, -0.8),
+    (0.2, 0.0, 0.0, 0.0, 0.0, -0.5, 0.0, 0.0), (-0.3, 0.0, 1e-3, 1e-3, 0.0, 0.2, 0.1, 0.0)])
+def test_nothing_folds_back_into_the_image(coefficients):
+    """Along every direction pixels go outwards with the angle, up to the last valid point; beyond it there is none."""
+    camera = RadialTangentialCamera(640, 480, 300.0, 300.0, 320.0, 240.0, coefficients)
+    assert 0.2 < camera.max_angle < np.pi / 2
+    theta = np.linspace(0.0, 1.56, 3000)
+    for phi in np.linspace(-np.pi, np.pi, 24, endpoint=False):
+        rays = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+        pixels, valid = camera.project(rays)
+        last = valid.sum()
+        assert valid[:last].all() and 0 < last < len(theta)
+        assert abs(theta[last] - camera.max_angle) < 0.02
+        assert (np.diff(np.linalg.norm(pixels[:last] - pixels[0], axis=1)) > 0.0).all()
+        assert np.isnan(camera.project_jacobian(rays[last:])).all()
+        np.testing.assert_allclose(camera.unproject(pixels[:last]), rays[:last], atol=1e-10)
+
+
+def test_without_distortion_both_perspective_cameras_agree():
+    points = points_in_front(500, 1.4)
+    flat = RadialTangentialCamera(640, 480, 615.0, 612.0, 319.0, 241.0)
+    np.testing.assert_allclose(flat.project(points)[0], PINHOLE.project(points)[0], atol=1e-9)
+    np.testing.assert_allclose(flat.shape_at(np.linspace(0, 1.2, 20)), PINHOLE.shape_at(np.linspace(0, 1.2, 20)), atol=1e-12)
+
+
+@CAMERAS
+def test_the_shape_of_the_lens_is_the_finite_difference(camera):
+    theta = np.linspace(0.01, min(0.9 * camera.max_angle, 1.2), 20)
+
+    def radius(theta):  # across the image, in the normalised plane; tangential distortion is no part of the shape
+        bare = camera
+        if isinstance(camera, RadialTangentialCamera):
+            k = list(camera.coefficients)
+            k[2] = k[3] = 0.0
+            bare = RadialTangentialCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, tuple(k))
+        rays = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
+        return (bare.project(rays)[0][:, 0] - bare.cx) / bare.fx
+
+    shape = camera.shape_at(theta)
+    np.testing.assert_allclose(shape[:, 0], 2e-6 / (radius(theta + 1e-6) - radius(theta - 1e-6)), rtol=1e-6)
+    np.testing.assert_allclose(shape[:, 1], radius(theta) / theta, rtol=1e-7)
+
+
+@CAMERAS
+def test_a_camera_survives_camera_info(camera):
+    assert camera_of(camera_parameters(camera)[0], camera.width, camera.height, camera.K, camera_parameters(camera)[1]) == camera
+
+
+@pytest.mark.parametrize(("change", "why"), [
+    ({"model": "fisheye624"}, "distortion_model"), ({"distortion": [0.1, 0.2]}, "2 coefficients"), ({"K": np.zeros((3, 3))}, "not calibrated"),
+    ({"distortion": [np.nan] * 5}, "finite"), ({"width": 0}, "0 x 480"), ({"K": np.eye(4)}, "intrinsic matrix")])
+def test_a_camera_info_that_is_none_is_refused(change, why):
+    good = dict(model="plumb_bob", width=640, height=480, K=PINHOLE.K, distortion=[0.1, 0.0, 0.0, 0.0, 0.0])
+    assert camera_of(**good).model == "plumb_bob"
+    with pytest.raises(ConfigError, match=why):
+        camera_of(**{**good, **change})
+
+
 @CAMERAS
 def test_unproject_inverts_project(camera):
     points = points_in_front(2000, min(camera.max_angle, 1.54))
     pixels, valid = camera.project(points)
-    assert valid.all()
+    assert valid.mean() > 0.99  # tangential distortion folds a little earlier on one side
     rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    np.testing.assert_allclose(camera.unproject(pixels), rays, atol=1e-11)
+    np.testing.assert_allclose(camera.unproject(pixels[valid]), rays[valid], atol=1e-10)
 
 
 @CAMERAS
@@ -63,7 +137,7 @@ def test_every_pixel_of_the_image_has_a_unit_ray(camera):
 
 @CAMERAS
 def test_jacobian_is_the_finite_difference(camera):
-    points = np.vstack([points_in_front(200, 1.4, seed=3), [[0.0, 0.0, 2.0]]])
+    points = np.vstack([points_in_front(200, min(1.4, 0.9 * camera.max_angle), seed=3), [[0.0, 0.0, 2.0]]])
     step = 1e-6
     numeric = np.stack([(camera.project(points + d)[0] - camera.project(points - d)[0]) / (2 * step)
                         for d in step * np.eye(3)], axis=-1)

@@ -1,5 +1,8 @@
 """Strict configuration: what is refused, and what the message says."""
 
+import json
+import math
+import time
 from dataclasses import dataclass
 
 import pytest
@@ -41,8 +44,8 @@ def test_defaults_and_nesting(tmp_path):
     ("{name: a, count: 20}", "count", "20 is outside [1, 9]"),
     ("{name: a, count: 2.5}", "count", "not of type int"),
     ("{name: a, count: true}", "count", "not of type int"),
-    ("{name: a, inner: {gain: 0}}", "inner.gain", "0 is not > 0 1/s"),
-    ("{name: a, inner: {gain: .nan}}", "inner.gain", "nan"),
+    ("{name: a, inner: {gain: 0}}", "inner.gain", "0 is outside (0, 1e+06] 1/s"),
+    ("{name: a, inner: {gain: .nan}}", "inner.gain", "nan is outside (0, 1e+06] 1/s"),
     ("{name: a, inner: {gain: fast}}", "inner.gain", "'fast' is not of type float"),
     ("{name: a, inner: {axes: [1]}}", "inner.axes", "has 1 entries, needs 2"),
     ("{name: a, inner: {axes: [1, 7]}}", "inner.axes", "7 is outside [0, 5] m"),
@@ -65,6 +68,50 @@ def test_broken_yaml_and_missing_file(tmp_path):
         config.load(Outer, tmp_path / "picture.yaml")
     with pytest.raises(ConfigError, match="cannot be read"):
         config.load(Outer, tmp_path / "none.yaml")
+
+
+DEEP = "[" * 100_000
+BOMB = "\n".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9 if k else ['x'] * 9)}]" for k in range(9))
+LADDER = "\n".join(f"a{k}: &a{k} [{f'*a{k - 1}' if k else 'x'}]" for k in range(30))
+
+
+@pytest.mark.parametrize("content, words", [
+    (DEEP, "line 1: more than 20 levels"), ("{a: " * 2000, "line 1: more than 20 levels"), ("- " * 2000, "more than 20 levels"),
+    (LADDER, "more than 20 levels"), (BOMB, "more than 20000 values"), ("&a [*a]", "alias 'a' has no anchor before it"),
+    ("name: a\nname: b", "line 2: key 'name' stands here twice"), ("{name: a, inner: {gain: 1, gain: 2}}", "key 'gain' stands here twice"),
+    ("? [a]\n: b", "a key that is no word"), ("!!python/object/apply:os.system [ls]", "tags are not used"), ("!!timestamp x", "tags are not used"),
+    (f"[{'1, ' * 3000}]", "more than 2000 entries"), (f"count: {'9' * 400}", "a whole number beyond 64 bits"), (f"# {'x' * (1 << 20)}", "more than 1048576 bytes"),
+    ("--- a\n--- b", "is not valid YAML"), ("a: \x00", "is not valid YAML"), ("<<: 3", "is not valid YAML"),
+])
+def test_what_must_not_be_built_is_refused_while_it_is_read(tmp_path, content, words):
+    path = tmp_path / "x.yaml"
+    path.write_text(content)
+    began = time.monotonic()
+    with pytest.raises(ConfigError) as error:
+        config.read_yaml(path)
+    assert words in str(error.value) and str(path) in str(error.value) and len(str(error.value).splitlines()) == 1
+    assert time.monotonic() - began < 2.0
+
+
+def test_words_are_those_of_json():
+    text = '{a: 1, b: -2.5, c: 1e-3, d: true, e: null, f: on, g: 1:30, h: 2024-99-99, i: 0x10, j: .inf, k: &k {x: 1}, l: {<<: *k, y: [*k]}, m: "1"}'
+    assert config.parse_yaml(text, "") == {
+        "a": 1, "b": -2.5, "c": 0.001, "d": True, "e": None, "f": "on", "g": "1:30", "h": "2024-99-99", "i": "0x10", "j": math.inf, "k": {"x": 1},
+        "l": {"x": 1, "y": [{"x": 1}]}, "m": "1"}
+    value = {"a": [1, 1e-05, -1e22, "x\n\u00e9\"", None, False, {}]}
+    assert config.parse_yaml(json.dumps(value), "") == value
+
+
+def test_errors_are_one_line_whatever_they_quote(tmp_path):
+    with pytest.raises(ConfigError) as error:
+        read(tmp_path, f'{{name: "a\\nb\\e[31m{"x" * 5000}"}}')
+    assert len(str(error.value)) < 2000 and str(error.value).isprintable()
+
+
+def test_names_stay_in_their_folders():
+    for name in ("../vehicles/rpg", "/etc/passwd", ".", "a/b", "a" * 5000, "\0", "a" * 5000 + ".yaml", "\0.yaml"):
+        with pytest.raises(ConfigError):
+            config.find("vehicles", name)
 
 
 def test_unknown_name_lists_the_names_there_are():

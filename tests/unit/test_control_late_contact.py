@@ -10,9 +10,9 @@ from perch_control.admission import AtEnd
 from perch_control.geometric import GeometricController
 from perch_control.modes import State
 from perch_control.parameters import ControllerParameters
-from perch_core.scenario import Adhesion, load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval.in_process.parameters import NodeParameters
+from perch_sim.scenario import Adhesion, load_scenario
 
 
 def touch(name, farther):

@@ -24,11 +24,11 @@ from perch_control.settings import GeometricGains
 from perch_core import rigid_body, so3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
-from perch_core.scenario import load_scenario
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
+from perch_sim.scenario import load_scenario
 
 SNAPDRAGON, RPG = load_vehicle("snapdragon"), load_vehicle("rpg")
 
@@ -97,7 +97,7 @@ def test_compiled_linearisation_and_finite_differences_agree(states, with_lines)
 
 def test_reference_rows_are_those_of_their_times():
     source, vehicle, out = FlatReference(perch("surface_90_1.7m").trajectory), packed_vehicle(SNAPDRAGON), np.zeros((21, 17))
-    rows = ReferenceRows(vehicle, 0.5, 500)
+    rows = ReferenceRows(vehicle, 0.5, 500, 0.002)
     for elapsed in (0.0, 0.002, 0.05, 0.052, 0.3, 1.9):
         rows.fill(source, elapsed, 25, out)
         for k in range(21):

@@ -94,7 +94,7 @@ def test_attached_stops_the_motors_and_arming_again_recovers():
     loop.run(plan.trajectory.duration + 0.04)
     loop.controller.command(Command.ATTACHED, "test")
     loop.run(0.05)
-    assert loop.controller.state is State.DISARMED and np.all(np.array(loop.controller.maneuvers.rotors.command) == 0)
+    assert loop.controller.state is State.ATTACHED and np.all(np.array(loop.controller.maneuvers.rotors.command) == 0)
     loop.controller.command(Command.ARM)
     assert loop.controller.state is State.RECOVERING
     assert loop.run(4.0, until=lambda x: x.controller.state is State.HOVERING), loop.events
@@ -214,12 +214,23 @@ def test_each_fault_leads_to_its_answer(fault, expected, word):
     assert reached, (loop.controller.state, m.message, loop.events)
 
 
-def test_at_rest_and_tilted_stops_the_motors():
+@pytest.mark.parametrize("tilt", [70.0, 135.0, 180.0])
+def test_at_rest_and_tilted_stops_the_motors_whatever_odometry_says(tilt):
+    loop, angle = hovering(), np.radians(tilt)
+    force = (9.81 * np.sin(angle), 0.0, 9.81 * np.cos(angle))
+    for k in range(800):
+        loop.controller.imu(loop.time + 0.002 * k, (0.0, 0.0, 0.0), force)
+        loop.controller.step(loop.time + 0.002 * k, loop.plant.state)
+        if loop.controller.state is State.FAILED:
+            break
+    assert 0.002 * k < 1.5
+
+
+def test_a_descent_without_any_sensor_ends():
     loop = hovering()
-    tilted = moved(loop.plant.state, q=(np.sin(0.75), 0, 0, np.cos(0.75)), v=(0, 0, 0), w=(0, 0, 0))
-    loop.odometry = lambda plant: tilted
-    assert loop.run(3.0, until=lambda x: x.controller.state is State.FAILED), loop.events
-    assert not loop.controller.step(loop.time, tilted).armed
+    loop.controller.imu(loop.time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+    results = [loop.controller.step_blind(loop.time + 0.02 * k) for k in range(75)]
+    assert results[40].armed and not results[-1].armed and loop.controller.state is State.FAILED
 
 
 def along_x(start: float, p: float, v: float, duration: float, brakes: bool = False) -> SampledTrajectory:

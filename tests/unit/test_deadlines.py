@@ -1,6 +1,7 @@
 """When an answer in real time is late: against a made-up clock."""
 
 import numpy as np
+import pytest
 
 from perch_core.ros.deadlines import MOVED, WINDOW, Deadlines, durations_us, median_and_p99
 from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
@@ -63,3 +64,13 @@ def test_median_and_p99_are_samples_next_to_the_quantiles():
 def test_durations_are_reported_in_microseconds_and_none_without_any():
     assert durations_us("step", [0.002, 0.001, 0.003]) == {"step_us_median": 2000.0, "step_us_p99": 2000.0}
     assert durations_us("step", []) == {}
+
+
+@pytest.mark.parametrize("period", [1_000_000, 5_000_000, 10_000_000])
+def test_the_period_is_that_of_the_imu(period):
+    deadlines = Deadlines()
+    for k in range(1000):
+        deadlines.answered(k * period, k * period + (0 if k != 700 else period + 1))
+    assert (deadlines.answers, deadlines.missed) == (1000, 1)
+    deadlines.answered(1003 * period, 1003 * period)  # three were never answered
+    assert (deadlines.answers, deadlines.missed) == (1004, 4)

@@ -1,6 +1,7 @@
 """Campaign files, draws, causes of failure, results and their ranking."""
 
 import math
+import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -12,7 +13,6 @@ import pytest
 from scipy.stats import binomtest, kstest
 
 from perch_core.errors import ConfigError
-from perch_core.scenario import Adhesion
 from perch_eval import demo
 from perch_eval.campaign import command as campaign
 from perch_eval.campaign import workers
@@ -26,6 +26,7 @@ from perch_eval.campaign.specification import Run, load_campaign, scenario_of
 from perch_eval.evaluation import command as evaluation
 from perch_eval.statistics import Rate, Spread
 from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.scenario import Adhesion
 
 
 def write(folder, text):
@@ -46,7 +47,8 @@ def test_draws_follow_their_distributions():
 
 
 @pytest.mark.parametrize("entry", [3.0, {}, {"uniform": [1, 2], "choice": [1]}, {"uniform": [2, 1]}, {"uniform": [1]},
-                                   {"normal": [0, 0]}, {"choice": []}, {"gauss": [0, 1]}, {"uniform": [0, 1], "low": 0}])
+                                   {"normal": [0, 0]}, {"choice": []}, {"gauss": [0, 1]}, {"uniform": [0, 1], "low": 0},
+                                   {"choice": [60.0, [75.0], 90.0]}, {"grid": [1, "a"]}, {"grid": [[1, 2], [1]]}, {"choice": [math.nan]}, {"grid": [None]}])
 def test_a_distribution_that_says_nothing_is_refused(entry):
     with pytest.raises(ConfigError, match="vary.a"):
         parse("c.yaml", "vary.a", entry)
@@ -92,7 +94,15 @@ def test_more_runs_keep_the_first_ones(tmp_path):
 @pytest.mark.parametrize("vary, words", [
     ("target.distanse: {uniform: [1.0, 2.0]}", "distanse"),
     ("target.distance: {uniform: [5.0, 6.0]}", "outside"),
-    ("wind.steady.7: {uniform: [0.0, 1.0]}", "3 entries"),
+    ("wind.steady.7: {uniform: [0.0, 1.0]}", "3 entries"), ("wind.gust_sigma.0: {uniform: [0.0, 1.0]}", "gust_sigma: .* is not of type float"),
+    ("seed: {grid: [.nan]}", "vary.seed.grid: .* are not all numbers"), ("seed: {grid: [1.5]}", "vary.seed: .* is not a grid or choice of whole numbers in .0, 2147483647."),
+    ("seed: {grid: [one]}", "vary.seed"), ("seed: {uniform: [1, 2]}", "vary.seed"), ("seed: {choice: [-1]}", "vary.seed"),
+    ("target.distance: {normal: [1.7, 0.1], low: abc}", "vary.target.distance.low: 'abc' is not a number"),
+    ("target.distance: {uniform: [.nan, 2.0]}", "vary.target.distance.uniform"), ("target.distance: {normal: [1.7, .inf]}", "normal"),
+    (", ".join(f"parameters.vio.a{k}: {{grid: [{', '.join('1' * 100)}]}}" for k in range(4)), "runs: 10000000000 flights .* are more than 20000"),
+    ("parameters.controller.snapdragon.laed: {grid: [0.1]}", "parameters.controller.snapdragon.laed: unknown"),
+    ("parameters.controller.snapdragon.lead: {uniform: [0.01, 9.0]}", "parameters.controller.snapdragon.lead: .* is outside"),
+    ("parameters.pilot.a: {grid: [1]}", "parameters.pilot"), ("vehicle: {grid: [nothing]}", "vehicle: 'nothing': unknown"),
 ])
 def test_what_no_scenario_accepts_is_refused_before_the_first_flight(tmp_path, vary, words):
     with pytest.raises(ConfigError, match=words):
@@ -157,6 +167,24 @@ def test_a_damaged_results_file_is_named_and_left_as_it_is(tmp_path):
         with pytest.raises(ResultsError, match="r.sqlite cannot be read as results"):
             Results(path, "c", "digest", resume=True)
         assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("damage", ["folder", "UPDATE runs SET vary = '{'", "UPDATE runs SET metrics = '[1]'", "UPDATE runs SET seed = 'x'",
+                                    f"UPDATE runs SET vary = '{'[' * 100_000}'", "DROP TABLE runs", "UPDATE runs SET metrics = '{\"a\": []}'"])
+def test_results_that_make_no_sense_are_refused_in_one_line(tmp_path, capsys, damage):
+    path = tmp_path / "results.sqlite"
+    if damage == "folder":
+        path.mkdir()
+    else:
+        with closing(Results(path, "c", "digest", resume=False)) as results:
+            results.add(RunResult(1, 1, "perched", "perched", ""))
+        with closing(sqlite3.connect(path)) as db, db:
+            db.execute(damage)
+    with pytest.raises(ResultsError, match="results.sqlite cannot be read as results"):
+        read_results(path)
+    assert campaign.main(["contact", "--out", str(tmp_path), "--resume"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {path} ") and len(said.splitlines()) == 1
 
 
 @pytest.mark.parametrize("folder", ["file", "file/below", "/proc/flights"])

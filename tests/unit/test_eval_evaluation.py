@@ -11,10 +11,9 @@ from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.evaluation import command
 from perch_eval.evaluation.cable import cable_of_length
 from perch_eval.evaluation.nonlinear import solve
-from perch_eval.evaluation.planning_times import PAPERS_LIMITS, waypoint_problem
+from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
 from perch_eval.evaluation.sections import Section
-from perch_planner.planner import plan
-from perch_planner.problem import PerchSettings
+from perch_planner.paper import paper_m
 
 
 def part(*claims, missing=False):
@@ -65,12 +64,11 @@ def test_the_cable_has_its_length_and_sag(share):
 
 
 @pytest.mark.parametrize("waypoints", [3, 10])
-def test_the_nonlinear_program_keeps_the_thrust_bound_and_costs_no_more_than_the_cut_plan(waypoints):
-    vehicle, settings = load_vehicle("snapdragon"), PerchSettings(thrust_max=4.5, **PAPERS_LIMITS)
-    problem = waypoint_problem(np.random.default_rng(1), waypoints)
-    planned = plan(problem, settings, vehicle)
+def test_the_nonlinear_program_keeps_the_thrust_bound_and_costs_no_more_than_the_papers_plan(waypoints):
+    vehicle = load_vehicle("snapdragon")
+    planned = paper_m.plan(waypoint_problem(np.random.default_rng(1), waypoints), SETTINGS, vehicle)
     durations = planned.trajectory.durations
-    found = solve(problem, settings, vehicle, durations, 4.5)
+    found = solve(planned.iterations[-1].program, vehicle.mass, 4.5)
     assert found.converged and found.thrust_max <= 4.5 * 1.001
 
     def snap(coefficients):

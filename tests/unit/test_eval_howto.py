@@ -1,4 +1,4 @@
-"""What the how-to guides show is valid: files load, commands are accepted, the Python example flies."""
+"""What the how-to guides show is valid: files load, commands are accepted, the Python examples fly."""
 
 import importlib
 import re
@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from perch_core.scenario import load_scenario
 from perch_core.tag_board import load_board
 from perch_eval import demo
 from perch_eval.campaign import command as campaign
 from perch_eval.campaign.specification import load_campaign
 from perch_eval.evaluation import command as evaluation
 from perch_eval.replay import command as replay
+from perch_sim.scenario import load_scenario
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -65,6 +65,9 @@ def test_python_runs(text, tmp_path, monkeypatch, capsys):
     guide = next(g for g in GUIDES if text in g.read_text())
     for yaml in re.findall(r"```yaml\n(.*?)```", guide.read_text(), re.S):
         (tmp_path / re.match(r"# \w+ (\S+)", yaml).group(1)).write_text(yaml)
+    for module in re.findall(r"```py\n(.*?)```", guide.read_text(), re.S):
+        (tmp_path / re.match(r"# (\S+)", module).group(1)).write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     exec(compile(text, guide.name, "exec"), {})
     assert capsys.readouterr().out.split()[0] in ("perched", "missed")

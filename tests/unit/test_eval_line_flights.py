@@ -2,38 +2,41 @@
 
 import numpy as np
 import pytest
-from perch_msgs.msg import Contact, Powerline, PowerlineArray
 
 from perch_core import so3
-from perch_core.ros.conversions import to_point, to_stamp
-from perch_core.ros.trajectories import sampled_message
-from perch_core.scenario import Cable, Mission, Scenario, World
 from perch_core.trajectory import SampledTrajectory
+from perch_core.values import AtEnd, Contact, MappedPowerline, PowerlineMap, TrajectoryOrder, nanoseconds
 from perch_eval.campaign.results import RunResult
 from perch_eval.evaluation import powerline_flights
 from perch_eval.evaluation.powerline import flown_sections
 from perch_eval.evaluation.powerline_flights import mapping_errors, perching_errors
 from perch_eval.evaluation.sections import FAILS, HOLDS, Effort
 from perch_eval.flight import Flight, States
+from perch_sim.scenario import Cable, Mission, Scenario, World
 
 OFFSET, TILT = np.array([0.01, -0.02, 0.02]), np.radians(4.0)  # of the flown from the planned: 3 cm, 4 deg
 
 
+def contact(time: float, state: int) -> tuple[float, Contact]:
+    """A touch with its time."""
+    return time, Contact(nanoseconds(time), state, "", 0.0, 0.0, 0.0, 0.0, "")
+
+
 class Flown(Flight):
-    """A recorded flight made here: the plan, shifted and tilted, and flown to `end`; the odometry is off by `drift`."""
+    """A flight made here: the plan, shifted and tilted, and flown to `end`; the odometry is off by `drift`."""
 
     drift = np.zeros(3)
 
-    def __init__(self, end: float, contact: float | None = None) -> None:
+    def __init__(self, end: float, touch: float | None = None) -> None:
         times = np.linspace(0.0, 3.0, 31)
         p = np.stack([times, np.zeros(31), 2.0 + 0.1 * times], axis=1)
         q = so3.quat_exp(np.stack([np.zeros(31), 0.4 * times, np.zeros(31)], axis=1))
         zero = np.zeros((31, 3))
-        plan = sampled_message(SampledTrajectory(times, p, q, np.gradient(p, times, axis=0), zero, zero, zero, np.ones((31, 4)), 10.0))
-        plan.at_end, plan.recovery_start = 3, 2.0
-        self._raw = {"trajectory": [(9.0, plan)]}
-        if contact is not None:
-            self._raw["contact"] = [(1.0, Contact(state=4)), (2.0, Contact(state=0)), (contact, Contact(state=1))]
+        plan = SampledTrajectory(times, p, q, np.gradient(p, times, axis=0), zero, zero, zero, np.ones((31, 4)), 10.0)
+        self.made = {"trajectory": [(9.0, TrajectoryOrder(1, plan, AtEnd.RECOVER, recovery_start=2.0))]}
+        if touch is not None:
+            self.made["contact"] = [contact(1.0, 4), contact(2.0, 0), contact(touch, 1)]
+        super().__init__(self.made)
         t = np.linspace(0.0, end - 10.0, 400)
         turn = so3.quat_exp(np.array([0.0, TILT, 0.0]))
         nearest = so3.quat_exp(np.stack([0 * t, 0.4 * t, 0 * t], axis=1))
@@ -53,9 +56,9 @@ def scenario(y: float = 0.0, z: float = 0.0) -> Scenario:
         Cable(start=(-3.0, 3.0, 3.0), end=(8.0, 3.0, 3.0)), Cable(start=(-3.0, y, height + z), end=(8.0, y, height + z)))))
 
 
-@pytest.mark.parametrize("contact", [None, 11.6, 12.5])
-def test_errors_are_those_that_were_put_in(contact):
-    found = perching_errors(Flown(12.8, contact), scenario(), 0.15)
+@pytest.mark.parametrize("touch", [None, 11.6, 12.5])
+def test_errors_are_those_that_were_put_in(touch):
+    found = perching_errors(Flown(12.8, touch), scenario(), 0.15)
     assert found["perching_in_map_m"] == pytest.approx(0.03, abs=1e-6)
     assert found["perching_position_m"] == pytest.approx(np.hypot(0.02, 0.02), abs=1e-6), "across the wire"
     assert found["perching_tilt_deg"] == pytest.approx(4.0, abs=0.3)  # the attitude is that of the nearest sample
@@ -71,10 +74,8 @@ def test_a_wire_elsewhere_is_an_error_and_a_drift_with_the_wire_is_none():
 def test_the_map_is_judged_in_map_and_as_the_vehicle_sees_it():
     flight, where = Flown(12.8), scenario()
     _, y, z = where.mission.perch_point
-    lines = PowerlineArray(lines=[Powerline(start=to_point(np.array([-1.0, k, z + k])), end=to_point(np.array([5.0, k, z + k])))
-                                  for k in (0.03, 1.0)])
-    lines.header.stamp = to_stamp(10.5)
-    flight._raw["powerlines"] = [(8.9, lines)]
+    lines = tuple(MappedPowerline(1, (-1.0, k, z + k), (5.0, k, z + k), 0.01, np.zeros((3, 3)), 0.0, 1) for k in (0.03, 1.0))
+    flight.made["powerlines"] = [(8.9, PowerlineMap(nanoseconds(10.5), lines, False, ""))]
     found = mapping_errors(flight, where)
     assert found["mapping_in_map_m"] == pytest.approx(np.hypot(0.03, 0.03), abs=1e-6)
     drift = np.array([0.0, 0.04, 0.02])
@@ -88,7 +89,7 @@ def test_a_flight_that_ends_before_the_perch_has_no_errors():
 
 def test_a_crash_on_the_way_is_no_error_at_the_perch():
     flight = Flown(12.8)
-    flight._raw["contact"] = [(1.0, Contact(state=4)), (2.0, Contact(state=0)), (11.6, Contact(state=3))]
+    flight.made["contact"] = [contact(1.0, 4), contact(2.0, 0), contact(11.6, 3)]
     assert set(perching_errors(flight, scenario(), 0.15).values()) == {None}
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from perch_core.scenario import load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval import consistency
 from perch_eval.estimation_flight import EstimatorTrack, Flight, motion_of
 from perch_eval.perch_motion import ImuReadings
 from perch_eval.target_sightings import estimated_body, see_target
+from perch_sim.scenario import load_scenario
 
 OFF = np.array([0.02, -0.01, 0.015])
 

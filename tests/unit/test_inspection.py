@@ -6,13 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from perch_control.mission import ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Mode, Phase, Result, State, Target
+from perch_control.mission import ControllerState, Goal, InspectionMission, Inputs, MissionSettings, Mode, Phase, Result, State, Target
 from perch_control.mission.waypoints import waypoint_lines
 from perch_control.nmpc import LineWeights, chosen_lines
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_core.lines import Segment
-from perch_core.scenario import Scenario, Start, Waypoint, load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.inspection.flight import fly
@@ -21,6 +20,7 @@ from perch_eval.inspection.layout import random_layout
 from perch_eval.inspection.measures import collisions, inspected, judge, reference_of, reference_states, segments, watched
 from perch_control.mission.parameters import MissionParameters
 from perch_control.parameters import ControllerParameters
+from perch_sim.scenario import Scenario, Start, Waypoint, load_scenario
 
 BASE = load_scenario("inspection")
 RADII = load_vehicle("rpg").body_radii
@@ -89,7 +89,7 @@ def test_a_scenario_says_what_its_nodes_fly():
                                                    (False, Result.MISSED, "inspection given up: held up")])
 def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, result, message):
     settings = MissionSettings(waypoints=(1.0, 0.0, 2.0, 0.0, 1.0, 2.0, 2.5, 10.0))
-    machine, controller, id, reference, seen, outcome = MissionMachine(settings), ControllerState.DISARMED, 0, None, [], None
+    machine, controller, id, reference, seen, outcome = InspectionMission(settings), ControllerState.DISARMED, 0, None, [], None
     machine.start(Goal(1.2, 10.0, mode=Mode.INSPECTION, perch_point=np.array([3.0, 0.0, 2.0])), 0.0)
     p, time = np.zeros(3), 0.0
     while outcome is None and time < 60.0:

@@ -7,7 +7,7 @@ from perch_core import so3
 from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, detect_lines, place)
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
-from perch_perception.powerline_mapper_node import mapping_pose
+from perch_perception.powerline_mapper import mapping_pose
 from perch_sim.rendering import Renderer
 
 

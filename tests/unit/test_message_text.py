@@ -10,6 +10,7 @@ import yaml
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from hypothesis import given
 from hypothesis import strategies as st
+from perch_core.errors import ConfigError
 from perch_msgs.msg import MotorCommand, Trajectory
 from ros_graph.commands import GraphError
 from ros_graph.interfaces import interface
@@ -68,7 +69,7 @@ def test_parts_of_messages():
     ("{x: 1", "not valid YAML"),
 ])
 def test_values_that_do_not_fit_are_refused(text, words):
-    with pytest.raises(GraphError, match=words):
+    with pytest.raises((GraphError, ConfigError), match=words):
         fill(Point(), parse(text, "message"))
 
 

@@ -1,28 +1,26 @@
 """What the report says about deadlines, from recorded diagnostics."""
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from perch_core.component import Diagnostics
+from perch_eval.flight import Flight
+from perch_eval.metrics import missed_deadlines, node_durations
 
-from perch_eval.metrics import missed_deadlines
 
-
-class Recording:
-    """The diagnostics of a flight: (node, values) in order."""
-
-    def __init__(self, *reports):
-        self.reports = reports
-
-    def messages(self, topic):
-        assert topic == "diagnostics"
-        for k, (node, values) in enumerate(self.reports):
-            status = DiagnosticStatus(name=f"/{node}", values=[KeyValue(key=a, value=str(b)) for a, b in values.items()])
-            yield float(k), DiagnosticArray(status=[status])
+def flight(*reports):
+    """A flight of diagnostics: (node, values) in order."""
+    return Flight({"diagnostics": [(float(k), Diagnostics(k, {"node": f"/{node}", **{key: str(v) for key, v in values.items()}}))
+                                   for k, (node, values) in enumerate(reports)]})
 
 
 def test_the_last_counts_of_each_node_are_reported():
-    flight = Recording(("controller", {"deadlines": 500, "missed_deadlines": 9}), ("vehicle", {"steps": 500}),
-                       ("controller", {"deadlines": 4000, "missed_deadlines": 10}), ("estimator", {"deadlines": 0, "missed_deadlines": 0}))
-    assert missed_deadlines(flight) == {"controller": {"deadlines": 4000.0, "missed": 10.0, "missed_percent": 0.25}}
+    flown = flight(("controller", {"deadlines": 500, "missed_deadlines": 9}), ("vehicle", {"steps": 500}),
+                   ("controller", {"deadlines": 4000, "missed_deadlines": 10}), ("estimator", {"deadlines": 0, "missed_deadlines": 0}))
+    assert missed_deadlines(flown) == {"controller": {"deadlines": 4000.0, "missed": 10.0, "missed_percent": 0.25}}
 
 
 def test_lockstep_has_no_deadlines():
-    assert missed_deadlines(Recording(("controller", {"steps": 500, "step_us_median": 80.0}))) == {}
+    assert missed_deadlines(flight(("controller", {"steps": 500, "step_us_median": 80.0}))) == {}
+
+
+def test_durations_are_medians_in_milliseconds_whatever_their_unit():
+    flown = flight(*(("vio", {"image_ms": v, "step_us_median": 1000 * v, "state": "running"}) for v in (9.0, 2.0, 3.0)))
+    assert node_durations(flown) == {"vio": {"image_ms": 3.0, "step_ms_median": 3.0}}

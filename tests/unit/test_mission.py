@@ -9,8 +9,8 @@ from perch_core import so3
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
-    AdhesionLimits, AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionMachine, MissionSettings, Phase,
-    PlanAnswer, Result, State, Target)
+    AdhesionLimits, AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
+    PlanAnswer, Result, State, SurfaceMission, Target)
 
 TICK = 0.02
 SURFACE = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.2]), math.pi / 2)
@@ -23,7 +23,7 @@ class World:
     def __init__(self, sees=True, plans=True, sticks=True, stays=True, recovers=True, ready=True, detour=0.0):
         self.detour, self.flown = detour, []  # what a new plan's contact is late by [s]; starts and durations of perches
         self.sees, self.plans, self.sticks, self.stays, self.recovers, self.ready = sees, plans, sticks, stays, recovers, ready
-        self.machine = MissionMachine(MissionSettings())
+        self.machine = SurfaceMission(MissionSettings())
         self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self.controller, self.trajectory_id = ControllerState.DISARMED, 0
         self.reference = self.perch_end = self.query = None

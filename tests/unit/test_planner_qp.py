@@ -8,12 +8,13 @@ from perch_core import bernstein
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_planner import full_qp, plan_checks, reference_element, solvers
-from perch_planner.contact_constraints import Contact, tube_bounds, tube_times
+from perch_planner import plan_checks, reduced_qp, reference_element, solvers
+from perch_planner.contact_constraints import Contact, conditions, tube_bounds, tube_times
 from perch_planner.cutting import limit_cuts
 from perch_planner.linear_bounds import Bounds
+from perch_planner.paper import paper_m
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
-from perch_planner.segment_program import FullSegments, ReducedSegments
+from perch_planner.reduced_rows import appended, rows_of
 from perch_planner.yaw_profile import yaw_coefficients
 
 VEHICLE = load_vehicle("snapdragon")
@@ -55,34 +56,40 @@ def test_hermite_functions_are_unit_derivatives_and_bubbles_vanish_at_the_ends()
     assert reference_element.GRAMS[4][8:, 8:] == pytest.approx(np.eye(7), abs=1e-9)
 
 
+def program(contact: Contact, durations: np.ndarray, order: int = 4, everywhere: bool = False):
+    """The reduced program with the rows of tube and window, what is given at the knots, and its values."""
+    given, values, bubbles, bounds = conditions(durations, everywhere, contact.velocity, contact.problem)
+    made = reduced_qp.assemble(durations, given, values, bubbles, reference_element.GRAMS[order], order)
+    return made, rows_of(*made, *bounds), given, values
+
+
+def solved(made, rows, solver: str = "daqp") -> np.ndarray:
+    solution = solvers.least_norm(*rows, solver)
+    assert solution.solved, (solver, solution.status, solution.residual)
+    return reduced_qp.coefficients(*made, solution.w)
+
+
 @pytest.mark.parametrize("objective, order", [("snap", 4), ("jerk", 3)])
 @pytest.mark.parametrize("waypoints, durations", [((), (1.6,)), (THREE, (0.7, 0.5, 0.5, 0.7))])
 def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
-    durations = np.array(durations)
-    contact = Contact(problem(60.0, waypoints), PerchSettings(), VEHICLE.perch_offset)
-    answers = {}
-    for make, options in ((ReducedSegments, {"bubbles": "everywhere"}), (ReducedSegments, {}), (FullSegments, {"solver": "piqp"})):
-        coefficients, solution = make(contact, durations, PerchSettings(objective=objective, **options)).solve()
-        assert solution.solved
-        answers[make, len(options)] = coefficients
-    same, default, full = answers.values()
+    asked, durations = problem(60.0, waypoints), np.array(durations)
+    settings = PerchSettings(objective=objective, tangential_speed_max=20.0)  # which the paper leaves free
+    contact = Contact(asked, settings, VEHICLE.perch_offset)
+    same, default = (solved(*program(contact, durations, order, everywhere)[:2]) for everywhere in (True, False))
+    chosen = paper_m.position_program(asked, settings, VEHICLE, durations)
+    full = chosen.coefficients(solvers.least_norm(chosen.rows, chosen.lower, chosen.upper).w)
     assert same == pytest.approx(full, abs=1e-4)
     assert cost(same, durations, order) == pytest.approx(cost(full, durations, order), rel=1e-6)
     # Without the bubbles before the tube the fourth derivative is continuous at a small price.
-    assert 1.0 - 1e-6 <= cost(default, durations, order) / cost(full, durations, order) <= 1.001
+    if order == 4:
+        assert 1.0 - 1e-6 <= cost(default, durations, order) / cost(full, durations, order) <= 1.001
 
 
 def test_solvers_find_the_same_minimum():
-    settings = PerchSettings()
-    contact = Contact(problem(80.0), settings, VEHICLE.perch_offset)
-    durations = np.array([1.2, 0.5])
-    answers = []
-    for name in solvers.available():
-        coefficients, solution = ReducedSegments(contact, durations, PerchSettings(solver=name)).solve()
-        assert solution.solved, (name, solution.status, solution.residual)
-        answers.append(coefficients)
-    for other in answers[1:]:
-        assert other == pytest.approx(answers[0], abs=1e-5)
+    made, rows, _, _ = program(Contact(problem(80.0), PerchSettings(), VEHICLE.perch_offset), np.array([1.2, 0.5]))
+    first, *others = (solved(made, rows, name) for name in solvers.SOLVERS)
+    for other in others:
+        assert other == pytest.approx(first, abs=1e-5)
 
 
 def test_least_norm_is_the_minimum_that_scipy_finds():
@@ -98,7 +105,7 @@ def test_least_norm_is_the_minimum_that_scipy_finds():
     assert answer.solved and answer.w @ answer.w == pytest.approx(peer.fun, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", solvers.available())
+@pytest.mark.parametrize("name", solvers.SOLVERS)
 def test_contradictory_bounds_are_not_called_solved(name):
     rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
     answer = solvers.least_norm(rows, np.array([1.0, 1.0]), np.array([2.0, 2.0]), name)
@@ -106,10 +113,9 @@ def test_contradictory_bounds_are_not_called_solved(name):
 
 
 def test_end_conditions_and_continuity_are_exact():
-    contact = Contact(problem(90.0, THREE), PerchSettings(), VEHICLE.perch_offset)
     durations = np.array([0.7, 0.5, 0.5, 0.7])
-    coefficients, _ = ReducedSegments(contact, durations, PerchSettings()).solve()
-    given, values = contact.knots(durations)
+    made, rows, given, values = program(Contact(problem(90.0, THREE), PerchSettings(), VEHICLE.perch_offset), durations)
+    coefficients = solved(made, rows)
     for knot in range(5):
         for order in range(5):
             sides = []
@@ -129,8 +135,7 @@ def test_waypoint_derivatives_are_met_even_where_all_are_given():
     asked = PerchProblem(problem().start, problem().surface, points)
     contact = Contact(asked, PerchSettings(), VEHICLE.perch_offset)
     durations = np.array([0.7, 0.6, 0.9])
-    coefficients, solution = ReducedSegments(contact, durations, PerchSettings()).solve()
-    assert solution.solved
+    coefficients = solved(*program(contact, durations)[:2])
     for k, waypoint in enumerate(points):
         for order, value in enumerate((waypoint.p, waypoint.v, waypoint.a, waypoint.j)):
             if value is not None:
@@ -141,31 +146,29 @@ def test_waypoint_derivatives_are_met_even_where_all_are_given():
 
 
 def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
-    settings = PerchSettings()
-    contact = Contact(problem(60.0), settings, VEHICLE.perch_offset)
     durations = np.array([1.2, 0.5])
-    for make in (ReducedSegments, FullSegments):
-        program = make(contact, durations, PerchSettings(solver="piqp"))
-        free, _ = program.solve()
-        jerk, force = (bernstein.evaluate(bernstein.derivative(free[0], k), 0.4) / durations[0]**k for k in (3, 2))
-        x = np.array([1.0, 0.0, 0.0])
-        bound = jerk[0] - 2.0 * force[0] - 1.0
-        program.add(Bounds(np.array([0, 0]), np.array([0, 0]), np.array([0.4, 0.4]), np.array([3, 2]), np.array([x, -2.0 * x]),
-                           np.array([-np.inf]), np.array([bound])))
-        cut, solution = program.solve()
-        jerk, force = (bernstein.evaluate(bernstein.derivative(cut[0], k), 0.4) / durations[0]**k for k in (3, 2))
-        assert solution.solved and jerk[0] - 2.0 * force[0] <= bound + 1e-5
+    made, rows, _, _ = program(Contact(problem(60.0), PerchSettings(), VEHICLE.perch_offset), durations)
+
+    def at(coefficients):
+        return [bernstein.evaluate(bernstein.derivative(coefficients[0], k), 0.4)[0] / durations[0]**k for k in (3, 2)]
+
+    jerk, force = at(solved(made, rows))
+    x, bound = np.array([1.0, 0.0, 0.0]), jerk - 2.0 * force - 1.0
+    cut = Bounds(np.array([0, 0]), np.array([0, 0]), np.array([0.4, 0.4]), np.array([3, 2]), np.array([x, -2.0 * x]),
+                 np.array([-np.inf]), np.array([bound]))
+    jerk, force = at(solved(made, appended(*rows, made, tuple(cut))))
+    assert jerk - 2.0 * force <= bound + 1e-5
 
 
 def test_tube_bounds_are_sorted_and_leave_room_on_every_axis():
     surface = PerchSurface.from_inclination(np.zeros(3), np.pi / 2)
     end = 3.3 * surface.normal - (0.0, 0.0, 9.81)
-    lower, upper = tube_bounds(end, PerchSettings())
+    lower, upper = tube_bounds(end, 0.1, 0.33)
     # At 90 degrees the paper's inequality [M:eq15] reads -8.829 <= z <= -10.791, which nothing satisfies, and y = 0.
     assert (lower[2], upper[2]) == pytest.approx((-10.791, -8.829))
     assert (lower[1], upper[1]) == pytest.approx((-0.33, 0.33), abs=1e-9)
     assert (lower < end).all() and (end < upper).all()
-    times = tube_times(2.0, PerchSettings())
+    times = tube_times(2.0, 0.15, 0.01)
     assert len(times) == 15 and times[0] == pytest.approx(1.85) and times[-1] == pytest.approx(1.99)
 
 
@@ -173,7 +176,7 @@ def test_full_cost_is_the_papers_integral():
     rng = np.random.default_rng(1)
     segment = rng.normal(size=15)
     expected = cost(np.array([[segment, 0 * segment, 0 * segment]]), np.array([0.7]), 4)
-    assert segment @ full_qp.cost_matrix(0.7, 4) @ segment == pytest.approx(expected, rel=1e-9)
+    assert segment @ paper_m.cost_matrix(0.7, 4) @ segment == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("order, degree", [(4, 7), (3, 5)])

@@ -40,6 +40,17 @@ def refusal(**changes) -> PlanningRefusal:
     return caught.value
 
 
+def test_the_gripper_is_where_plans_bring_it() -> None:
+    """A given pose may be as far from where a plan would end on one side as on the other."""
+    planned = request().perch
+    at_plan = PerchPose.on_line(LINE, LINE.centre, np.radians(80), VEHICLE.wire_offset, np.array([0.0, 0, 4.3]))
+    for off in (-0.045, 0.045):
+        check_request(request(perch=dataclasses.replace(planned, p_WB=at_plan.p_WB + off * planned.s3_W)), VEHICLE, PowerlineSettings())
+    for off in (-0.055, 0.055):
+        given = dataclasses.replace(planned, p_WB=at_plan.p_WB + off * planned.s3_W)
+        assert refusal(perch=given).constraint in ("gripper", "clearance [P:eq14j]")
+
+
 def test_flight_agrees_with_an_adaptive_integrator() -> None:
     rng = np.random.default_rng(0)
     start, rates, T = hover_state(MODEL, np.zeros(3), LEVEL), rng.uniform(-6, 6, (5, 4)), 0.5

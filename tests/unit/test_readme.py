@@ -15,11 +15,11 @@ import rclpy
 import yaml
 from perch_core import config
 from perch_core.ros.node import close_nodes
-from perch_core.scenario import load_scenario
 from perch_eval import demo
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
-from perch_eval.node_launch import PACKAGES
+from perch_eval.node_launch import NODES
+from perch_sim.scenario import load_scenario
 from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.qos import DurabilityPolicy
 
@@ -88,16 +88,16 @@ def test_what_the_commands_name_exists():
             load_scenario(arguments[arguments.index("--scenario") + 1])
     for arguments in named["start_stack.py"]:
         if "--without" in arguments:
-            assert arguments[arguments.index("--without") + 1] in PACKAGES
+            assert arguments[arguments.index("--without") + 1] in NODES
     for arguments in named["plan.py"]:
         assert config.find("problems", arguments[0])
     for arguments in named["bench.py"]:
         assert (ROOT / "bench" / f"{arguments[0]}.py").is_file()
     for arguments in named["run_node.py"]:
-        assert arguments[0] in PACKAGES
+        assert arguments[0] in NODES
     assert all(named[word] for word in ("demo.py", "start_stack.py", "plan.py", "bench.py"))
     for package, node in re.findall(r"ros2 run (\w+) (\w+)", README):
-        assert PACKAGES[node] == package
+        assert NODES[node].package == package
 
 
 def test_the_scenario_of_the_example_can_be_flown(tmp_path):
@@ -131,14 +131,15 @@ def nodes(tmp_path_factory):
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         rclpy.init(args=[])
         try:
-            for node in (name for name in PACKAGES if name != "vio_model"):  # the stand-in has the topics of vio
+            for node in (name for name in NODES if name != "vio_model"):  # the stand-in has the topics of vio
                 arguments = ["--ros-args", "--params-file", str(ROOT / "config" / f"{node}.yaml")]
                 if node == "recorder":
                     arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
                 if node == "viewer":
                     arguments += ["-p", "port:=0"]
-                create = importlib.import_module(f"{PACKAGES[node]}.{node}_node").create
+                create = importlib.import_module(f"{NODES[node].package}.{node}_node").create
                 created[node] = create(cli_args=arguments, use_global_arguments=False)
+                created[node].connect()
             yield created
         finally:
             close_nodes(list(created.values()))
@@ -184,7 +185,7 @@ def test_topics_have_publishers_types_and_durability_as_named(row, nodes):
 
 def test_every_published_topic_is_named(nodes):
     named = {f"/{topic.lstrip('/')}" for row in TABLES["topic"] for topic in code(row[0])}
-    own = re.compile(r"^/(parameter_events|rosout|step_report|.*/_action/.*|.*/transition_event)$")  # ROS's, and the lockstep's
+    own = re.compile(r"^/(parameter_events|rosout|.*/_action/.*|.*/transition_event)$")  # ROS's
     published = {p.topic_name for node in nodes.values() for p in node.publishers}
     assert {topic for topic in published - named if not own.match(topic)} == set()
 
@@ -203,7 +204,7 @@ def test_services_and_action(nodes):
 def test_nodes_and_executables(nodes):
     for row in TABLES["node"]:
         package, executable = code(row[1])[0].split()
-        assert PACKAGES[executable] == package and code(row[0]) == [executable]
+        assert NODES[executable].package == package and code(row[0]) == [executable]
         assert (ROOT / "config" / f"{executable}.yaml").is_file()
 
 

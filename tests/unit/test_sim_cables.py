@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.catenary import Catenary
-from perch_core.scenario import Cable, Grip, Scenario, World
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim.cable_contact import CableLine
 from perch_sim.contact_event import ContactState
 from perch_sim.plant import Plant
+from perch_sim.scenario import Cable, Grip, Scenario, World
 
 VEHICLE = load_vehicle("rpg")
 CABLE = Cable(start=(3.0, -3.0, 3.0), end=(3.0, 3.0, 3.0))

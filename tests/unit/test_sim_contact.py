@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.scenario import Adhesion, Target, load_scenario
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim.contact_event import ContactState
 from perch_sim.plant import Plant
+from perch_sim.scenario import Adhesion, Target, load_scenario
 
 SCENARIO = load_scenario("surface_90")
 VEHICLE = load_vehicle(SCENARIO.vehicle)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.errors import ConfigError
-from perch_core.scenario import Wind, load_scenario
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim import seeding
 from perch_sim.calibration import true_mount
 from perch_sim.camera_timing import CameraTiming
 from perch_sim.imu import Imu
 from perch_sim.motors import MotorCommandError, Motors
+from perch_sim.scenario import Wind, load_scenario
 from perch_sim.state_history import StateHistory, TrueState
 from perch_sim.wind import WindField
 

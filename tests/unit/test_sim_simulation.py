@@ -12,12 +12,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.scenario import Wind, load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
 from perch_sim.body import make_body
 from perch_sim.drawing import Drawing, DrawnInProcesses, DrawnOnDemand
 from perch_sim.plant import resting_state
+from perch_sim.scenario import Wind, load_scenario
 from perch_sim.simulation import SECOND, Simulation
 from perch_sim.vio_model import VioModel, VioModelParameters
 

@@ -12,6 +12,7 @@ import time
 
 import psutil
 import pytest
+from perch_eval import stack as stack_module
 from perch_eval.program import Program
 from perch_eval.stack import Stack, StackError
 
@@ -56,6 +57,7 @@ def test_each_program_gets_the_mildest_signal_that_ends_it(tmp_path, manners, co
     lines = Lines()
     stack = Stack([python("it", manners, WAIT)], tmp_path, on_line=lines)
     stack.start()
+    stack.wait_until_ready(set)
     lines.wait_for(("it", "up"))
     endings = stack.stop()
     assert endings["it"].code == code and stack.pids == {}
@@ -97,6 +99,13 @@ def test_a_program_that_ends_is_named_with_reason_and_last_lines(tmp_path):
         with pytest.raises(StackError, match="bad ended"):
             stack.raise_if_ended()
     assert (tmp_path / "bad.log").read_text() == "last words\n"
+
+
+def test_a_full_disk_ends_no_program(tmp_path):
+    (tmp_path / "talker.log").symlink_to("/dev/full")
+    with Stack([python("talker", "for k in range(20_000): print('line', k, flush=True)")], tmp_path) as stack:
+        ending, = stack.wait()
+    assert ending.code == 0 and ending.tail[-1] == "line 19999"
 
 
 def test_a_killed_program_is_named_with_the_signal(tmp_path):
@@ -142,6 +151,27 @@ def test_nodes_that_do_not_appear_are_named(tmp_path):
 def test_wait_ends_when_the_caller_is_done(tmp_path):
     with Stack([python("a", OBEDIENT, WAIT)], tmp_path) as stack:
         assert stack.wait(lambda: True) == ()
+
+
+def test_what_is_not_ready_yet_is_stopped_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(stack_module, "_ESCALATION", ((signal.SIGINT, 1000.0),))
+    lines = Lines()
+    stack = Stack([python("loading", STUBBORN, WAIT, nodes=("/loading",))], tmp_path, on_line=lines)
+    stack.start()
+    lines.wait_for(("loading", "up"))
+    assert stack.stop()["loading"].code == -signal.SIGKILL
+
+
+def test_a_second_interrupt_does_not_stop_the_stopping(tmp_path):
+    lines = Lines()
+    stack = Stack([python("it", f"import os; signal_parent = {os.getpid()}", "import signal, sys",
+                          "def leave(*_): os.kill(signal_parent, signal.SIGINT); sys.exit(0)", "signal.signal(signal.SIGINT, leave)", WAIT)],
+                  tmp_path, on_line=lines)
+    stack.start()
+    stack.wait_until_ready(set)
+    lines.wait_for(("it", "up"))
+    assert stack.stop()["it"].code == 0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="util-linux without setpriv")

@@ -1,15 +1,18 @@
 """The whole tag pipeline on rendered images: accuracy against the paper-scale bars, parts of boards, faults."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.scenario import load_scenario
+from perch_core.camera import RadialTangentialCamera
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import BoardLocalizer, CalibrationSigma, LocalizerConfig
 from perch_sim.rendering import Renderer, build_scene
+from perch_sim.scenario import load_scenario
 
 BOARD = load_board("pad_four_tags")
 MOUNT = load_vehicle("snapdragon").mounts["front"]
@@ -18,10 +21,10 @@ MOUNT = load_vehicle("snapdragon").mounts["front"]
 class Place:
     """A scenario's room with a camera that can be put anywhere."""
 
-    def __init__(self, scenario):
-        self.scenario = load_scenario(scenario)
+    def __init__(self, scenario, mount=MOUNT):
+        self.scenario, self.mount = load_scenario(scenario), mount
         self.surface = self.scenario.surface
-        self.renderer = Renderer(build_scene(self.scenario, seed=3), MOUNT, seed=1)
+        self.renderer = Renderer(build_scene(self.scenario, seed=3), mount, seed=1)
         self.rng = np.random.default_rng(11)
 
     def hover(self):
@@ -33,7 +36,7 @@ class Place:
 
     def errors(self, p_WB, R_WB, board):
         """Position [m] and attitude [rad] errors of a pose in the camera."""
-        p_WC, R_WC = MOUNT.pose(p_WB, R_WB)
+        p_WC, R_WC = self.mount.pose(p_WB, R_WB)
         p_CS = R_WC.T @ (self.surface.p_WS - p_WC)
         R_CS = R_WC.T @ self.surface.R_WS
         return np.linalg.norm(p_CS - board.p_CS), np.linalg.norm(so3.log(R_CS @ board.R_CS.T))
@@ -70,6 +73,22 @@ def test_joint_pose_keeps_the_accuracy_bars(places, scenario, centimetres, degre
     assert 100 * np.median(error[:, 0]) <= centimetres
     assert np.degrees(np.median(error[:, 1])) <= degrees
     assert np.degrees(np.percentile(error[:, 1], 90)) <= 2.0
+
+
+@pytest.mark.parametrize("coefficients", [(-0.12, 0.012, 4e-4, -3e-4, 0.0), (0.4, 0.1, 2e-4, -1e-4, 0.01, 0.6, 0.2, 0.02)],
+                         ids=["plumb_bob", "rational_polynomial"])
+def test_a_radial_tangential_lens_is_as_good(coefficients):
+    """At rest and in motion: search, tracking and following, medians inside the same bars."""
+    mount = replace(MOUNT, camera=RadialTangentialCamera(640, 480, 300.0, 301.0, 318.0, 242.0, coefficients))
+    place, found = Place("surface_90", mount), []
+    localizer = BoardLocalizer(BOARD, mount)
+    for k in range(12):
+        p, R = np.array([0.05 * k, 0.02 * k, 1.2]), so3.exp(np.array([0.0, -0.02 * k, 0.02 * k]))
+        result = localizer.process(place.image(p, R), k / 30, body(k / 30, p, R))
+        assert result.board is not None, result.message
+        found.append(place.errors(p, R, result.board))
+    error = np.median(found, axis=0)
+    assert error[0] < 0.005 and np.degrees(error[1]) < 0.3
 
 
 def test_tracks_through_fast_motion_with_the_vehicles_own_state(places):

@@ -1,13 +1,11 @@
-"""Body states at image stamps, images that wait for them, and pixels out of messages."""
-
-from types import SimpleNamespace
+"""Body states at image stamps, and pixels of images."""
 
 import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.camera import PinholeCamera
+from perch_core.values import CameraImage
 from perch_perception.images import ImageError, image_array, mono_image, rgb_image
-from perch_perception.pending_images import PendingImages
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -59,59 +57,38 @@ def test_refuses_states_that_go_back_or_are_not_finite_and_forgets_old_ones():
         buffer.at(1.5)
 
 
-def image(ns):
-    return SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=ns // 10**9, nanosec=ns % 10**9)))
+def image(pixels, encoding, **changes):
+    fields = dict(stamp=0, frame="", width=8, height=4, encoding=encoding, pixels=pixels)
+    return CameraImage(**{**fields, **changes})
 
 
-def test_an_image_waits_for_the_odometry_after_its_exposure():
-    handled = []
-    pending = PendingImages(-0.008, lambda msg, exposed, why: handled.append((round(exposed, 6), why)))
-    pending.add(image(100_000_000), 0.1, keep_all=True)  # exposed at 0.108 s
-    assert handled == []
-    pending.advance(0.106)
-    assert handled == []
-    pending.advance(0.108)
-    assert handled == [(0.108, "")]
-
-
-def test_every_image_is_answered_once_also_the_bad_ones():
-    handled = []
-    pending = PendingImages(0.0, lambda msg, exposed, why: handled.append((exposed, why)))
-    for ns in (100, 100, 50, 5000):  # ms: repeated, back in time, far in the future
-        pending.add(image(ns * 1_000_000), 0.2, keep_all=True)
-    assert [h[0] for h in handled] == [0.1, 0.1, 0.05, 5.0]
-    assert handled[0][1] == ""
-    assert "not newer" in handled[1][1] and "not newer" in handled[2][1] and "ahead of the odometry" in handled[3][1]
-    pending.add(image(200_000_000), 0.2, keep_all=True)  # the future stamp did not spoil the order
-    assert handled[-1] == (0.2, "")
-
-
-def test_real_time_drops_the_oldest_lockstep_none():
-    for keep_all, dropped in ((True, 0), (False, 3)):
-        handled = []
-        pending = PendingImages(0.0, lambda msg, exposed, why: handled.append(why))
-        for k in range(5):
-            pending.add(image((100 + k) * 1_000_000), 0.0, keep_all=keep_all)
-        assert (pending.dropped, len(handled)) == (dropped, dropped)
-        pending.advance(1.0)
-        assert len(handled) == 5
-
-
-def test_pixels_of_messages():
+def test_pixels_of_images():
     camera = PinholeCamera(width=8, height=4, fx=5, fy=5, cx=4, cy=2)
     rgb = np.arange(8 * 4 * 3, dtype=np.uint8).reshape(4, 8, 3)
-    padded = np.zeros((4, 32), np.uint8)
-    padded[:, :24] = rgb.reshape(4, 24)
-    msg = SimpleNamespace(height=4, width=8, encoding="rgb8", step=32, data=padded.tobytes())
-    np.testing.assert_array_equal(rgb_image(msg, camera), rgb)
-    np.testing.assert_allclose(mono_image(msg, camera), rgb @ [0.299, 0.587, 0.114], atol=1.0)
-    msg.encoding = "bgr8"
-    np.testing.assert_array_equal(rgb_image(msg, camera), rgb[..., ::-1])
-    mono = SimpleNamespace(height=4, width=8, encoding="mono8", step=8, data=rgb[..., 0].tobytes())
-    np.testing.assert_array_equal(image_array(mono, camera), rgb[..., 0])
+    grey = rgb @ [0.299, 0.587, 0.114]
+    np.testing.assert_array_equal(rgb_image(image(rgb, "rgb8"), camera), rgb)
+    np.testing.assert_allclose(mono_image(image(rgb, "rgb8"), camera), grey, atol=1.0)
+    for encoding in ("bgr8", "8UC3"):
+        np.testing.assert_array_equal(rgb_image(image(rgb, encoding), camera), rgb[..., ::-1])
+        np.testing.assert_allclose(mono_image(image(rgb[..., ::-1], encoding), camera), grey, atol=1.0)
+    for encoding in ("mono8", "8UC1"):
+        np.testing.assert_array_equal(mono_image(image(rgb[..., 0], encoding), camera), rgb[..., 0])
     with pytest.raises(ImageError, match="no colour"):
-        rgb_image(mono, camera)
-    for change, why in (({"encoding": "16UC1"}, "16UC1"), ({"width": 9}, "9 x 4"), ({"step": 4}, "too few"),
-                        ({"data": b"123"}, "too few")):
+        rgb_image(image(rgb[..., 0], "mono8"), camera)
+    mono = rgb[..., 0]
+    for change, why in (({"encoding": "16UC1"}, "16UC1"), ({"width": 9}, "9 x 4"), ({"pixels": mono[:2]}, "are not mono8"),
+                        ({"pixels": lambda region: None}, "no pixels"), ({"encoding": "rgb8"}, "are not rgb8")):
         with pytest.raises(ImageError, match=why):
-            image_array(SimpleNamespace(**{**mono.__dict__, **change}), camera)
+            image_array(image(**{**dict(pixels=mono, encoding="mono8"), **change}), camera)
+
+
+def test_only_the_region_asked_for_is_drawn():
+    camera, asked = PinholeCamera(width=8, height=4, fx=5, fy=5, cx=4, cy=2), []
+
+    def draw(region):
+        asked.append(region)
+        return np.zeros((4, 8), np.uint8)
+
+    region = (slice(1, 3), slice(2, 5))
+    mono_image(image(draw, "mono8"), camera, region)
+    assert asked == [region]

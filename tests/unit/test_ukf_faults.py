@@ -9,10 +9,10 @@ from unit.estimator_flight import MS, Flight
 
 
 def test_coasts_without_vio_grows_its_covariance_and_recovers():
-    flight = Flight(7).fly(end=1500)
+    flight = Flight(7).fly(end=2300)
     before = flight.sigma()[:3].max()
-    kept, flight.poses = flight.poses, {k: v for k, v in flight.poses.items() if not 1500 - 25 <= k < 1900}
-    for k in range(1500, 1880):
+    kept, flight.poses = flight.poses, {k: v for k, v in flight.poses.items() if not 2300 - 25 <= k < 2700}
+    for k in range(2300, 2680):
         flight.step(k)
     assert flight.estimator.status.health is Health.COASTING
     assert flight.estimator.status.vio_age > 0.5  # longer than the kept IMU history
@@ -20,7 +20,7 @@ def test_coasts_without_vio_grows_its_covariance_and_recovers():
     assert coasting > 1.5 * before
     assert np.abs(flight.error()[:3]).max() < 5 * coasting
     flight.poses = kept
-    flight.fly(1880, 2100)
+    flight.fly(2680, 2900)
     assert flight.estimator.status.health is Health.RUNNING
     assert flight.sigma()[:3].max() < coasting
     flight.assert_sane()
@@ -75,18 +75,15 @@ def test_a_jump_of_vios_map_is_gated_first_and_accepted_when_it_lasts():
     assert np.abs(flight.error()[:3]).max() < 0.1  # the jump is not followed while it is gated
     flight.fly(1600, 2200)
     assert flight.estimator.status.health is Health.RUNNING
-    assert flight.sigma()[0] > 0.2  # it cannot know which of both was right, and says so
+    np.testing.assert_allclose(flight.error()[:3], [-0.5, 0.0, 0.0], atol=0.06)  # VIO's map is the map
     flight.assert_sane()
 
 
 @pytest.mark.parametrize(("make", "outcome"), [
-    (lambda s: replace(s, w_B=(float("nan"), 0.0, 0.0)), ImuOutcome.NOT_FINITE),
-    (lambda s: replace(s, f_B=(0.0, float("inf"), 0.0)), ImuOutcome.NOT_FINITE),
-    (lambda s: replace(s, w_B=(34.0, 0.0, 0.0)), ImuOutcome.SATURATED),
-    (lambda s: replace(s, f_B=(0.0, 0.0, -156.0)), ImuOutcome.SATURATED),
-    (lambda s: replace(s, stamp=s.stamp - 20 * MS), ImuOutcome.NOT_NEWER),
+    (lambda s: s._replace(w_B=(34.0, 0.0, 0.0)), ImuOutcome.SATURATED),
+    (lambda s: s._replace(f_B=(0.0, 0.0, -156.0)), ImuOutcome.SATURATED),
 ])
-def test_bad_imu_samples_are_bridged_with_a_larger_covariance(make, outcome):
+def test_saturated_imu_samples_count_with_a_larger_covariance(make, outcome):
     good, bad = Flight(12).fly(end=1500), Flight(12).fly(end=1500)
     for k in range(1500, 1505):
         good.step(k)
@@ -94,9 +91,8 @@ def test_bad_imu_samples_are_bridged_with_a_larger_covariance(make, outcome):
         assert bad.estimator.add_imu(make(bad.sample(k))) is outcome
         assert outcome.value in bad.estimator.status.message
     bad.assert_sane()
-    if outcome is not ImuOutcome.NOT_NEWER:
-        assert np.all(bad.sigma()[:9] >= 0.99 * good.sigma()[:9])
-        assert bad.sigma()[3:9].max() > 1.2 * good.sigma()[3:9].max()
+    assert np.all(bad.sigma()[:9] >= 0.99 * good.sigma()[:9])
+    assert bad.sigma()[3:9].max() > 1.2 * good.sigma()[3:9].max()
     bad.fly(1505, 2000)
     assert np.linalg.norm(bad.error()[:3]) < 0.15
     bad.assert_sane()
@@ -115,7 +111,25 @@ def test_an_imu_gap_grows_the_covariance_and_heals():
     flight.assert_sane()
 
 
+@pytest.mark.parametrize(("make", "outcome"), [
+    (lambda s: s._replace(w_B=(float("nan"), 0.0, 0.0)), ImuOutcome.NOT_FINITE),
+    (lambda s: s._replace(f_B=(0.0, float("inf"), 0.0)), ImuOutcome.NOT_FINITE),
+    (lambda s: s._replace(f_B=(0.0, 1e30, 0.0)), ImuOutcome.NOT_FINITE),
+    (lambda s: s._replace(stamp=s.stamp - 20 * MS), ImuOutcome.NOT_NEWER),
+])
+def test_refused_imu_samples_leave_no_trace(make, outcome):
+    """They may be another writer's, with the stamps of the good ones that come after them."""
+    good, bad = Flight(12).fly(end=1500), Flight(12).fly(end=1500)
+    for k in range(1500, 1600):
+        assert bad.estimator.add_imu(make(bad.sample(k))) is outcome
+        assert outcome.value in bad.estimator.status.message
+        bad.step(k)
+        good.step(k)
+    np.testing.assert_array_equal(bad.estimator.estimate.p_WB, good.estimator.estimate.p_WB)
+    np.testing.assert_array_equal(bad.estimator.estimate.P, good.estimator.estimate.P)
+
+
 def test_a_first_sample_that_is_not_finite_is_refused():
     estimator = Estimator()
-    assert estimator.add_imu(ImuSample(0, (float("nan"),) * 3, (0.0, 0.0, 9.81))) is ImuOutcome.EMPTY
+    assert estimator.add_imu(ImuSample(0, (float("nan"),) * 3, (0.0, 0.0, 9.81))) is ImuOutcome.NOT_FINITE
     assert estimator.estimate is None

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 
 from perch_core import config
 from perch_core.errors import ConfigError
 from perch_core.rigid_body import accelerations, attitude_rate
-from perch_core.scenario import Scenario, load_scenario
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
+from perch_sim.scenario import Scenario, load_scenario
+from perch_sim.scenario_files import scenario_mapping
 
 
 def test_snapdragon_has_the_papers_thrust_range():
@@ -45,13 +45,19 @@ def test_hover_is_an_equilibrium_and_spin_follows_euler():
     assert np.allclose(attitude_rate(np.eye(3), w) @ np.array([1.0, 0, 0]), np.cross(w, [1.0, 0, 0]))
 
 
-def test_a_vehicle_that_cannot_lift_itself_is_refused(tmp_path):
-    content = yaml.safe_load(config.find("vehicles", "snapdragon").read_text())
-    content["mass"] = 0.6
-    path = tmp_path / "heavy.yaml"
-    path.write_text(yaml.safe_dump(content))
-    with pytest.raises(ConfigError, match="cannot lift 0.6 kg"):
-        config.load(Vehicle, path)
+@pytest.mark.parametrize("change, words", [
+    ({"mass": 0.6}, "cannot lift 0.6 kg"), ({"rotor_yaw_sign": [1000, -1, 1, -1]}, "rotor_yaw_sign: 1000 is outside [-1, 1]"),
+    ({"rotor_yaw_sign": [1, 0, 1, -1]}, "are not each 1 or -1"), ({"rotor_yaw_sign": [1, 1, 1, 1]}, "without moment"),
+    ({"rotor_xy": [[0.1, 0.1]] * 4}, "without moment"), ({"rotor_xy": [[math.inf, 0.1]] * 4}, "rotor_xy: inf is outside [-5, 5] m"),
+    ({"inertia": [9e18, 9e18, 9e18]}, "inertia: 9e+18 is outside (0, 10] kg m^2"), ({"inertia": [6e-4, 5e-4, 2e-3]}, "which no body has"),
+    ({"inertia": [6e-2, 6e-2, 6e-2]}, "can have"), ({"thrust_coefficient": 1e-3}, "is outside (0, 1000] N"), ({"speed_min": 1700.0}, "cannot come down"),
+    ({"body_rate_max": 1e9}, "body_rate_max: 1e+09 is outside (0, 10000] rad/s"), ({"name": "../x"}, "'../x' is no name"), ({"cameras": {"a/b": {}}}, "'a/b' is no name"),
+])
+def test_a_vehicle_that_no_vehicle_can_be_is_refused(change, words):
+    content = config.read_yaml(config.find("vehicles", "snapdragon"))
+    with pytest.raises(ConfigError) as error:
+        config.from_mapping(Vehicle, content | change, "x.yaml")
+    assert words in str(error.value)
 
 
 @pytest.mark.parametrize("name", sorted(p.stem for p in (config.config_dir() / "scenarios").glob("*.yaml")))
@@ -83,8 +89,48 @@ def test_surface_faces_the_start():
     ({"nodes": ["vehicle", "pilot"]}, "'pilot' is not one of"),
     ({"parameters": {"pilot": {}}}, "parameters.pilot"),
     ({"targett": {}}, "unknown key"),
+    ({"mode": "powerline"}, "world.cables: has 0 entries, outside [1, 100]"),
+    ({"world": {"cables": [{"start": [1.0, 0.0, 2.0], "end": [1.0, 0.0, 2.0]}]}}, "world.cables[0]: cable: both ends"),
+    ({"world": {"cables": [{"start": [0.0, 0.0, 2.0], "end": [4.0, 0.0, 2.0], "sag": 1e3}]}}, "world.cables[0].sag: 1000 m is outside [0, 4] m"),
+    ({"name": "../../x"}, "'../../x' is no name"), ({"vehicle": "../vehicles/rpg", "name": "a" * 101}, "is no name"),
+    ({"start": {"position": [1e9, 0.0, 0.0]}}, "start.position: 1e+09 is outside [-10000, 10000] m"),
+    ({"inspection": {"watched": [math.nan, 0.0, 0.0]}}, "inspection.watched: nan is outside [-10000, 10000] m"),
 ])
 def test_scenarios_that_cannot_be_flown_are_refused(change, words):
     with pytest.raises(ConfigError) as error:
         config.from_mapping(Scenario, {"name": "x"} | change, "x.yaml")
     assert words in str(error.value) and "x.yaml" in str(error.value)
+
+
+def write(folder, **files):
+    for name, content in files.items():
+        (folder / f"{name}.yaml").write_text(content)
+
+
+def test_a_scenario_takes_over_what_it_does_not_say_itself(tmp_path):
+    write(tmp_path, mine="extends: line_80\nname: mine\nmission: {perch_pitch_deg: 60.0}\nworld: {cables: [{start: [4.0, -2.0, 4.0], end: [4.0, 2.0, 4.0]}]}\n"
+                         "parameters: {vio: {tracker.crowding: 0.7}, estimator: {imu.gyro_noise: 0.02}}\n",
+          theirs="extends: mine.yaml\nname: theirs\nmission: {replan: false}\n")
+    mine, base = load_scenario(tmp_path / "theirs.yaml"), load_scenario("line_80")
+    assert (mine.name, mine.vehicle, mine.mode) == ("theirs", base.vehicle, "powerline")
+    assert mine.mission.perch_pitch_deg == 60.0 and not mine.mission.replan and mine.mission.takeoff_height == base.mission.takeoff_height
+    assert len(mine.world.cables) == 1 and mine.world.room == base.world.room  # lists are replaced, mappings merged
+    assert mine.parameters["vio"] == {**base.parameters["vio"], "tracker.crowding": 0.7}
+    assert mine.parameters["controller"] == base.parameters["controller"]
+    assert "extends" not in scenario_mapping(tmp_path / "theirs.yaml")
+
+
+@pytest.mark.parametrize("start, words", [
+    ("a", "a.yaml extends {0}/b.yaml extends {0}/a.yaml: extends: the files extend each other in a circle"),
+    ("lost", "lost.yaml extends {0}/gone.yaml: extends: scenarios: nowhere: unknown; there are: inspection, line_180"),
+    ("missing", "missing.yaml: extends: {0}/none.yaml: no such file"),
+    ("odd", "odd.yaml: extends: 3 is neither a name in config/scenarios nor a file"),
+    ("listed", "listed.yaml extends {0}/list.yaml: [1] is not a mapping"),
+])
+def test_files_that_cannot_be_extended_are_refused_with_their_chain(tmp_path, start, words):
+    write(tmp_path, a="extends: b.yaml\nname: a\n", b="extends: a.yaml\nname: b\n", lost="extends: gone.yaml\nname: lost\n",
+          gone="extends: nowhere\n", missing="extends: none.yaml\nname: missing\n", odd="extends: 3\nname: odd\n",
+          listed="extends: list.yaml\nname: listed\n", list="[1]\n")
+    with pytest.raises(ConfigError) as error:
+        load_scenario(tmp_path / f"{start}.yaml")
+    assert words.format(tmp_path) in str(error.value)

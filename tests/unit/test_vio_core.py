@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.camera import PinholeCamera
+from perch_core.camera import PinholeCamera, RadialTangentialCamera
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion
 from perch_perception.vio import bearing, ekf, lens
@@ -64,7 +64,10 @@ def test_residual_jacobians_are_those_of_finite_differences():
         np.testing.assert_allclose(linear.J[:, :, getattr(bearing, name)], numeric, atol=1e-7, err_msg=name)
 
 
-@pytest.mark.parametrize("camera", [MOUNT.camera, PinholeCamera(640, 480, 275.0, 275.0, 320.0, 240.0)])
+@pytest.mark.parametrize("camera", [
+    MOUNT.camera, PinholeCamera(640, 480, 275.0, 275.0, 320.0, 240.0),
+    RadialTangentialCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (-0.1, 0.01, 0.0, 0.0, 0.0)),
+    RadialTangentialCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.4, 0.1, 0.0, 0.0, 0.01, 0.6, 0.2, 0.02))])
 @pytest.mark.parametrize("column, name", list(enumerate(("fx", "fy", "cx", "cy"))))
 def test_the_lens_derivatives_are_those_of_another_lens(camera, column, name):
     rng = np.random.default_rng(2)

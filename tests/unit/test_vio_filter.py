@@ -7,7 +7,8 @@ import pytest
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.perch_motion import PerchMotion, read_imu
-from perch_perception.ukf.imu_buffer import ImuBuffer, ImuSample
+from perch_core.values import ImuSample
+from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.vio import VioConfig
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import observe

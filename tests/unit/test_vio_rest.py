@@ -1,7 +1,10 @@
 """Standing still as VIO sees it before it sees anything: on the ground, after a shake, and when the vehicle has gone for good."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import ImuSample
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
@@ -38,3 +41,64 @@ def test_a_steady_climb_is_not_rest():
     late = [(o, z) for t, o, z in seen if t > 1.5]
     assert not any(o is FrameOutcome.RESTING for o, _ in late)
     assert late[-1][1] == pytest.approx(0.015 + 0.3 * (seen[-1][0] - 1.1), abs=0.05)
+
+
+ATTITUDES = {"ground": np.zeros(3), "wall": np.array([0.1, -1.5, 0.2]), "upside down": np.array([3.0, 0.2, 0.0])}
+
+
+def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
+    """A vehicle that rests, whose IMU's biases walk; its camera sees noise, or nothing.
+
+    Returns:
+        The odometry; outcomes; error (15,) and covariance of (p, v, theta, b_g, b_a) at the times; `fly`, which goes on to a time with a force.
+    """
+    config, rng, mount = VioConfig(), np.random.default_rng(seed), load_vehicle("snapdragon").mounts["down"]
+    imu, R = config.imu, so3.exp(ATTITUDES[attitude])
+    p, sigma = np.array([0.5, 0.2, 1.2]), np.array([0.001] * 3)
+    vio = VisualInertialOdometry(config, mount, p + rng.normal(0.0, sigma), 0.0)
+    vio._known = replace(vio._known, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, config.start.yaw_sigma)]) @ R)  # as a filter that was lost here left it
+    bias = rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
+    walk, noise = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(rate), np.repeat([imu.gyro_noise, imu.accel_noise], 3)
+    seen, frame, k = [], 0.1, 0
+    images = [np.clip(rng.normal(3 if dark else 110, 1 if dark else 4, (480, 640)), 0, 255).astype(np.uint8) for _ in range(4)]
+
+    def fly(until, force=np.zeros(3)):
+        nonlocal bias, frame, k
+        while k / rate < until:
+            k += 1
+            bias = bias + walk * rng.normal(size=6)
+            read = bias + noise * rng.normal(size=6)
+            vio.add_imu(ImuSample(round(1e9 * k / rate), tuple(read[:3]), tuple(read[3:] + R.T @ (force + [0.0, 0.0, 9.81]))))
+            if k / rate > frame + 0.05:
+                result = vio.add_image(round(frame * 1e9), images[len(seen) % 4])
+                seen.append(result.outcome)
+                frame += 1 / fps
+        s = vio.filter.state
+        return np.concatenate([p - s.p_WB, -s.v_WB, so3.log(s.R_WB.T @ R), bias[:3] - s.gyro_bias, bias[3:] - s.accel_bias]), \
+            (result.estimate.P if result.estimate else None)
+
+    return vio, seen, [fly(time) for time in times], fly
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES)
+@pytest.mark.parametrize("dark", [False, True])
+def test_rest_in_any_attitude_is_known_for_long_and_honestly(attitude, dark):
+    """Minutes; what does not grow in these does not grow in an hour (one was run once: docs/estimation.md)."""
+    _, outcomes, ((_, before), (error, after)), _ = rest(1, attitude, (30.0, 120.0), dark)
+    assert set(outcomes[2:]) == {FrameOutcome.RESTING}
+    np.testing.assert_allclose(np.sqrt(np.diag(after))[:9], np.sqrt(np.diag(before))[:9], rtol=0.05)
+    assert error @ np.linalg.solve(after, error) < 37.7  # chi2, 15, 99.9 %
+    assert np.abs(error[9:12]).max() < 0.002  # the gyro's bias walked by 0.002
+
+
+def test_errors_at_rest_are_as_large_as_the_covariance_says():
+    ends = [rest(seed, "wall", (10.0,), True)[2][-1] for seed in range(12)]
+    assert 10.0 < np.mean([e @ np.linalg.solve(P, e) for e, P in ends]) < 21.0  # chi2, 15 x 12, 99.9 %, about
+
+
+def test_a_departure_from_a_wall_in_the_dark_is_noticed():
+    vio, outcomes, _, fly = rest(2, "wall", (5.0,), True, fps=30.0)
+    fly(5.6, force=np.array([-2.0, 0.0, 0.0]))
+    assert outcomes[-1] in (FrameOutcome.LEAVING, FrameOutcome.BLIND)
+    dt = vio.filter.state.stamp * 1e-9 - 5.0
+    assert vio.filter.state.v_WB[0] == pytest.approx(-2.0 * dt, abs=0.1)

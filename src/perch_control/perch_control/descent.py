@@ -16,11 +16,12 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.law import moment
 from perch_control.geometric.step import rotors_for
-from perch_control.persistent import Persistent
+from perch_control.debounce import Debounce
 from perch_control.settings import GeometricGains
 
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]
 _SETTLE_TIME = 0.3  # the change of thrust at the beginning is over [s]
+_MEAN_TIME = 0.1    # of the specific force [s]
 _LEAK = 4.0         # the velocity is forgotten with this time constant [s]
 _BOUNCE = 0.5       # after a touch nothing has to be said for so long [s]
 _TOUCHED_SHARE = 0.4  # thrust / weight after a touch
@@ -69,7 +70,7 @@ class BlindDescent:
         self.attitude = AttitudeByImu(tuple(q), tuple(w))
         self.v_W = tuple(v) if norm(v) < _KNOWN_SPEED else (0.0, 0.0, 0.0)
         self._stamp, self._start = now, now
-        self._rest, self._force = Persistent(_REST_TIME), GRAVITY
+        self._rest, self._force = Debounce(_REST_TIME), GRAVITY
         self._touched: float | None = None  # when the ground was hit [s]
         self.landed = False
 
@@ -83,7 +84,7 @@ class BlindDescent:
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))
         # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `descent_share` of it.
         middle = 0.5 * (1.0 + self._settings.descent_share) * GRAVITY
-        self._force += 0.02 * (norm(accel) - self._force)  # 0.1 s mean: rotor vibration is ten times the difference
+        self._force += dt / _MEAN_TIME * (norm(accel) - self._force)  # rotor vibration is ten times the difference
         calm = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
         resting = self._rest.update(calm and middle < self._force < 1.1 * GRAVITY, stamp)
         begun = stamp - self._start > _SETTLE_TIME

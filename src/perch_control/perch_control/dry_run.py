@@ -14,9 +14,9 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.l1 import L1Augmentation, L1Settings
 from perch_control.modes import Command, State
+from perch_control.period import NOMINAL_PERIOD
 from perch_control.reference import FlatReference
 from perch_control.settings import GeometricGains
-from perch_core.timing import CONTROL_PERIOD
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import GRAVITY, Vehicle
 
@@ -32,14 +32,14 @@ class _DryRun:
     def step(self, count: int = 3) -> None:
         """Let periods pass."""
         for _ in range(count):
-            self.time += CONTROL_PERIOD
+            self.time += NOMINAL_PERIOD
             p, v = self._expected()
             self.flight.imu(self.time, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
             self.flight.step(self.time, (*p, *v, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 
     def follow(self, id: int, end: float, at_end: AtEnd) -> None:
         """Take a trajectory to a height [m]."""
-        start = self.time + CONTROL_PERIOD
+        start = self.time + NOMINAL_PERIOD
         path = rest_to_rest(np.array(self._expected()[0]), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE, start_time=start)
         self.flight.follow(Order(id, FlatReference(path), start, at_end))
 
@@ -64,7 +64,7 @@ def dry_run(vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, l
     flight.command(Command.ARM)
     seen.append(flight.state)
     run.follow(1, 0.2, AtEnd.HOLD)
-    run.step(round(_RISE / CONTROL_PERIOD) + 5)
+    run.step(round(_RISE / NOMINAL_PERIOD) + 5)
     seen.append(flight.state)
     run.follow(2, 0.4, AtEnd.CONTACT)
     run.step()
@@ -77,6 +77,6 @@ def dry_run(vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, l
     seen.append(flight.state)
     flight.step_blind(run.time + 0.1)
     for k in range(1, 4):
-        flight.imu(run.time + 0.1 + k * CONTROL_PERIOD, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
-        flight.step_blind(run.time + 0.1 + k * CONTROL_PERIOD)
+        flight.imu(run.time + 0.1 + k * NOMINAL_PERIOD, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
+        flight.step_blind(run.time + 0.1 + k * NOMINAL_PERIOD)
     return seen

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any, Protocol
 
 from perch_core.vector3 import axes_of, axpy, norm
 from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.flight_settings import FlightSettings
-from perch_control.geometric import ControlOutput, packed_vehicle
-from perch_control.geometric.controller import NO_COMPENSATION
+from perch_control.geometric import packed_vehicle
 from perch_control.geometric.step import predicted
 from perch_control.guidance import Running
 from perch_control.l1 import L1Augmentation
+from perch_control.law import NO_COMPENSATION, Law
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.odometry_gate import OdometryGate, Verdict
-from perch_control.reference import Following
+from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import RotorEstimate, thrusts
 from perch_control.schedule import Schedule
@@ -26,27 +25,8 @@ from perch_control.smooth_position import SmoothPosition
 from perch_control.supervisor import Supervisor
 from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 
-_SPARE_SHARE = 0.01          # weight of a step in the mean margin: 0.2 s
+_SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
-
-
-class Law(Protocol):
-    """A control law: geometric or NMPC."""
-
-    name: str
-
-    def begin(self) -> None:
-        """The law takes over: what it remembers of an earlier flight does not count."""
-
-    def believe(self, vehicle: Vehicle) -> None:
-        """Fly a vehicle whose thrust differs from what its file says."""
-
-    def prepare(self, source: Any, contact: bool, running: Running | None = None) -> Any:
-        """The reference to follow for a trajectory, which ends in a contact or not, and takes over from a running reference."""
-
-    def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
-                compensation: tuple[float, ...], time_to_contact: float) -> ControlOutput:
-        """Rotor commands for one period."""
 
 
 class FlightController:
@@ -67,6 +47,7 @@ class FlightController:
         self._refused = ""
         self._schedule = Schedule(self.maneuvers)
         self._smooth = SmoothPosition()
+        self._period = MeasuredPeriod()
 
     @property
     def settings(self) -> FlightSettings:
@@ -80,6 +61,7 @@ class FlightController:
         self.law, self.maneuvers.gains, self.maneuvers.settings = law, gains, settings
         self.health.settings = settings.rotors
         law.believe(self.vehicle)
+        law.pace(self._period.value)
         self.gate.limits = settings.odometry
         self.supervisor.restart()
 
@@ -150,13 +132,13 @@ class FlightController:
         m = self.maneuvers
         if m.state is State.ARMED or m.flying:
             return
-        if m.state is not State.DISARMED:
+        if m.state not in (State.DISARMED, State.ATTACHED):
             raise CommandRefused(f"arm is refused: {m.state.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry.timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({self._refused})" if self._refused else ""))
         self._thrust.reset(self.law, self.compensator)
-        if m.attached_to is not None:
-            m.recover("came off the surface")
+        if m.state is State.ATTACHED:
+            m.recover("leaving what carries the vehicle")
             return
         if axes_of(m.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
@@ -171,7 +153,9 @@ class FlightController:
             TrajectoryRefused: it may not be flown.
         """
         m = self.maneuvers
-        if m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
+        if m.state is State.ATTACHED:
+            self._thrust.reset(self.law, self.compensator)
+        elif m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {m.state.name.lower()}, not armed and ready")
         if m.state is State.HOVERING and order.at_end is not AtEnd.HOLD and self._spare < self.settings.margin_perch:
             raise TrajectoryRefused(f"the thrust margin in hover is {self._spare:.2f}; a perch needs {self.settings.margin_perch:g}")
@@ -203,6 +187,7 @@ class FlightController:
         Its time also shows that odometry with an old stamp is late.
         """
         self._imu_stamp, self._thrust.felt = stamp, accel[2]
+        self.supervisor.imu(stamp, gyro, accel)
         if self.maneuvers.blind is not None:
             self.maneuvers.blind.imu(stamp, gyro, accel)
         else:
@@ -218,6 +203,8 @@ class FlightController:
             sample: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
         """
         m = self.maneuvers
+        if self._period.update(stamp):
+            self.law.pace(self._period.value)
         # Odometry that repeats itself does not stop the time.
         dt = self._advance(stamp if stamp > m.now else max(m.now, self._imu_stamp))
         verdict = self.gate.check(stamp, sample)
@@ -237,10 +224,13 @@ class FlightController:
         return self._fly() if m.flying else self._idle()
 
     def step_blind(self, stamp: float) -> StepResult:
-        """Answer a step for which no odometry has come, from the IMU alone."""
+        """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
+        m = self.maneuvers
         self.odometry_age += self._advance(stamp)
-        self.maneuvers.descend("no odometry")
-        return self._descend() if self.maneuvers.blind is not None else self._idle()
+        if m.flying and stamp - self._imu_stamp > self.settings.down_time:
+            m.motors_off(State.FAILED, f"neither odometry nor IMU for {self.settings.down_time:g} s")
+        m.descend("no odometry")
+        return self._descend() if m.blind is not None else self._idle()
 
     def _advance(self, stamp: float) -> float:
         m = self.maneuvers
@@ -273,9 +263,9 @@ class FlightController:
         m.rotors = m.rotors.following(out.rotor_speed)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
-        self._spare += _SPARE_SHARE * (self.margin - self._spare) if m.state is State.HOVERING else 0.0
+        self._spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (self.margin - self._spare) if m.state is State.HOVERING else 0.0
         if self.supervisor.landed(setpoint):
-            m.motors_off(State.DISARMED, "landed, motors off")
+            m.motors_off(self._lying, "landed, motors off")
             return self._idle()
         return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event())
 
@@ -294,12 +284,17 @@ class FlightController:
     def _descend(self) -> StepResult:
         m = self.maneuvers
         if m.blind.landed:
-            m.motors_off(State.DISARMED, "landed without position, motors off")
+            m.motors_off(self._lying, "landed without position, motors off")
             return self._idle()
         speed, thrust = m.blind.rotors(m.rotors.speed)
         m.rotors = m.rotors.following(speed)
         self.margin = (self.vehicle.thrust_max - max(thrust)) / self.vehicle.thrust_max
         return StepResult(True, speed, wrench=m.blind.wanted(), margin=self.margin, event=self._event())
+
+    @property
+    def _lying(self) -> State:
+        """What the state is on the ground, as the vehicle lies there."""
+        return State.FAILED if self.supervisor.tilted else State.DISARMED
 
     def _idle(self) -> StepResult:
         m = self.maneuvers

@@ -37,7 +37,7 @@ class FlightSettings:
     position_error_max: float = quantity(1.0, unit="m", above=0.0)
     fault_time: float = quantity(0.12, unit="s", low=0.0, doc="tilt, rate or position are out for so long before the supervisor acts")
     missed_speed: float = quantity(1.0, unit="m/s", above=0.0, doc="faster than this after the planned contact: it was missed")
-    down_time: float = quantity(1.5, unit="s", above=0.0, doc="at rest and tilted for so long: motors off")
+    down_time: float = quantity(1.2, unit="s", above=0.0, doc="at rest and tilted for so long, or without any sensor: motors off")
     margin_time: float = quantity(1.0, unit="s", above=0.0, doc="rotors at their limit for so long: land")
     margin_min: float = quantity(0.02, unit="-", low=0.0, high=0.5, doc="thrust margin that counts as none")
     margin_perch: float = quantity(0.15, unit="-", low=0.0, high=0.5, doc="a perch is refused where the mean margin in hover is less")

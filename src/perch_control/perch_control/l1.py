@@ -21,7 +21,7 @@ from perch_control.geometric.step import drag_compensation, wrench_of
 from perch_control.rotor_lag import RotorEstimate, thrusts
 
 _ZERO = (0.0,) * 6
-_LONGEST_GAP = 0.01  # a longer time between samples starts the predictor anew [s]
+_LONGEST_GAP = 0.025  # a longer time between samples starts the predictor anew [s]
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,7 @@ class Maneuvers:
     def track(self, order: Order, source: Any) -> None:
         """Follow a trajectory, by the reference made from it."""
         self.enter(State.TRACKING, f"tracking trajectory {order.id}")
+        self.attached_to = None
         self.order, self.source, self.start, self.trajectory_id = order, source, order.start, order.id
 
     def motors_off(self, state: State, message: str) -> None:
@@ -114,7 +115,7 @@ class Maneuvers:
     def attach(self, message: str) -> None:
         """Stop the motors on a surface that carries the vehicle."""
         normal = self._surface_normal() or axes_of(self.belief[6:10])[2]
-        self.motors_off(State.DISARMED, message)
+        self.motors_off(State.ATTACHED, message)
         self.attached_to = normal
 
     def stop(self, message: str) -> None:

@@ -19,6 +19,7 @@ class State(IntEnum):
     RECOVERING = 4
     LANDING = 5
     FAILED = 6
+    ATTACHED = 7
 
 
 class Command(IntEnum):

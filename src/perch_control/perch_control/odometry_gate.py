@@ -10,6 +10,9 @@ from perch_core.config import quantity
 from perch_core.jit import compiled
 
 
+_LARGEST = 1e6  # metres, m/s, rad/s: no vehicle is there
+
+
 @dataclass(frozen=True)
 class OdometryLimits:
     """What counts as usable odometry."""
@@ -47,6 +50,8 @@ class OdometryGate:
         """
         if not isfinite(sum(state)):
             return Verdict(False, reason="odometry holds a value that is not finite")
+        if max(state) > _LARGEST or min(state) < -_LARGEST:
+            return Verdict(False, reason=f"odometry holds a value beyond {_LARGEST:g}")
         n = hypot(*state[6:10])
         if abs(n - 1.0) > 1e-2:
             return Verdict(False, reason=f"odometry quaternion has norm {n:.3f}, not 1")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from perch_control.flight_settings import FlightSettings
 from perch_control.l1 import L1Settings
+from perch_control.laws import check_law
 from perch_control.nmpc.settings import NmpcSettings
 from perch_control.settings import GeometricGains
 from perch_core.config import choice, part, quantity, text
@@ -15,10 +16,13 @@ from perch_core.config import choice, part, quantity, text
 class ControllerChoice:
     """Which control law flies."""
 
-    type: str = choice("geometric", options=("geometric", "nmpc"), doc="control law at the start; service set_controller changes it")
+    type: str = text("geometric", doc="control law, one of perch_control.laws (geometric, nmpc); service set_controller changes it, too")
     adaptive: bool = quantity(False, doc="L1 augmentation on force and moment")
-    standby: bool = quantity(True, doc="prepare the NMPC in the background, so that set_controller can choose it in flight")
-    reference_period: int = quantity(5, low=1, high=500, doc="controller/reference every so many steps")
+    standby: bool = quantity(True, doc="prepare laws that take long to build (nmpc), so that set_controller can choose them in flight")
+    reference_period: float = quantity(0.01, unit="s", above=0.0, high=1.0, doc="of controller/reference")
+
+    def __post_init__(self) -> None:
+        check_law(self.type)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +31,9 @@ class ControllerParameters:
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
     gains: str = choice("vehicle", options=("vehicle", "snapdragon", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
-    estimator_status: bool = quantity(True, doc="estimator/status is awaited at every 50th step; false: there is no estimator that sends it")
-    blind_after: float = quantity(0.08, unit="s", above=0.0,
-                                  doc="real time: without odometry for so long while the IMU goes on, descend on the IMU alone; "
+    blind_after: float = quantity(0.08, unit="s", above=0.0, high=1.0,
+                                  doc="without odometry for so long, descend on the IMU alone, by its stamps; without either, by the clock; "
                                       "motors stop after 0.1 s without commands")
-    blind_after_lockstep: float = quantity(10.0, unit="s", above=0.0, doc="the same in lockstep, wall-clock time: a slow estimator is not a dead one")
     controller: ControllerChoice = part(ControllerChoice)
     snapdragon: GeometricGains = part(GeometricGains)
     rpg: GeometricGains = part(GeometricGains)

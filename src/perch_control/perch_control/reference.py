@@ -5,7 +5,7 @@ A source is anything with `duration` and `setpoint(t)`, t in seconds since its s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Any, NamedTuple, Protocol
 
@@ -162,6 +162,17 @@ class FlatReference:
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]. Past the end the last acceleration holds: a contact is being awaited there."""
         return Setpoint._make(_flat_setpoint(*self.trajectory.arrays, t))
+
+
+def normalised(trajectory: SampledTrajectory) -> SampledTrajectory:
+    """The same with unit quaternions: those of a plan's samples are off by their rounding."""
+    return replace(trajectory, q=trajectory.q / np.linalg.norm(trajectory.q, axis=1)[:, None])
+
+
+def with_unit_quaternions(trajectory: SampledTrajectory) -> SampledTrajectory:
+    """`normalised` where anybody's quaternions need it; what has been normalised stays as it is to the last bit."""
+    off = np.abs(np.linalg.norm(trajectory.q, axis=1) - 1.0).max()
+    return trajectory if off < 1e-9 else normalised(trajectory)
 
 
 @dataclass(frozen=True)

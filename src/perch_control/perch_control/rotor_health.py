@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import exp
 
-from perch_control.persistent import Persistent
+from perch_control.debounce import Debounce
 from perch_core.config import quantity
 from perch_core.vehicle import GRAVITY
 
@@ -58,7 +58,7 @@ class RotorHealth:
         self.ratio = self.mean = self.believed = 1.0
         self.weak = False
         self._felt = self._promised = self._mean_felt = self._mean_promised = GRAVITY
-        self._low, self._last = Persistent(self.settings.hold), 0.0
+        self._low, self._last = Debounce(self.settings.hold), 0.0
 
     def pause(self, now: float) -> None:
         """Something else than air acts on the vehicle, or it turns too fast: what is felt now says nothing."""

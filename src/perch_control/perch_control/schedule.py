@@ -10,6 +10,7 @@ from perch_control.maneuvers import Maneuvers
 from perch_control.modes import State
 
 _EARLY = 0.01  # stamps that are nearer than this are the same [s]
+_MOST = 50     # ways out that are kept
 
 
 class Schedule:
@@ -36,7 +37,7 @@ class Schedule:
         """
         m = self._maneuvers
         check_joints(order.source.trajectory, m.settings.joint_gap)
-        self._ways_out = [o for o in self._ways_out if o.id == order.id and o.start >= m.now] + [order]
+        self._ways_out = [o for o in self._ways_out if o.id == order.id and o.start >= m.now][-_MOST:] + [order]
 
     def leave(self, reason: str, law: Any) -> bool:
         """Leave a trajectory by the next recovery that was planned for it; False where none is near.
@@ -66,14 +67,15 @@ class Schedule:
             self._leave_the_wire(law)
             return
         order, source = self._pending
-        if m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
+        resting = m.state in (State.ARMED, State.ATTACHED)
+        if not (resting or m.state in (State.TRACKING, State.HOVERING)):
             self._pending = None
         elif m.now >= order.start:
             self._pending = None
-            # On the ground there is nothing to continue; in the air the new reference is reached without a jump.
+            # From rest there is nothing to continue; in the air the new reference is reached without a jump.
             begin = m.now - order.start
             end = order.recovery_start if order.recovery_start > begin else source.duration  # the wire is met there
-            m.track(order, source if m.state is State.ARMED else blended(m.expected(m.now), source, begin, end))
+            m.track(order, source if resting else blended(m.expected(m.now), source, begin, end))
 
     def _leave_the_wire(self, law: Any) -> None:
         """Where the appended recovery is due, take the one that is kept ready for then: it begins where the vehicle is by now.

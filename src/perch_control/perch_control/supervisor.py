@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from perch_core.vector3 import axes_of, norm
+from perch_core.vector3 import norm
 from perch_control.admission import AtEnd, Order
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import State
-from perch_control.monitors import TrackingMonitor
-from perch_control.persistent import Persistent
+from perch_control.monitors import CarriedTilted, TrackingMonitor
+from perch_control.debounce import Debounce
 from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint
 from perch_control.weak_landing import WeakLanding
@@ -20,6 +20,7 @@ class Supervisor:
 
     def __init__(self, maneuvers: Maneuvers) -> None:
         self._maneuvers = maneuvers
+        self._carried: CarriedTilted | None = None  # while motors run
         self.restart()
 
     def restart(self) -> None:
@@ -27,8 +28,7 @@ class Supervisor:
         m = self._maneuvers
         self._state, settings = m.state, m.settings
         self._monitor = TrackingMonitor(settings, m.vehicle.body_rate_max)
-        self._ground = Persistent(settings.ground_time)
-        self._down = Persistent(settings.down_time)
+        self._ground = Debounce(settings.ground_time)
 
     def estimator(self, state: int, vio_age: float, message: str) -> None:
         """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
@@ -40,6 +40,23 @@ class Supervisor:
         elif state == _COASTING and vio_age > s.coasting_time and m.state is State.TRACKING and not m.committed:
             m.stop(f"hover: no VIO for {vio_age:.1f} s")
 
+    def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
+        """Take an IMU sample: time [s], in B [rad/s, m/s^2]. Running motors that only press the vehicle onto something are stopped."""
+        m = self._maneuvers
+        if not m.flying:
+            self._carried = None
+            return
+        if self._carried is None:
+            self._carried = CarriedTilted(m.settings)
+        self._carried.imu(stamp, gyro, accel)
+        if self._carried.lasts:
+            m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
+
+    @property
+    def tilted(self) -> bool:
+        """What carries the vehicle, by the IMU, does not push along b3."""
+        return self._carried is not None and self._carried.tilted
+
     def act(self, margin: float) -> None:
         """Watch one step of a flight.
 
@@ -49,9 +66,6 @@ class Supervisor:
         m, s = self._maneuvers, self._maneuvers.settings
         if m.state is not self._state:
             self.restart()
-        if self._down.update(self._is_down(), m.now):
-            m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
-            return
         if isinstance(m.source, WeakLanding):
             m.source.update(m.belief, m.specific_thrust_max)
             return
@@ -95,11 +109,6 @@ class Supervisor:
                 self._maneuvers.land(f"landing after trajectory {order.id}")
             else:
                 self._maneuvers.stop(f"hovering at the end of trajectory {order.id}")
-
-    def _is_down(self) -> bool:
-        """The vehicle rests on something in an attitude in which it cannot hover."""
-        v, w, b3 = self._maneuvers.belief[3:6], self._maneuvers.belief[10:13], axes_of(self._maneuvers.belief[6:10])[2]
-        return b3[2] < 0.5 and norm(v) < 0.15 and norm(w) < 0.5
 
     def landed(self, setpoint: Setpoint) -> bool:
         """The reference has descended away from under the vehicle for a while: the ground carries it."""

@@ -1,4 +1,4 @@
-"""Cameras: pinhole and equidistant (Kannala-Brandt) projection with its inverse and Jacobian, and how a camera is mounted.
+"""Cameras: pinhole, radial-tangential and equidistant projection with inverse and Jacobian, and how a camera is mounted.
 
 Frame C: x to the right in the image, y down, z forward along the optical axis. Pixel (0, 0) is the centre of the
 first pixel, as in OpenCV. Arrays may have any leading axes: points (..., 3), pixels (..., 2).
@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from perch_core import lens as kernels
+from perch_core import radtan
 from perch_core.errors import ConfigError
 
 Region = tuple[slice, slice]  # rows and columns of an image
@@ -95,6 +96,104 @@ class PinholeCamera(_Camera):
         return np.stack([np.stack([self.fx / z, zero, -self.fx * x / z**2], -1),
                          np.stack([zero, self.fy / z, -self.fy * y / z**2], -1)], -2)
 
+    def shape_at(self, theta: np.ndarray) -> np.ndarray:
+        """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""
+        theta = np.asarray(theta, float) + 1e-9
+        return np.column_stack([np.cos(theta) ** 2, np.tan(theta) / theta])
+
+
+@dataclass(frozen=True)
+class RadialTangentialCamera(_Camera):
+    """Perspective camera with the distortion of Brown and Conrady: ROS's `plumb_bob` and `rational_polynomial`, OpenCV's default.
+
+    The equations are in `perch_core.radtan`. Nothing is projected from where the polynomial would fold back into the image.
+
+    Attributes:
+        width, height: image size [px].
+        fx, fy, cx, cy: focal lengths and principal point [px].
+        coefficients: k1, k2, p1, p2, k3 (`plumb_bob`), and k4, k5, k6 (`rational_polynomial`): five or eight.
+        near: points closer than this along the optical axis are not projected [m].
+    """
+
+    coefficients: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    near: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "coefficients", tuple(float(k) for k in self.coefficients))
+        if len(self.coefficients) not in (5, 8) or not np.all(np.isfinite(self.coefficients)):
+            raise ConfigError("RadialTangentialCamera", "coefficients", f"{self.coefficients!r} are not five or eight numbers")
+
+    @property
+    def model(self) -> str:
+        """The name in sensor_msgs/CameraInfo."""
+        return "plumb_bob" if len(self.coefficients) == 5 else "rational_polynomial"
+
+    @cached_property
+    def distortion(self) -> np.ndarray:
+        """The coefficients, shape (5,) or (8,)."""
+        return np.array(self.coefficients, dtype=float)
+
+    @cached_property
+    def max_radius(self) -> float:
+        """Largest distance from the axis in the plane z = 1 at which a point is projected; inf where there is no limit."""
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.coefficients, 0.0, 0.0, 0.0)[:8]
+        over, under = np.polynomial.Polynomial([1.0, k1, k2, k3]), np.polynomial.Polynomial([1.0, k4, k5, k6])
+        t = np.polynomial.Polynomial([0.0, 1.0])
+        slope = (over + 2 * t * over.deriv()) * under - 2 * t * over * under.deriv()  # of r g(r^2), times under^2
+        # a hair before the turning point itself, where the inverse has no slope
+        return min((0.995 * root for root in (*_positive_roots(slope), *_positive_roots(under))), default=math.inf)
+
+    @property
+    def max_angle(self) -> float:
+        """Largest angle from the optical axis at which a point is projected [rad]."""
+        return math.atan(self.max_radius)
+
+    @cached_property
+    def lens(self) -> tuple[float, ...]:
+        """As the kernels of `perch_core.radtan` take it."""
+        k = (*self.coefficients, 0.0, 0.0, 0.0)[:8]
+        return tuple(float(x) for x in (self.fx, self.fy, self.cx, self.cy, *k, self.max_radius, self.near))
+
+    def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of points in C.
+
+        Args:
+            points_C: shape (..., 3) [m].
+
+        Returns:
+            Pixels (..., 2), NaN where the point is not in front of the camera or beyond `max_radius`, and a mask (...) that
+            says so. A valid pixel may lie outside the image: see `contains`.
+        """
+        points, shape = _rows(points_C, 3)
+        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
+        radtan.project(self.lens, points, pixels, valid)
+        return pixels.reshape(*shape, 2), valid.reshape(shape)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
+        rows, shape = _rows(pixels, 2)
+        rays_C = np.empty((len(rows), 3))
+        radtan.unproject(self.lens, rows, rays_C)
+        return rays_C.reshape(*shape, 3)
+
+    def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
+        """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
+        points, shape = _rows(points_C, 3)
+        jacobian = np.empty((len(points), 2, 3))
+        radtan.project_jacobian(self.lens, points, jacobian)
+        return jacobian.reshape(*shape, 2, 3)
+
+    def shape_at(self, theta: np.ndarray) -> np.ndarray:
+        """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2).
+
+        The tangential part, some 1e-3 of the radius, is left out.
+        """
+        theta = np.asarray(theta, float) + 1e-9
+        out = np.tan(theta)
+        g, slope = radtan.gain.py_func(self.lens, out**2), radtan.gain_slope.py_func(self.lens, out**2)
+        return np.column_stack([np.cos(theta) ** 2 / (g + 2.0 * out**2 * slope), out * g / theta])
+
 
 @dataclass(frozen=True)
 class EquidistantCamera(_Camera):
@@ -135,10 +234,8 @@ class EquidistantCamera(_Camera):
         """Largest angle from the optical axis at which a point is projected [rad]."""
         k1, k2, k3, k4 = self.coefficients
         slope = np.polynomial.Polynomial([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])  # d theta_d / d theta in theta^2
-        roots = slope.roots()
-        turning = [math.sqrt(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0]
         # a hair before the turning point itself, where the inverse has no slope
-        return min([self.angle_limit, *(0.995 * t for t in turning)])
+        return min([self.angle_limit, *(0.995 * turning for turning in _positive_roots(slope))])
 
     @cached_property
     def lens(self) -> tuple[float, ...]:
@@ -178,6 +275,13 @@ class EquidistantCamera(_Camera):
         kernels.project_jacobian(self.lens, points, jacobian)
         return jacobian.reshape(*shape, 2, 3)
 
+    def shape_at(self, theta: np.ndarray) -> np.ndarray:
+        """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""
+        theta = np.asarray(theta, float)
+        r = kernels.radius.py_func(self.lens, theta)
+        ratio = np.divide(r, theta, out=np.ones_like(theta), where=theta > 1e-12)
+        return np.column_stack([1.0 / kernels.radius_slope.py_func(self.lens, theta), ratio])
+
 
 def _rows(array: np.ndarray, width: int) -> tuple[np.ndarray, tuple[int, ...]]:
     """Vectors of any leading shape one below the other, and that shape."""
@@ -185,7 +289,49 @@ def _rows(array: np.ndarray, width: int) -> tuple[np.ndarray, tuple[int, ...]]:
     return np.ascontiguousarray(array).reshape(-1, width), array.shape[:-1]
 
 
-Camera = PinholeCamera | EquidistantCamera
+def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:
+    """Square roots of a polynomial's real positive roots."""
+    return [math.sqrt(root.real) for root in polynomial.trim(1e-300).roots() if abs(root.imag) < 1e-12 and root.real > 0]
+
+
+Camera = PinholeCamera | RadialTangentialCamera | EquidistantCamera
+
+
+def camera_of(model: str, width: int, height: int, K: np.ndarray, distortion: np.ndarray) -> Camera:
+    """The camera of a calibration in the words of sensor_msgs/CameraInfo.
+
+    Args:
+        model: `plumb_bob`, `rational_polynomial` or `equidistant`; empty: not distorted.
+        width, height: image size [px].
+        K: intrinsic matrix, shape (3, 3).
+        distortion: coefficients of the model; none: not distorted.
+
+    Raises:
+        ConfigError: another model, another number of coefficients, or a matrix that is none (all zero: not calibrated).
+    """
+    K, d = np.asarray(K, float), np.asarray(distortion, float).ravel()
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
+        raise ConfigError("camera_info", "k", f"{K.ravel().tolist()} is no intrinsic matrix: the camera is not calibrated")
+    if not np.isfinite(d).all():
+        raise ConfigError("camera_info", "d", f"{d.tolist()} is not finite")
+    if not 0 < width <= 1 << 15 or not 0 < height <= 1 << 15:
+        raise ConfigError("camera_info", "width", f"{width} x {height} px is no size of an image")
+    common = dict(width=int(width), height=int(height), fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]))
+    counts = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
+    if model not in counts:
+        raise ConfigError("camera_info", "distortion_model", f"{model!r} is not one of {', '.join(filter(None, counts))}")
+    if len(d) not in counts[model]:
+        raise ConfigError("camera_info", "d", f"has {len(d)} coefficients, {model or 'no model'} has {counts[model][-1]}")
+    if model == "equidistant":
+        return EquidistantCamera(**common, coefficients=tuple(d) or (0.0,) * 4)
+    if not d.any():
+        return PinholeCamera(**common)
+    return RadialTangentialCamera(**common, coefficients=tuple(d) if len(d) != 4 else (*d, 0.0))
+
+
+def camera_parameters(camera: Camera) -> tuple[str, tuple[float, ...]]:
+    """Distortion model and coefficients of a camera in the words of sensor_msgs/CameraInfo."""
+    return camera.model, tuple(float(k) for k in camera.distortion)
 
 
 @dataclass(frozen=True)

@@ -8,26 +8,39 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import os
+import re
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from perch_core.errors import ConfigError
+from perch_core.yaml_text import parse_yaml, read_yaml
 
 T = TypeVar("T")
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's, where there is one, is ten times as fast
+LARGEST = {"m": 1e4, "m/s": 100.0, "m/s^2": 1e3, "m/s^3": 1e5, "rad": 1e3, "rad/s": 1e4, "rad/s^2": 1e4, "deg": 360.0, "s": 3600.0, "Hz": 1e4,
+           "kg": 50.0, "kg m^2": 10.0, "N": 1e3, "N/s": 1e5, "N s/m": 100.0, "N s^2/rad^2": 1e-2, "px": 1e4}
+"""Greatest magnitude of a quantity of a unit where its field says nothing; far above what any vehicle here is or does."""
+LARGEST_NUMBER = 1e6
+"""The same of every other number."""
+LONGEST_TEXT = 2000
+NAME = re.compile(r"\w[\w .+-]{0,99}")
+"""Of a thing that folders, files or topics are named after."""
 
 
 def quantity(default: Any = MISSING, *, unit: str = "", low: float | None = None, high: float | None = None,
              doc: str = "", above: float | None = None) -> Any:
-    """A number (or tuple of numbers) with unit and range; `low`/`high` are inclusive, `above` is exclusive."""
+    """A number (or tuple of numbers) with unit and range; `low`/`high` are inclusive, `above` is exclusive.
+
+    Where a bound is missing it is that of `LARGEST`.
+    """
+    largest = LARGEST.get(unit, LARGEST_NUMBER)
+    low, high = -largest if low is None and above is None else low, largest if high is None else high
     return field(default=default, metadata={"unit": unit, "low": low, "high": high, "above": above, "doc": doc})
 
 
@@ -39,6 +52,11 @@ def choice(default: Any = MISSING, *, options: tuple[str, ...], doc: str = "") -
 def text(default: Any = MISSING, *, doc: str = "") -> Any:
     """A free string (a path, a name)."""
     return field(default=default, metadata={"doc": doc})
+
+
+def label(default: Any = MISSING, *, doc: str = "") -> Any:
+    """What folders, files or topics are named after: no separators, no control characters."""
+    return field(default=default, metadata={"label": True, "doc": doc})
 
 
 def part(cls: type, *, doc: str = "") -> Any:
@@ -56,22 +74,24 @@ def check(source: str, key: str, item: Field, value: Any) -> None:
     options = meta.get("options")
     if options is not None and value not in options:
         raise ConfigError(source, key, f"{value!r} is not one of {', '.join(options)}")
-    numbers = value if isinstance(value, tuple) else (value,)
-    for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, (int, float)):
-            continue
-        unit = f" {meta['unit']}" if meta.get("unit") else ""
-        if math.isnan(number):
-            raise ConfigError(source, key, "nan is not a number")
-        if math.isinf(number) and item.default != number:
-            raise ConfigError(source, key, f"{number} is not finite")
-        low, high, above = meta.get("low"), meta.get("high"), meta.get("above")
-        if above is not None and high is None and not number > above:
-            raise ConfigError(source, key, f"{number:g} is not > {above:g}{unit}")
-        if (low is not None and number < low) or (high is not None and number > high) or (above is not None and not number > above):
-            begin = f"({above:g}" if above is not None else "[-inf" if low is None else f"[{low:g}"
-            span = f"{begin}, {'inf' if high is None else format(high, 'g')}]"
-            raise ConfigError(source, key, f"{number:g} is outside {span}{unit}")
+    if isinstance(value, str) and (len(value) > LONGEST_TEXT or not "".join(value.split()).isprintable()):
+        raise ConfigError(source, key, f"{value!r} is not text of up to {LONGEST_TEXT} printable characters")
+    if meta.get("label") and not NAME.fullmatch(value):
+        raise ConfigError(source, key, f"{value!r} is no name: up to 100 letters, digits and any of ' _.+-' after the first")
+    low, high, above = meta.get("low", -LARGEST_NUMBER), meta.get("high", LARGEST_NUMBER), meta.get("above")
+    for number in _numbers(value):
+        if number != item.default and not (number <= high and (number >= low if above is None else number > above)):
+            span = f"{f'[{low:g}' if above is None else f'({above:g}'}, {high:g}] {meta.get('unit', '')}".rstrip()
+            raise ConfigError(source, key, f"{number:g} is outside {span}")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """The numbers of a value, also of tuples in it; what has a class of its own has been checked."""
+    if isinstance(value, (tuple, list)):
+        for entry in value:
+            yield from _numbers(entry)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield value
 
 
 def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
@@ -88,7 +108,10 @@ def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
         if not isinstance(value, dict):
             raise ConfigError(source, key, f"{value!r} is not a mapping")
         _, item = typing.get_args(kind)
-        return {str(k): _convert(item, v, source, f"{key}.{k}") for k, v in value.items()}
+        for k in value:
+            if not (isinstance(k, str) and NAME.fullmatch(k)):
+                raise ConfigError(source, key, f"{k!r} is no name")
+        return {k: _convert(item, v, source, f"{key}.{k}") for k, v in value.items()}
     if origin is tuple:
         args = typing.get_args(kind)
         if not isinstance(value, (list, tuple)):
@@ -131,7 +154,7 @@ def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T
     """
     if not isinstance(mapping, dict):
         raise ConfigError(source, prefix, f"{mapping!r} is not a mapping")
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     known = {f.name: f for f in fields(cls) if f.init}
     dot = f"{prefix}." if prefix else ""
     for key in mapping:
@@ -151,20 +174,9 @@ def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T
         raise ConfigError(source, f"{dot}{error.key}", error.problem) from None
 
 
-def read_yaml(path: Path | str) -> Any:
-    """Parsed YAML of a file.
-
-    Raises:
-        ConfigError: the file is missing or is not YAML.
-    """
-    try:
-        return yaml.load(Path(path).read_text(encoding="utf-8"), _LOADER)
-    except OSError as error:
-        raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(str(path), "", f"is not valid YAML: {' '.join(str(error).split())}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(str(path), "", "is not text in UTF-8") from None
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
 
 
 def load(cls: type[T], path: Path | str) -> T:
@@ -195,12 +207,12 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     """
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml"):
-        if path.is_file():
+        if os.path.isfile(path):
             return path
         raise ConfigError(str(path), "", "no such file")
     folder = config_dir() / kind
     candidate = folder / f"{name_or_path}.yaml"
-    if candidate.is_file():
+    if NAME.fullmatch(str(name_or_path)) and candidate.is_file():
         return candidate
     names = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
     raise ConfigError(kind, str(name_or_path), f"unknown; there are: {names}")

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class PerchError(ValueError):
-    """Base of every error that a caller can cause and mend."""
+    """Base of every error that a caller can cause and mend. It survives pickling, whatever its class's constructor takes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (type(self), self.args, vars(self))
+
+
+def _unpickled(cls: type[PerchError], args: tuple[Any, ...], attributes: dict[str, Any]) -> PerchError:
+    error = cls.__new__(cls, *args)
+    error.args = args
+    error.__dict__.update(attributes)
+    return error
 
 
 class ConfigError(PerchError):
     """A value in a YAML file, a parameter or a command line is not usable.
 
-    The message reads `<source>: <key>: <value> <why it is refused>`.
+    The message reads `<source>: <key>: <value> <why it is refused>`: one line, however long or odd what it quotes.
     """
 
     def __init__(self, source: str, key: str, problem: str) -> None:
-        self.source, self.key, self.problem = source, key, problem
-        super().__init__(": ".join(part for part in (source, key, problem) if part))
+        self.source, self.key, self.problem = (_line(part) for part in (source, key, problem))
+        super().__init__(": ".join(part for part in (self.source, self.key, self.problem) if part))
+
+
+def _line(text: str) -> str:
+    """Text on one line, without control characters, its middle left out where it is long."""
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
+    return line if len(line) <= 1000 else f"{line[:600]} ... {line[-300:]}"
 
 
 class FreeFallError(PerchError):

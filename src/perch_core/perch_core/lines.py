@@ -42,7 +42,7 @@ class Segment:
         norm = float(np.linalg.norm(direction))
         values = (*centre, *direction, self.half_length, self.radius)
         if centre.shape != (3,) or direction.shape != (3,) or not np.all(np.isfinite(values)):
-            raise PerchError(f"line {self.id}: needs a finite centre and direction in 3-d, got {values}")
+            raise PerchError(f"line {self.id}: needs a finite centre and direction in 3-d, got {tuple(map(float, values))}")
         if norm == 0 or self.half_length <= 0 or self.radius <= 0:
             raise PerchError(f"line {self.id}: length {2 * self.half_length:g} m and radius {self.radius:g} m must be > 0")
         object.__setattr__(self, "centre", centre)

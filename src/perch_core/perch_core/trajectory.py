@@ -46,7 +46,7 @@ class FlatSample:
 
 @dataclass(frozen=True)
 class FlatTrajectory:
-    """Piecewise polynomial in the flat outputs x, y, z, yaw. [M:eq3, M:eq17]
+    """Piecewise polynomial in the flat outputs x, y, z, yaw. [defines M:eq3, M:eq17]
 
     Attributes:
         durations: segment durations [s], shape (n,).

@@ -10,7 +10,7 @@ import numpy as np
 
 from perch_core import config, so3
 from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
-from perch_core.config import choice, quantity, text
+from perch_core.config import LARGEST, choice, label, quantity, text
 from perch_core.errors import ConfigError
 
 Vector3 = tuple[float, float, float]
@@ -27,9 +27,9 @@ class CameraConfig:
     height: int = quantity(unit="px", low=16, high=4096)
     focal: tuple[float, float] = quantity(unit="px", above=0.0, doc="fx, fy")
     centre: tuple[float, float] = quantity(unit="px", low=0.0, doc="cx, cy")
-    distortion: Vector4 = quantity((0.0, 0.0, 0.0, 0.0), doc="k1..k4 of the Kannala-Brandt polynomial")
-    position: Vector3 = quantity(unit="m", doc="p_BC")
-    orientation: Vector4 = quantity(doc="q_BC, xyzw")
+    distortion: Vector4 = quantity((0.0, 0.0, 0.0, 0.0), low=-10.0, high=10.0, doc="k1..k4 of the Kannala-Brandt polynomial")
+    position: Vector3 = quantity(unit="m", low=-5.0, high=5.0, doc="p_BC")
+    orientation: Vector4 = quantity(low=-1.01, high=1.01, doc="q_BC, xyzw")
     colour: bool = quantity(False, doc="rgb8 instead of mono8")
     rate: float = quantity(30.0, unit="Hz", above=0.0, high=120.0)
     exposure: float = quantity(0.0035, unit="s", above=0.0, high=0.03)
@@ -64,8 +64,8 @@ class CameraConfig:
 class ImuConfig:
     """An IMU: ranges and noise, per sample at `rate`."""
 
-    rate: float = quantity(500.0, unit="Hz", above=0.0)
-    position: Vector3 = quantity((0.0, 0.0, 0.0), unit="m", doc="p_BI; axes parallel to B")
+    rate: float = quantity(500.0, unit="Hz", low=100.0, high=1000.0)
+    position: Vector3 = quantity((0.0, 0.0, 0.0), unit="m", low=-5.0, high=5.0, doc="p_BI; axes parallel to B")
     accel_noise: float = quantity(unit="m/s^2", low=0.0, doc="1 sigma per sample, vibration included")
     gyro_noise: float = quantity(unit="rad/s", low=0.0, doc="1 sigma per sample")
     accel_bias_walk: float = quantity(unit="m/s^2/sqrt(s)", low=0.0)
@@ -80,13 +80,13 @@ class ImuConfig:
 class Vehicle:
     """A quadrotor. Rotors in the order front-left, rear-left, rear-right, front-right unless the file says otherwise."""
 
-    name: str = text()
+    name: str = label()
     mass: float = quantity(unit="kg", above=0.0, high=50.0)
     inertia: Vector3 = quantity(unit="kg m^2", above=0.0, doc="principal moments, axes of B")
-    rotor_xy: tuple[tuple[float, float], ...] = quantity(unit="m", doc="rotor positions in B")
-    rotor_yaw_sign: tuple[int, int, int, int] = quantity(doc="+1: the rotor's drag torque turns the body to +yaw")
+    rotor_xy: tuple[tuple[float, float], ...] = quantity(unit="m", low=-5.0, high=5.0, doc="rotor positions in B")
+    rotor_yaw_sign: tuple[int, int, int, int] = quantity(low=-1, high=1, doc="+1: the rotor's drag torque turns the body to +yaw")
     thrust_coefficient: float = quantity(unit="N s^2/rad^2", above=0.0, doc="thrust = coefficient * speed^2")
-    torque_ratio: float = quantity(unit="m", above=0.0, doc="kappa of [P:eq2]: drag torque / thrust")
+    torque_ratio: float = quantity(unit="m", above=0.0, high=1.0, doc="kappa of [P:eq2]: drag torque / thrust")
     speed_min: float = quantity(unit="rad/s", low=0.0)
     speed_max: float = quantity(unit="rad/s", above=0.0)
     motor_time_constant: float = quantity(unit="s", low=0.0, high=1.0, doc="first-order lag of the rotor speed")
@@ -96,19 +96,29 @@ class Vehicle:
     perch_offset: float = quantity(unit="m", low=0.0, high=1.0, doc="velcro or gripper below the centre of mass")
     stand_off: float = quantity(0.0, unit="m", low=0.0, high=0.2, doc="how far short of a wire the gripper is planned to stop")
     rest_sag: float = quantity(0.0, unit="m", low=0.0, high=0.1, doc="how much lower it stands, felt or feet pressed by its weight")
-    perch_radius: float = quantity(0.04, unit="m", above=0.0, doc="radius of the velcro plate")
-    body_radii: Vector3 = quantity(unit="m", above=0.0, doc="ellipsoid that contains the vehicle")
-    propeller_radius: float = quantity(0.0, unit="m", low=0.0)
+    perch_radius: float = quantity(0.04, unit="m", above=0.0, high=1.0, doc="radius of the velcro plate")
+    body_radii: Vector3 = quantity(unit="m", above=0.0, high=5.0, doc="ellipsoid that contains the vehicle")
+    propeller_radius: float = quantity(0.0, unit="m", low=0.0, high=2.0)
     cameras: dict[str, CameraConfig] = text()
     imu: ImuConfig = text()
 
     def __post_init__(self) -> None:
-        if len(self.rotor_xy) != 4:
-            raise ConfigError("", "rotor_xy", f"has {len(self.rotor_xy)} rotors, needs 4")
-        if self.speed_max <= self.speed_min:
-            raise ConfigError("", "speed_max", f"{self.speed_max:g} is not above speed_min {self.speed_min:g} rad/s")
-        if 4 * self.thrust_max <= self.mass * GRAVITY:
-            raise ConfigError("", "speed_max", f"total thrust {4 * self.thrust_max:.2f} N cannot lift {self.mass:g} kg")
+        least, middle, most = sorted(self.inertia)
+        radius = max(self.body_radii)
+        for key, problem in (
+            ("rotor_xy", len(self.rotor_xy) != 4 and f"has {len(self.rotor_xy)} rotors, needs 4"),
+            ("rotor_yaw_sign", 0 in self.rotor_yaw_sign and f"{list(self.rotor_yaw_sign)} are not each 1 or -1"),
+            ("inertia", most > 1.001 * (least + middle) and f"{most:g} is more than {least:g} + {middle:g} kg m^2, which no body has"),
+            ("inertia", most > self.mass * radius**2 and f"{most:g} kg m^2 is more than {self.mass:g} kg within {radius:g} m (body_radii) can have"),
+            ("speed_max", self.speed_max <= self.speed_min and f"{self.speed_max:g} is not above speed_min {self.speed_min:g} rad/s"),
+            ("speed_max", self.thrust_max > LARGEST["N"] and f"{self.thrust_max:.4g} N of a rotor is outside (0, {LARGEST['N']:g}] N"),
+            ("speed_max", 4 * self.thrust_max <= self.hover_thrust and f"total thrust {4 * self.thrust_max:.2f} N cannot lift {self.mass:g} kg"),
+            ("speed_min", 4 * self.thrust_min >= self.hover_thrust and f"idling with {4 * self.thrust_min:.2f} N it cannot come down"),
+        ):
+            if problem:
+                raise ConfigError("", key, problem)
+        if np.linalg.cond(self.allocation) > 1e6:
+            raise ConfigError("", "rotor_xy", f"{[list(xy) for xy in self.rotor_xy]} m with these yaw signs leave an axis without moment")
 
     @cached_property
     def inertia_matrix(self) -> np.ndarray:

@@ -1,8 +1,10 @@
-"""What commands take: counts, and folders for results, which are tried out before the work begins."""
+"""What commands take: counts, folders for results, which are tried out before the work begins, and the address of the network."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import socket
 import tempfile
 from pathlib import Path
 
@@ -33,3 +35,21 @@ def output_folder(path: Path, option: str = "--out") -> Path:
             return path
     except OSError as error:
         raise ConfigError(option, str(path), f"cannot be written: {error.strerror}") from None
+
+
+def open_network(address: str | None) -> None:
+    """Bind the ROS sockets of this process and its children to an address, instead of that of $PERCH_NETWORK (loopback by default).
+
+    Raises:
+        ConfigError: no network of this machine has the address.
+    """
+    source, address = ("--network", address) if address else ("PERCH_NETWORK", os.environ.get("PERCH_NETWORK", "127.0.0.1"))
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+            trial.bind((address, 0))
+            bound = trial.getsockname()[0]
+    except OSError as error:
+        raise ConfigError(source, address, f"is not the IPv4 address of a network of this machine: {error.strerror}") from None
+    if bound == "0.0.0.0":
+        raise ConfigError(source, address, "is every network of this machine: name the one to open")
+    os.environ["PERCH_NETWORK"] = bound

@@ -1,4 +1,4 @@
-"""Several nodes in one process, on one executor: the same classes.
+"""Several nodes in one process, on one executor.
 
     composed PLAN.json
 
@@ -13,31 +13,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from perch_core.errors import PerchError
-from perch_core.ros.composition import composition
-from perch_core.ros.node import StopSignal, close_nodes, settle, spin_until_stopped
-from perch_core.ros.priority import priority
-from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
+from perch_core.ros.node import run
+from perch_core.ros.wiring import Wiring
 
 
-def create_nodes(plan: list[dict[str, Any]]) -> list[Node]:
-    """Create every node of a plan, each with its own arguments; all or none.
+def create_nodes(plan: list[dict[str, Any]], wiring: Wiring) -> list[Any]:
+    """Create every node of a plan, each with its own arguments.
 
     Raises:
         PerchError: a node refuses its parameters.
     """
-    nodes: list[Node] = []
-    try:
-        for entry in plan:
-            create = importlib.import_module(entry["module"]).create
-            nodes.append(create(cli_args=entry["arguments"], use_global_arguments=False))
-    except BaseException:
-        close_nodes(nodes)
-        raise
-    return nodes
+    return [importlib.import_module(entry["module"]).create(wiring, cli_args=entry["arguments"], use_global_arguments=False)
+            for entry in plan]
 
 
 def main() -> None:
@@ -50,26 +37,7 @@ def main() -> None:
     except (OSError, ValueError) as error:
         print(f"error: {sys.argv[1]}: {error}", file=sys.stderr)
         sys.exit(2)
-    stop = StopSignal()
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    nodes: list[Node] = []
-    try:
-        with composition.creating():
-            nodes = create_nodes(plan)
-        priority.nodes = len(nodes)
-        settle()
-        executor = EventsExecutor()
-        for node in nodes:
-            executor.add_node(node)
-        composition.connect(executor)
-        spin_until_stopped(executor, stop)
-    except (PerchError, rclpy.exceptions.InvalidParameterValueException) as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    finally:
-        close_nodes(nodes)
-        rclpy.try_shutdown()
-    sys.exit(0)
+    run(lambda wiring: create_nodes(plan, wiring), [])
 
 
 if __name__ == "__main__":

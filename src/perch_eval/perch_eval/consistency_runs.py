@@ -17,7 +17,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from perch_core.errors import PerchError
-from perch_core.scenario import load_scenario
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
 from perch_eval.arguments import count, output_folder
@@ -26,6 +25,7 @@ from perch_eval.campaign.workers import prepare_worker
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
 from perch_eval.target_sightings import Sightings, see_target
+from perch_sim.scenario import load_scenario
 
 GROUPS = {"estimator: all 15 states": slice(0, 15), "estimator: position": slice(0, 3), "estimator: velocity": slice(3, 6),
           "estimator: attitude": slice(6, 9)}

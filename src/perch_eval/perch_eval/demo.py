@@ -11,14 +11,15 @@ from pathlib import Path
 
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
-from perch_core.scenario import Scenario, load_scenario
-from perch_eval.arguments import output_folder
+from perch_eval.arguments import open_network, output_folder
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
+from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
-from perch_eval.pilot import SUCCESSES, FlightResult, Pilot
 from perch_eval.report import build_report, inspection_words
+from perch_eval.ros.pilot import FlightResult, Pilot
 from perch_eval.stack import Stack, StackError
+from perch_sim.scenario import Scenario, load_scenario
 
 READY_TIMEOUT = 180.0  # [s] compiled functions that a changed source invalidated are built while nodes start
 EXAMPLES = """examples:
@@ -41,6 +42,7 @@ def parser() -> argparse.ArgumentParser:
                              + ", ".join(CHAIN_NODES) + ")")
     layout.add_argument("--separate", action="store_true", help="every node in a process of its own")
     out.add_argument("--realtime", action="store_true", help="paced by the wall clock instead of lockstep")
+    out.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     out.add_argument("--verbose", action="store_true", help="show the nodes' output")
     return out
 
@@ -104,6 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Entry point; 0 perched or inspected, 1 the flight failed, 2 the caller's mistake."""
     args = parser().parse_args(arguments)
     try:
+        open_network(args.network)
         report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose)
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -112,6 +115,9 @@ def main(arguments: list[str] | None = None) -> int:
         print("interrupted; all nodes are stopped", file=sys.stderr)
         return 130
     print(summary(report))
+    if "unwritten" in report:
+        print(f"error: {report['unwritten']}", file=sys.stderr)
+        return 2
     print(f"report: {args.out / 'report.html'}")
     return 0 if report["outcome"] in SUCCESSES else 1
 
@@ -128,6 +134,8 @@ def summary(report: dict) -> str:
 
     lines = [f"outcome: {report['outcome']} ({report['message']})",
              f"  tracking RMSE {centimetres('tracking_rmse_m')}; estimation RMSE {centimetres('estimation_rmse_m')} (x, y, z)"]
+    if report["recording_damage"]:
+        lines.append(f"  the recording is cut off or damaged ({report['recording_damage']}): figures are of what can be read")
     if report.get("contact"):
         c = report["contact"]
         lines.append(f"  contact: {c['normal_speed_m_s']:.2f} m/s normal, {c['tangential_speed_m_s']:.2f} m/s tangential, "

@@ -1,4 +1,4 @@
-"""VIO and estimator on a true perch motion with rendered images, without controller, graph or ROS.
+"""VIO and estimator on a true perch motion with rendered images: their components on the flight loop, without a controller.
 
 For benches, tests and Monte-Carlo runs of consistency: the images, the camera's calibration errors and the IMU are the
 simulator's, the motion is exact (`perch_motion`), and nothing of the truth reaches the estimators.
@@ -7,24 +7,38 @@ simulator's, the motion is exact (`perch_motion`), and nothing of the truth reac
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+
 from perch_core import so3
 from perch_core.camera import CameraMount
+from perch_core.component import Component, Input, Output
 from perch_core.processes import frozen_heap
-from perch_core.scenario import Scenario
 from perch_core.timing import CONTROL_PERIOD
+from perch_core.urdf import optical_frame
+from perch_core.values import CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState
 from perch_core.vehicle import load_vehicle
 from perch_eval.consistency import attitude_error
+from perch_eval.in_process import Loop
+from perch_eval.in_process.stand_ins import NoParameters
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
-from perch_perception.ukf import Estimator, ImuSample, Inertial, UkfConfig, VioPose
-from perch_perception.ukf.odometry import vio_state
-from perch_perception.vio import VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
+from perch_perception.estimator_component import StateEstimator
+from perch_perception.ukf import Estimate, UkfConfig
+from perch_perception.vio import VioConfig, VioPoseEstimate, VioResult
+from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_mount
+from perch_sim.lockstep import Task
+from perch_sim.lockstep.schedule import Arrival
 from perch_sim.rendering import Renderer, build_scene
+from perch_sim.scenario import Scenario
 
+TRANSPORT = 0.02  # from the middle of an exposure to the arrival of its image [s]
+Tamper = Callable[[float, int, np.ndarray], list[tuple[int, np.ndarray]]]
+"""A frame (time [s], stamp [ns], image) to those that arrive, (stamp, image): none, others, several."""
+TamperImu = Callable[[float, ImuSample], ImuSample | None]
+"""An IMU sample at a time [s] to the one that arrives, or None."""
 DURATIONS = {1.7: 1.8, 3.0: 2.0}  # of the perch by distance: 570-700 deg/s at 90 deg [m -> s]
 
 
@@ -39,6 +53,7 @@ class Flight:
         mount: the camera as calibrated, what VIO is told.
         frames: (middle of the exposure [s], stamp [ns], image), in order.
         told_wrong: by how much position [m] and yaw [rad] are wrong that VIO is told at its start, shape (4,).
+        vehicle: name of its file.
     """
 
     motion: PerchMotion
@@ -47,6 +62,7 @@ class Flight:
     mount: CameraMount
     frames: tuple[tuple[float, int, np.ndarray], ...]
     told_wrong: np.ndarray = field(default_factory=lambda: np.zeros(4))
+    vehicle: str = "snapdragon"
 
     def sample(self, k: int) -> ImuSample:
         """IMU sample k."""
@@ -86,7 +102,7 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
-    return Flight(motion, truth, read_imu(truth, vehicle.imu, rng), mount, tuple(frames), _told_wrong(seed))
+    return Flight(motion, truth, read_imu(truth, vehicle.imu, rng), mount, tuple(frames), _told_wrong(seed), scenario.vehicle)
 
 
 def _told_wrong(seed: int) -> np.ndarray:
@@ -112,38 +128,137 @@ class VioStep:
     error: np.ndarray | None
 
 
-def run_vio(flight: Flight, config: VioConfig = VioConfig(),
-            tamper: Callable[[float, int, np.ndarray], list[tuple[int, np.ndarray]]] | None = None,
-            tamper_imu: Callable[[float, ImuSample], ImuSample | None] | None = None, begin: float = 0.0) -> list[VioStep]:
+class _Frame(CameraImage):
+    """An image that knows the middle of its exposure [s]."""
+
+    __slots__ = ("middle",)
+
+
+class _Vehicle(Component[NoParameters]):
+    """A flight's sensors as the vehicle of a loop."""
+
+    config_type = NoParameters
+
+    imu = Output(ImuSample, "imu/data_raw")
+    info = Output(CameraModel, "camera_down/camera_info")
+    image = Output(CameraImage, "camera_down/image_raw")
+
+    def __init__(self, flight: Flight, begin: float = 0.0, transport: float = TRANSPORT, tamper: Tamper | None = None,
+                 tamper_imu: TamperImu | None = None) -> None:
+        super().__init__(NoParameters())
+        self._flight, self._transport, self._tamper, self._tamper_imu = flight, transport, tamper, tamper_imu
+        self._k = int(np.searchsorted(flight.truth.times, begin))
+        self._frames = iter([frame for frame in flight.frames if frame[0] >= begin])
+        self._coming = next(self._frames, None)
+        self.time = 0
+
+    @property
+    def over(self) -> bool:
+        """Whether there are no more samples."""
+        return self._k >= len(self._flight.truth.times)
+
+    def advance(self) -> list[Arrival]:
+        """The next sample, and the frames that have arrived by it."""
+        at = float(self._flight.truth.times[self._k])
+        sample = self._flight.sample(self._k)
+        self._k, self.time = self._k + 1, sample.stamp
+        if self._tamper_imu is not None:
+            sample = self._tamper_imu(at, sample)
+        if sample is not None:
+            self.imu(sample)
+        arrivals = []
+        while self._coming is not None and self._coming[0] + self._transport <= at:
+            arrivals += self._show(*self._coming)
+            self._coming = next(self._frames, None)
+        return arrivals
+
+    def _show(self, middle: float, stamp: int, pixels: np.ndarray) -> list[Arrival]:
+        camera, frame, arrivals = self._flight.mount.camera, optical_frame("down"), []
+        for arriving, shown in self._tamper(middle, stamp, pixels) if self._tamper is not None else [(stamp, pixels)]:
+            image = _Frame(arriving, frame, shown.shape[1], shown.shape[0], "mono8", shown)
+            image.middle = middle
+            self.info(CameraModel(arriving, frame, camera))
+            self.image(image)
+            arrivals.append(Arrival("down", arriving, round(middle * 1e9), image))
+        return arrivals
+
+
+class _Vio(VioComponent):
+    """Keeps what became of each frame, and what it cost."""
+
+    def __init__(self, config: VioComponentConfig) -> None:
+        super().__init__(config)
+        self.frames: list[tuple[float, VioResult, float]] = []  # middle of the exposure [s], result, CPU time [s]
+
+    def use(self, image: _Frame) -> None:
+        """As it does, and note it."""
+        clock = time.process_time()
+        super().use(image)
+        self.frames.append((image.middle, self.result, time.process_time() - clock))
+
+
+class _Repeated(Component[NoParameters]):
+    """VIO's states again, each with its frame."""
+
+    config_type = NoParameters
+
+    info = Input(CameraModel, "camera_down/camera_info")
+    state = Output(InertialState, "vio/state")
+
+    def __init__(self, states: dict[int, InertialState]) -> None:
+        super().__init__(NoParameters())
+        self._states = states
+
+    def on_info(self, model: CameraModel) -> None:
+        """Of the frame with this stamp."""
+        if model.stamp in self._states:
+            self.state(self._states[model.stamp])
+
+
+class _Estimator(StateEstimator):
+    """Keeps its whole state at every `stride`-th sample from `begin` [s] on, and the NIS of each state that it has used."""
+
+    def __init__(self, config: UkfConfig, begin: float, stride: int) -> None:
+        super().__init__(config)
+        self._from, self._stride, self._samples = round(begin * 1e9), stride, 0
+        self.states: list[tuple[int, Estimate]] = []  # number of the sample
+        self.nis: list[float] = []
+
+    def on_imu(self, sample: ImuSample) -> None:
+        """As it does, and note it."""
+        accepted = self._estimator.status.accepted
+        super().on_imu(sample)
+        if self._estimator.status.accepted > accepted:
+            self.nis.append(self._estimator.status.nis)
+        if sample.stamp >= self._from and self._samples % self._stride == 0:
+            self.states.append((self._samples, self._estimator.estimate))
+        self._samples += 1
+
+
+def run_vio(flight: Flight, config: VioConfig = VioConfig(), tamper: Tamper | None = None, tamper_imu: TamperImu | None = None,
+            begin: float = 0.0) -> list[VioStep]:
     """VIO over a flight.
 
     Args:
         flight: its data.
         config: VIO's settings.
-        tamper: turns a frame (time, stamp, image) into those that arrive: none, others, several.
-        tamper_imu: turns an IMU sample into the one that arrives, or None.
+        tamper: what becomes of frames on their way.
+        tamper_imu: what becomes of IMU samples on theirs.
         begin: VIO is switched on there [s], and told the pose of that moment, as wrong as the flight has it.
     """
-    start = flight.motion.sample(np.array([begin]))
-    vio = VisualInertialOdometry(config, flight.mount, start.p_WB[0] + flight.told_wrong[:3], float(flight.told_wrong[3]))
-    steps, k = [], int(np.searchsorted(flight.truth.times, begin))
+    standing = flight.motion.sample(np.array([begin])).p_WB[0] - (0.0, 0.0, load_vehicle(flight.vehicle).standing_height)
+    vio = _Vio(VioComponentConfig(
+        **{f.name: getattr(config, f.name) for f in fields(VioConfig)}, vehicle=flight.vehicle,
+        start_position=tuple((standing + flight.told_wrong[:3]).tolist()), start_yaw_deg=float(np.degrees(flight.told_wrong[3]))))
+    vehicle = _Vehicle(flight, begin, tamper=tamper, tamper_imu=tamper_imu)
+    _run(Loop(vehicle, {"vio": vio}, {"vio": Task(0.0)}, {}), vehicle)
+    return [VioStep(middle, result, cost, _vio_error(flight, result)) for middle, result, cost in vio.frames]
+
+
+def _run(loop: Loop, vehicle: _Vehicle) -> None:
     with frozen_heap():  # as nodes do
-        for time_, stamp, image in flight.frames:
-            if time_ < begin:
-                continue
-            while k < len(flight.truth.times) and flight.truth.times[k] < time_ + 0.02:
-                sample = flight.sample(k)
-                if tamper_imu is not None:
-                    sample = tamper_imu(float(flight.truth.times[k]), sample)
-                if sample is not None:
-                    vio.add_imu(sample)
-                k += 1
-            for arriving, pixels in (tamper(time_, stamp, image) if tamper else [(stamp, image)]):
-                clock = time.process_time()
-                result = vio.add_image(arriving, pixels)
-                cost = time.process_time() - clock
-                steps.append(VioStep(time_, result, cost, _vio_error(flight, result)))
-    return steps
+        while not vehicle.over:
+            loop.step()
 
 
 def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:
@@ -155,11 +270,6 @@ def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:
                            m.R_WB[0].T @ m.v_WB[0] - e.R_WB.T @ e.v_WB])
 
 
-def received(e: VioPoseEstimate) -> VioPose:
-    """What the estimator node makes of VIO's state."""
-    return vio_state(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, Inertial(e.gyro_bias, e.accel_bias, e.P))
-
-
 @dataclass(frozen=True)
 class EstimatorTrack:
     """The estimator along a flight, at n IMU stamps.
@@ -168,34 +278,35 @@ class EstimatorTrack:
         times: [s], shape (n,).
         errors: truth minus estimate of (p, v, theta, b_g, b_a), shape (n, 15).
         covariances: shape (n, 15, 15).
-        nis: of each VIO pose.
+        nis: of each state of VIO that was used.
+        health: what it told of itself, ten times a second.
     """
 
     times: np.ndarray
     errors: np.ndarray
     covariances: np.ndarray
     nis: np.ndarray
+    health: tuple[EstimatorHealth, ...] = ()
 
 
 def run_estimator(flight: Flight, steps: list[VioStep], config: UkfConfig = UkfConfig(), latency: float = 0.040,
                   begin: float = 0.7, stride: int = 5) -> EstimatorTrack:
-    """The estimator on a flight's IMU and on VIO's poses, which arrive `latency` [s] after their exposure."""
-    estimator, q, rows, nis = Estimator(config), flight.truth.q_WB, [], []
-    poses: Iterator[VioPose] = iter([received(s.result.estimate) for s in steps if s.result.estimate is not None])
-    pending = next(poses, None)
-    for k, t in enumerate(flight.truth.times):
-        while pending is not None and pending.stamp * 1e-9 + latency <= t:
-            if estimator.add_vio(pending).used:
-                nis.append(estimator.status.nis)
-            pending = next(poses, None)
-        estimator.add_imu(flight.sample(k))
-        if t >= begin and k % stride == 0:
-            e = estimator.estimate
-            rows.append((t, np.concatenate([
-                flight.truth.p_WB[k] - e.p_WB, flight.truth.v_WB[k] - e.v_WB, attitude_error(q[k], e.q_WB),
-                flight.readings.gyro_bias[k] - e.gyro_bias, flight.readings.accel_bias[k] - e.accel_bias]), e.P))
-    return EstimatorTrack(np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.array([r[2] for r in rows]),
-                          np.array(nis))
+    """The estimator on a flight's IMU and on VIO's states, which count `latency` [s] after their exposure, or with the next sample."""
+    stamps = {middle: stamp for middle, stamp, _ in flight.frames}
+    states = {stamps[s.time]: _state(s.result.estimate) for s in steps if s.result.estimate is not None and s.time in stamps}
+    estimator, vehicle = _Estimator(config, begin, stride), _Vehicle(flight, transport=min(TRANSPORT, latency))
+    loop = Loop(vehicle, {"estimator": estimator, "vio": _Repeated(states)}, {"estimator": Task(), "vio": Task(latency)}, {})
+    _run(loop, vehicle)
+    truth, readings, q = flight.truth, flight.readings, flight.truth.q_WB
+    errors = [np.concatenate([truth.p_WB[k] - e.p_WB, truth.v_WB[k] - e.v_WB, attitude_error(q[k], e.q_WB),
+                              readings.gyro_bias[k] - e.gyro_bias, readings.accel_bias[k] - e.accel_bias]) for k, e in estimator.states]
+    return EstimatorTrack(np.array([truth.times[k] for k, _ in estimator.states]), np.array(errors),
+                          np.array([e.P for _, e in estimator.states]), np.array(estimator.nis),
+                          tuple(loop.trace.values("estimator/status")))
+
+
+def _state(e: VioPoseEstimate) -> InertialState:
+    return InertialState(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, e.gyro_bias, e.accel_bias, e.P)
 
 
 def with_settings(config: VioConfig, **changes: dict) -> VioConfig:

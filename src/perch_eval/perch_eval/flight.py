@@ -1,17 +1,17 @@
-"""A recorded flight as arrays."""
+"""A flight as values by channel, and as arrays: recorded (`perch_eval.ros.recorded_flight`) or flown in this process."""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from enum import Enum
 from typing import Any
 
 import numpy as np
-from rclpy.serialization import deserialize_message
 
-from perch_core.ros.conversions import odometry_arrays, pose_arrays, to_array, to_seconds
-from perch_eval.mcap_log import message_class, read
+from perch_core.values import ControlReference, OdometryState, TrajectoryOrder, seconds
 
 HASHED = ("ground_truth/odometry", "imu/data_raw", "odometry", "vio/odometry", "target/pose", "trajectory",
           "motor_command", "controller/reference")
@@ -36,76 +36,87 @@ class States:
         return States(np.asarray(times), between(self.p), self.q[nearest], between(self.v), between(self.w))
 
 
+def time_of(value: Any) -> float | None:
+    """The time that a value is of [s]: its stamp, of a trajectory its start; None: it has none."""
+    if isinstance(value, TrajectoryOrder):
+        return value.trajectory.start_time
+    stamp = getattr(value, "stamp", None)
+    return None if stamp is None else seconds(stamp)
+
+
+def timed(values: Iterable[Any]) -> list[tuple[float, Any]]:
+    """(time [s], value) of each value that has a time."""
+    return [(time, value) for value in values if (time := time_of(value)) is not None]
+
+
 class Flight:
-    """The messages of one flight by topic (without leading slash or namespace of the vehicle).
+    """The values of one flight by channel, without leading slash.
 
     Attributes:
         damage: why the recording could not be read to its end; empty if it could.
     """
 
-    damage = ""
+    def __init__(self, channels: Mapping[str, list[tuple[float, Any]]], damage: str = "") -> None:
+        """
+        Args:
+            channels: (time [s], value) of each channel, in the order in which they were emitted.
+            damage: as above.
+        """
+        self._channels, self.damage = channels, damage
 
-    def __init__(self, path: Path, namespace: str = "") -> None:
-        self._raw: dict[str, list[tuple[float, Any]]] = {}
-        prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
-        classes: dict[str, Any] = {}
-        for topic, name, time, data in read(path, on_damage=self._damaged):
-            key = topic.removeprefix(prefix).lstrip("/")
-            msg_type = classes.setdefault(name, message_class(name))
-            self._raw.setdefault(key, []).append((time * 1e-9, deserialize_message(data, msg_type)))
-
-    def _damaged(self, why: str) -> None:
-        self.damage = why
-
-    def messages(self, topic: str) -> list[tuple[float, Any]]:
-        """(time [s], message) of a topic, in the order recorded; empty when there are none."""
-        return self._raw.get(topic, [])
+    def values(self, channel: str) -> list[tuple[float, Any]]:
+        """(time [s], value) of a channel, in order; empty when there are none."""
+        return self._channels.get(channel, [])
 
     @property
     def topics(self) -> list[str]:
-        """The topics that carry messages."""
-        return sorted(self._raw)
+        """The channels that carry values."""
+        return sorted(self._channels)
 
-    def states(self, topic: str) -> States | None:
-        """The states of an odometry topic, in the order of their stamps."""
-        rows = [(to_seconds(m.header.stamp), *odometry_arrays(m)) for _, m in self.messages(topic)]
-        if len(rows) < 2:
+    def states(self, channel: str) -> States | None:
+        """The states of a channel of odometry, in the order of their stamps."""
+        found: list[OdometryState] = sorted((value for _, value in self.values(channel)), key=lambda state: state.stamp)
+        if len(found) < 2:
             return None
-        rows.sort(key=lambda row: row[0])
-        return States(*(np.array(column) for column in zip(*rows)))
+        return States(seconds(np.array([s.stamp for s in found], dtype=np.int64)), np.array([s.p_WB for s in found]),
+                      np.array([s.q_WB for s in found]), np.array([s.v_WB for s in found]), np.array([s.w_B for s in found]))
 
-    def vectors(self, topic: str, pick) -> tuple[np.ndarray, np.ndarray]:
-        """Times (n,) and `pick(message)` (n, ...) of a topic."""
-        rows = self.messages(topic)
-        return np.array([t for t, _ in rows]), np.array([pick(m) for _, m in rows])
+    def vectors(self, channel: str, pick: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Times (n,) and `pick(value)` (n, ...) of a channel."""
+        rows = self.values(channel)
+        return np.array([t for t, _ in rows]), np.array([pick(value) for _, value in rows])
 
     def reference(self) -> States | None:
         """What the controller wanted at each step while it followed a trajectory."""
-        rows = []
-        for t, m in self.messages("controller/reference"):
-            p, q = pose_arrays(m.pose)
-            rows.append((t, p, q, to_array(m.linear_velocity), to_array(m.angular_velocity)))
-        return States(*(np.array(column) for column in zip(*rows))) if len(rows) > 1 else None
+        found: list[ControlReference] = [value for _, value in self.values("controller/reference")]
+        if len(found) < 2:
+            return None
+        return States(seconds(np.array([r.stamp for r in found], dtype=np.int64)), np.array([r.p for r in found]),
+                      np.array([r.q for r in found]), np.array([r.v for r in found]), np.array([r.w for r in found]))
 
     def digest(self, until: float) -> str:
         """SHA-256 over the values of every state, command and estimate up to a time [s] (the `flight_hash`)."""
         total = hashlib.sha256()
-        for topic in HASHED:
-            total.update(topic.encode())
-            for t, msg in self.messages(topic):
+        for channel in HASHED:
+            total.update(channel.encode())
+            for t, value in self.values(channel):
                 if t <= until:
-                    total.update(np.array(_numbers(msg), float).tobytes())
+                    total.update(np.array(numbers(value), float).tobytes())
         return total.hexdigest()
 
 
-def _numbers(value: Any) -> list[float]:
-    """Every number of a message, depth first."""
+def numbers(value: Any) -> list[float]:
+    """Every number of a value, depth first."""
     if isinstance(value, (bool, int, float)):
         return [float(value)]
+    if value is None:
+        return []
     if isinstance(value, str):
         return [float(b) for b in value.encode()]
     if isinstance(value, np.ndarray):
         return value.astype(float).ravel().tolist()
-    if hasattr(value, "get_fields_and_field_types"):
-        return [x for name in value.get_fields_and_field_types() for x in _numbers(getattr(value, name))]
-    return [x for item in value for x in _numbers(item)]
+    if isinstance(value, Enum):
+        return numbers(value.value)
+    if dataclasses.is_dataclass(value):
+        return [x for field in dataclasses.fields(value) for x in numbers(getattr(value, field.name))]
+    return [x for item in value for x in numbers(item)]

@@ -9,9 +9,9 @@ import numpy as np
 
 from perch_core import config
 from perch_core.errors import ConfigError
-from perch_core.scenario import Scenario
 from perch_core.tag_board import load_board
 from perch_core.vehicle import Vehicle, load_vehicle
+from perch_sim.scenario import Scenario
 
 STEEPEST_VIEW = 80.0
 """Between line of sight and the pad's normal [deg]; beyond, a 0.16 m tag at 1.7 m is 4 px wide."""
@@ -36,17 +36,18 @@ def check_names(scenario: Scenario, source: str | Path) -> Vehicle:
     return load_vehicle(scenario.vehicle)
 
 
-def check_flight(scenario: Scenario, source: str | Path) -> None:
+def check_flight(scenario: Scenario, source: str | Path, vehicle: Vehicle | None = None) -> None:
     """Make sure that a flight of the scenario can begin and that its pad can be seen from the search hover.
 
     Args:
         scenario: to be checked.
         source: its file, for messages.
+        vehicle: what `check_names` has found.
 
     Raises:
         ConfigError: with the value, its place and what is allowed.
     """
-    vehicle = check_names(scenario, source)
+    vehicle = vehicle or check_names(scenario, source)
     for node in ("vehicle", "estimator", "controller", "mission"):
         if node not in scenario.nodes:
             raise ConfigError(str(source), "nodes", f"{node!r} is missing; a flight needs it")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
+from perch_core.values import AtEnd, Contact
 from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight, States
 
@@ -23,12 +24,11 @@ def _rmse(difference: np.ndarray) -> list[float]:
 def perch_window(flight: Flight) -> tuple[float, float] | None:
     """Start and end [s] of the perch: the first planned perch trajectory up to the contact, or to its planned end."""
     start = end = None
-    for _, msg in flight.messages("trajectory"):
-        if msg.at_end in (1, 3):
-            begin = msg.header.stamp.sec + 1e-9 * msg.header.stamp.nanosec
-            length = sum(s.duration for s in msg.segments) if msg.segments else msg.points[-1].time_from_start
-            if msg.at_end == 3 and msg.recovery_start > 0:
-                length = msg.recovery_start
+    for _, order in flight.values("trajectory"):
+        if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER):
+            begin, length = order.trajectory.start_time, order.trajectory.duration
+            if order.at_end == AtEnd.RECOVER and order.recovery_start > 0:
+                length = order.recovery_start
             start = begin if start is None else start
             end = begin + length
     if start is None:
@@ -37,17 +37,17 @@ def perch_window(flight: Flight) -> tuple[float, float] | None:
     return (start, min(end, touch[0]) if touch is not None and touch[0] > start else end)
 
 
-def touch_of(flight: Flight) -> tuple[float, Any] | None:
-    """Time and message of the contact that ended the perch: the adhesion, or else the first touch after take-off."""
+def touch_of(flight: Flight) -> tuple[float, Contact] | None:
+    """Time and event of the contact that ended the perch: the adhesion, or else the first touch after take-off."""
     airborne = False
     first = None
-    for t, msg in flight.messages("contact"):
-        if msg.state == 1:
-            return t, msg
-        if msg.state == 0:
+    for t, contact in flight.values("contact"):
+        if contact.state == 1:
+            return t, contact
+        if contact.state == 0:
             airborne = True
-        elif airborne and first is None and msg.state in (2, 3):
-            first = (t, msg)
+        elif airborne and first is None and contact.state in (2, 3):
+            first = (t, contact)
     return first
 
 
@@ -56,10 +56,10 @@ def contact_report(flight: Flight) -> dict[str, Any] | None:
     touch = touch_of(flight)
     if touch is None:
         return None
-    t, msg = touch
-    return {"time": t, "state": CONTACT_STATES[msg.state], "body": msg.body, "normal_speed_m_s": msg.normal_speed,
-            "tangential_speed_m_s": msg.tangential_speed, "tilt_error_deg": math.degrees(msg.tilt_error),
-            "offset_m": msg.offset, "reason": msg.reason}
+    t, contact = touch
+    return {"time": t, "state": CONTACT_STATES[contact.state], "body": contact.body, "normal_speed_m_s": contact.normal_speed,
+            "tangential_speed_m_s": contact.tangential_speed, "tilt_error_deg": math.degrees(contact.tilt_error),
+            "offset_m": contact.offset, "reason": contact.reason}
 
 
 def peak_acceleration(truth: States) -> float:
@@ -110,23 +110,22 @@ def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, 
 
 def target_error(flight: Flight) -> dict[str, float] | None:
     """Error of the target that the perch was planned on, in map."""
-    true, found = flight.messages("ground_truth/target"), flight.messages("target/pose")
-    plans = [t for t, m in flight.messages("trajectory") if m.at_end == 1]
+    true, found = flight.values("ground_truth/target"), flight.values("target/pose")
+    plans = [t for t, order in flight.values("trajectory") if order.at_end == AtEnd.CONTACT]
     if not true or not found or not plans:
         return None
-    used = [m for t, m in found if t <= plans[0]] or [found[0][1]]
-    a, b = true[-1][1].pose, used[-1].pose.pose
-    dp = np.array([b.position.x - a.position.x, b.position.y - a.position.y, b.position.z - a.position.z])
-    qa, qb = (np.array([o.x, o.y, o.z, o.w]) for o in (a.orientation, b.orientation))
-    dq = so3.quat_multiply(so3.quat_conjugate(qa), qb)
+    used = [pose for t, pose in found if t <= plans[0]] or [found[0][1]]
+    pad, pose = true[-1][1], used[-1]
+    dp = np.array(pose.p_WS) - np.array(pad.p)
+    dq = so3.quat_multiply(so3.quat_conjugate(np.array(pad.q)), np.array(pose.q_WS))
     return {"position_m": float(np.linalg.norm(dp)), "attitude_deg": math.degrees(float(np.linalg.norm(so3.quat_log(dq))))}
 
 
 def thrust_history(flight: Flight, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time, collective thrust reached and collective thrust commanded (interpolated to the same times) [s, N, N]."""
-    t, thrust = flight.vectors("rotor_state", lambda m: float(np.sum(m.thrust)))
+    t, thrust = flight.vectors("rotor_state", lambda r: float(np.sum(r.thrust)))
     tc, commanded = flight.vectors(
-        "motor_command", lambda m: vehicle.thrust_coefficient * float(np.sum(np.square(m.rotor_speed))) if m.armed else 0.0)
+        "motor_command", lambda c: vehicle.thrust_coefficient * float(np.sum(np.square(c.rotor_speed))) if c.armed else 0.0)
     if len(t) == 0 or len(tc) == 0:
         return np.empty(0), np.empty(0), np.empty(0)
     return t, thrust, np.interp(t, tc, commanded)
@@ -136,7 +135,7 @@ def rates(flight: Flight) -> dict[str, float]:
     """Messages per second of simulation time on each topic."""
     out = {}
     for topic in flight.topics:
-        times = [t for t, _ in flight.messages(topic)]
+        times = [t for t, _ in flight.values(topic)]
         if len(times) > 1 and times[-1] > times[0]:
             out[topic] = (len(times) - 1) / (times[-1] - times[0])
     return out
@@ -145,15 +144,14 @@ def rates(flight: Flight) -> dict[str, float]:
 def diagnostics(flight: Flight) -> dict[str, list[dict[str, float]]]:
     """Every diagnostics of each node, in order: their numbers by name."""
     out: dict[str, list[dict[str, float]]] = {}
-    for _, array in flight.messages("diagnostics"):
-        for status in array.status:
-            values = {}
-            for item in status.values:
-                try:
-                    values[item.key] = float(item.value)
-                except ValueError:
-                    continue
-            out.setdefault(status.name.strip("/"), []).append(values)
+    for _, said in flight.values("diagnostics"):
+        values = {}
+        for key, value in said.values.items():
+            try:
+                values[key] = float(value)
+            except ValueError:
+                continue
+        out.setdefault(str(said.values.get("node", "")).strip("/"), []).append(values)
     return out
 
 

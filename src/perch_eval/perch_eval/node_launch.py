@@ -7,6 +7,7 @@ written into one file per node, which is all that the node gets: so a log folder
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,26 +16,29 @@ from typing import Any
 import yaml
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
-from perch_core.scenario import Scenario
+from perch_sim.lockstep import flight_tasks
+from perch_sim.scenario import NODES as PACKAGES
+from perch_sim.scenario import Latency, Scenario
 
-PACKAGES = {
-    "vehicle": "perch_sim",
-    "vio_model": "perch_sim",
-    "vio": "perch_perception",
-    "estimator": "perch_perception",
-    "target_localizer": "perch_perception",
-    "powerline_mapper": "perch_perception",
-    "perching_planner": "perch_planner",
-    "powerline_planner": "perch_planner",
-    "controller": "perch_control",
-    "mission": "perch_control",
-    "recorder": "perch_eval",
-    "viewer": "perch_eval",
-}
-"""Node (which is also the name of its executable) -> package."""
 
-PARTICIPANTS = ("controller", "vio", "vio_model", "target_localizer", "powerline_mapper", "mission", "recorder")
-"""Nodes that the vehicle's lockstep waits for, where they are started."""
+@dataclass(frozen=True)
+class NodeKind:
+    """What is known of a node, which is also the name of its executable.
+
+    Attributes:
+        package: its package.
+        participant: it takes part in the simulator's lockstep.
+    """
+
+    package: str
+    participant: bool = False
+
+
+NODES = {name: NodeKind(package, name in flight_tasks(Latency())) for name, package in PACKAGES.items()}
+ALWAYS = ("description",)
+"""Nodes that are started with every scenario."""
+HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")
+"""Parameters of a node that its component knows nothing of."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +47,18 @@ class NodeLaunch:
 
     Attributes:
         name: node and executable.
-        package: its package.
-        parameters: parameter -> value, nested or dotted.
+        parameters: of its component, parameter -> value, nested or dotted.
+        host: of its host, see `HOST_PARAMETERS`.
     """
 
     name: str
-    package: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    host: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def package(self) -> str:
+        """Its package."""
+        return NODES[self.name].package
 
     @property
     def module(self) -> str:
@@ -60,7 +69,7 @@ class NodeLaunch:
         """Write the parameters as a ROS parameter file, valid in every namespace."""
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / f"{self.name}.yaml"
-        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dict(self.parameters)}}, sort_keys=True))
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": {**self.parameters, **self.host}}}, sort_keys=True))
         return file
 
 
@@ -78,9 +87,9 @@ def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence
         PerchError: a node that does not exist, or that would not have been started anyway.
     """
     for node in (*only, *without, *extra):
-        if node not in PACKAGES:
-            raise PerchError(f"node {node!r} is not one of {', '.join(PACKAGES)}")
-    everyone = tuple(dict.fromkeys((*(only or scenario.nodes), *extra)))
+        if node not in NODES:
+            raise PerchError(f"node {node!r} is not one of {', '.join(NODES)}")
+    everyone = tuple(dict.fromkeys((*(only or (*scenario.nodes, *ALWAYS)), *extra)))
     for node in without:
         if node not in everyone:
             raise PerchError(f"node {node!r} is not started anyway; started: {', '.join(everyone)}")
@@ -100,7 +109,7 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
         nodes: what to start.
         seed: of every random number in the flight.
         scenario_source: name or file of the scenario, for the nodes that read it themselves.
-        lockstep: wait for every node at every step; otherwise pace by the wall clock.
+        lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
         overrides: node -> parameter -> value, over everything else.
         expected: nodes that take part in the flight, if others than `nodes` do (started elsewhere).
 
@@ -115,9 +124,10 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
     common = _scenario_parameters(scenario, expected or nodes, seed, scenario_source or scenario.name, lockstep)
     launches = []
     for node in nodes:
-        parameters = _flat(read_parameters(node)) | common.get(node, {})
-        parameters |= _flat((scenario.parameters or {}).get(node, {})) | _flat(overrides.get(node, {}))
-        launches.append(NodeLaunch(node, PACKAGES[node], parameters))
+        parameters = flattened(read_parameters(node)) | common.get(node, {}) | _host_parameters(node, lockstep)
+        parameters |= flattened((scenario.parameters or {}).get(node, {})) | flattened(overrides.get(node, {}))
+        host = {name: parameters.pop(name) for name in HOST_PARAMETERS if name in parameters}
+        launches.append(NodeLaunch(node, parameters, host))
     return tuple(launches)
 
 
@@ -128,15 +138,29 @@ def read_parameters(node: str) -> dict[str, Any]:
         ConfigError: anything else than `/**: ros__parameters:` in it.
     """
     file = config.config_dir() / f"{node}.yaml"
-    if not file.exists():
+    try:
+        return parameters_in(file, file.stat().st_mtime_ns)
+    except FileNotFoundError:
         return {}
+
+
+@functools.lru_cache(maxsize=32)
+def parameters_in(file: Path, changed: int) -> dict[str, Any]:
+    """What a parameter file that was changed at a time [ns] sets in every namespace.
+
+    Raises:
+        ConfigError: anything else than `/**: ros__parameters:` in it.
+    """
     content = config.read_yaml(file)
     if not isinstance(content, dict) or set(content) != {"/**"}:
         raise ConfigError(str(file), "", "must hold one key, '/**', which is true in every namespace")
     parameters = content["/**"]
     if not isinstance(parameters, dict) or set(parameters) != {"ros__parameters"}:
         raise ConfigError(str(file), "/**", "must hold one key, 'ros__parameters'")
-    return parameters["ros__parameters"] or {}
+    found = parameters["ros__parameters"] or {}
+    if not isinstance(found, dict):
+        raise ConfigError(str(file), "/**.ros__parameters", f"{found!r} is not a mapping")
+    return found
 
 
 def parse_override(text: str) -> tuple[str, str, Any]:
@@ -149,10 +173,7 @@ def parse_override(text: str) -> tuple[str, str, Any]:
     node, dot, parameter = target.partition(".")
     if not (assigned and dot and node and parameter):
         raise PerchError(f"-p {text}: expected NODE.PARAMETER:=VALUE, as in controller.position_gain:=6.0")
-    try:
-        return node, parameter, yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise PerchError(f"-p {text}: the value is not valid YAML") from None
+    return node, parameter, config.parse_yaml(value, f"-p {text}")
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -167,10 +188,16 @@ def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     return overrides
 
 
-def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str,
-                         lockstep: bool) -> dict[str, dict[str, Any]]:
+def _host_parameters(node: str, lockstep: bool) -> dict[str, Any]:
+    """What the simulator means for a node's host. Its time is that of `/clock`, which the vehicle publishes, in real time, too."""
+    if node == "vehicle":
+        return {"lockstep": lockstep, "use_sim_time": False}
+    return {"lockstep": lockstep, "use_sim_time": True} if NODES[node].participant else {"use_sim_time": True}
+
+
+def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str, lockstep: bool) -> dict[str, dict[str, Any]]:
     """What the scenario as a whole means for single nodes."""
-    participants = [node for node in PARTICIPANTS if node in nodes]
+    participants = [node for node in nodes if NODES[node].participant]
     vehicle = {"vehicle": scenario.vehicle}
     mission = {"mission.planner_latency": scenario.latency.perching_planner,
                "mission.powerline_latency": scenario.latency.powerline_planner}
@@ -179,24 +206,23 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         mission |= {"mission.waypoints": [v for w in scenario.inspection.waypoints for v in (*w.position, w.yaw_deg)],
                     "mission.inspection_speed": scenario.inspection.speed}
         controller["nmpc.lines.watched"] = list(scenario.inspection.watched)
-    every_step = [topic for node, topic in (("estimator", "odometry"), ("controller", "motor_command")) if node in nodes]
     return {
-        "recorder": {"every_step": every_step if lockstep and every_step else [""]},
-        "viewer": {"scenario": source},
-        "vehicle": {"scenario": source, "seed": seed, "lockstep": lockstep, "participants": participants or [""]},
+        "viewer": {"scenario": source}, "description": vehicle,
+        "vehicle": {"scenario": source, "seed": seed, "participants": participants or [""]},
         "vio": vehicle | {"start_position": list(scenario.start.position), "start_yaw_deg": scenario.start.yaw_deg},
-        "vio_model": vehicle | {"seed": seed}, "powerline_mapper": vehicle,
+        # in lockstep the schedule lets what it says count later
+        "vio_model": vehicle | {"seed": seed, "latency": 0.0 if lockstep else scenario.latency.vio}, "powerline_mapper": vehicle,
         "target_localizer": vehicle | {"board": scenario.target.board},
         "perching_planner": vehicle, "powerline_planner": vehicle, "controller": controller, "mission": mission,
     }
 
 
-def _flat(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested parameters under dotted names, so that later ones replace single values."""
     flat: dict[str, Any] = {}
     for key, value in parameters.items():
         if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
+            flat |= flattened(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = list(value) if isinstance(value, tuple) else value
     return flat

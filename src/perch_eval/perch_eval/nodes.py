@@ -10,15 +10,15 @@ from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from perch_core.errors import PerchError
-from perch_core.scenario import Scenario
-from perch_eval.node_launch import PACKAGES, NodeLaunch, choose_nodes, node_launches
+from perch_eval.node_launch import NODES, NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
+from perch_sim.scenario import Scenario
 
 Overrides = Mapping[str, Mapping[str, Any]]
 
-ALL_NODES = tuple(PACKAGES)
-CHAIN_NODES = ("vehicle", "estimator", "controller")
-"""Nodes that every step waits for: in real time they share a process, and nobody else does."""
+ALL_NODES = tuple(NODES)
+CHAIN_NODES = ("vehicle", "estimator", "controller", "description")
+"""Nodes that every step waits for, and one that says where the vehicle is: in real time they share a process, and nobody else does."""
 FAST_NODES = (*CHAIN_NODES, "mission", "recorder")
 """Nodes with a little to do at many steps: between processes their messages cost more than their work."""
 
@@ -38,9 +38,9 @@ def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", co
         seed: of every random number in the flight.
         scenario_source: file of the scenario, where it is none of `config/scenarios`.
         composed: nodes that share a process, as far as the scenario has them; the others have one each.
-        lockstep: wait for every node at every step; otherwise pace by the wall clock.
+        lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
         record: add a recorder that writes this MCAP file.
-        hold_for_goal: hold simulation time at zero until the mission has a goal.
+        hold_for_goal: let simulation time begin when the mission has a goal.
         overrides: node -> parameter -> value, over everything else.
         namespace: of every node, as in `/quad1`.
         folder: receives the parameter files; by default `logs` beside the recording, or a temporary folder.
@@ -53,7 +53,7 @@ def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", co
     if record:
         own["recorder"] = {"file": str(record.absolute()), **own.get("recorder", {})}
     if hold_for_goal and "mission" in nodes:
-        own["mission"] = {"hold_for_goal": True, **own.get("mission", {})}
+        own["mission"] = {"lockstep_hold": "perch", **own.get("mission", {})}
     if folder is None:
         folder = record.parent / "logs" if record else Path(tempfile.mkdtemp(prefix="perch-"))
     launches = node_launches(scenario, nodes, seed=seed, scenario_source=scenario_source, lockstep=lockstep, overrides=own)
@@ -74,8 +74,8 @@ def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: st
         PerchError: a node to compose does not exist, or the workspace is not built or not sourced.
     """
     for name in composed:
-        if name not in PACKAGES:
-            raise PerchError(f"node {name!r} is not one of {', '.join(PACKAGES)}")
+        if name not in NODES:
+            raise PerchError(f"node {name!r} is not one of {', '.join(NODES)}")
     arguments = {launch.name: ros_arguments(launch, folder, namespace) for launch in launches}
     together = [launch for launch in launches if launch.name in composed]
     found = []

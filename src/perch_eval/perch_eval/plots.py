@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
-from perch_msgs.msg import EstimatorStatus
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend must be chosen first)
@@ -20,6 +19,7 @@ from perch_eval.flight import Flight  # noqa: E402
 from perch_eval.metrics import perch_window, thrust_history, tilt_degrees, touch_of  # noqa: E402
 
 TRUTH, ESTIMATE, WANTED, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
+RUNNING = 1  # state in perch_msgs/EstimatorStatus
 
 
 def encode(figure: Any) -> str:
@@ -78,12 +78,11 @@ def path_figure(flight: Flight) -> str:
     keep = (truth.t >= t0) & (truth.t <= t1 - 0.4)
     p, q = truth.p[keep], truth.q[keep]
     figure, axis = plt.subplots(figsize=(6.5, 5))
-    target = flight.messages("ground_truth/target")
+    target = flight.values("ground_truth/target")
     direction = np.array([1.0, 0.0])
     if target:
-        pose = target[-1][1].pose
-        o, c = pose.orientation, np.array([pose.position.x, pose.position.y, pose.position.z])
-        R = so3.quat_to_matrix(np.array([o.x, o.y, o.z, o.w]))
+        pad = target[-1][1]
+        c, R = np.array(pad.p), so3.quat_to_matrix(np.array(pad.q))
         horizontal = np.cross(R[:, 1], [0.0, 0.0, 1.0])[:2]
         if np.linalg.norm(horizontal) > 1e-6:
             direction = horizontal / np.linalg.norm(horizontal)
@@ -134,7 +133,7 @@ def thrust_figure(flight: Flight, vehicle: Vehicle) -> str:
     t, reached, commanded = thrust_history(flight, vehicle)
     keep = (t >= t0) & (t <= t1)
     figure, axis = plt.subplots(figsize=(12, 2.8))
-    tr, wanted = flight.vectors("controller/reference", lambda m: m.thrust)
+    tr, wanted = flight.vectors("controller/reference", lambda r: r.thrust)
     inside = (tr >= t0) & (tr <= t1)
     axis.plot(tr[inside], wanted[inside] if len(tr) else [], color=WANTED, lw=1.2, label="wanted")
     axis.plot(t[keep], commanded[keep], color=ESTIMATE, lw=0.9, label="commanded to the rotors (leads the lag)")
@@ -154,12 +153,12 @@ def error_figure(flight: Flight) -> str:
     truth, estimate = flight.states("ground_truth/odometry"), flight.states("odometry")
     if estimate is None:
         return ""
-    running = [t for t, m in flight.messages("estimator/status") if m.state == EstimatorStatus.RUNNING]
+    running = [t for t, health in flight.values("estimator/status") if health.state == RUNNING]
     began = running[0] if running else estimate.t[0]  # before, the filter knows nothing: kilometres of sigma
-    messages = [(t, m) for t, m in flight.messages("odometry") if t >= began]
+    shown = [(t, state) for t, state in flight.values("odometry") if t >= began][::10]
     keep = estimate.t >= began
-    sigma = np.array([np.sqrt(np.maximum(0.0, np.reshape(m.pose.covariance, (6, 6)).diagonal()[:3])) for _, m in messages[::10]])
-    ts = np.array([t for t, _ in messages[::10]])
+    sigma = np.array([np.sqrt(np.maximum(0.0, state.pose_covariance.diagonal()[:3])) for _, state in shown])
+    ts = np.array([t for t, _ in shown])
     error = estimate.p - truth.at(estimate.t).p
     figure, axes = plt.subplots(1, 3, figsize=(12, 2.8), sharex=True)
     for i, (axis, name) in enumerate(zip(axes, "xyz")):
@@ -176,11 +175,10 @@ def camera_frames(flight: Flight, times: list[float]) -> list[tuple[str, str]]:
     """Images nearest to given times: (caption, base64 JPEG) of each camera."""
     out = []
     for camera in ("front", "down"):
-        frames = flight.messages(f"camera_{camera}/image_raw/compressed")
+        frames = flight.values(f"camera_{camera}/image_raw/compressed")
         for time in times:
             if frames:
-                t, msg = min(frames, key=lambda item: abs(item[0] - time))
-                image = cv2.imdecode(np.frombuffer(bytes(msg.data), np.uint8), cv2.IMREAD_COLOR)
-                _, jpeg = cv2.imencode(".jpg", cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+                t, image = min(frames, key=lambda item: abs(item[0] - time))
+                _, jpeg = cv2.imencode(".jpg", cv2.resize(image.pixels(), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
                 out.append((f"{camera} camera, t = {t:.2f} s", base64.b64encode(jpeg.tobytes()).decode()))
     return out

@@ -9,6 +9,7 @@ import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,10 +117,15 @@ class RunningProgram:
         return Ending(self.program.name, code, tuple(self._tail), self._log)
 
     def _read(self) -> None:
-        stream = self._process.stdout
-        with self._log.open("w", buffering=1) as file, stream:
+        """Take everything that it writes, whatever becomes of the log: a program whose pipe is full waits, one whose pipe is closed dies."""
+        with self._process.stdout as stream, ExitStack() as stack:
+            file = None
+            with suppress(OSError):
+                file = stack.enter_context(self._log.open("wb", buffering=0))
             for line in stream:
-                file.write(line)
+                with suppress(OSError):
+                    if file is not None:
+                        file.write(line.encode())
                 self._tail.append(line.rstrip())
                 self._on_line(self.program.name, line.rstrip())
 

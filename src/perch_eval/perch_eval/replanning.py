@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
+from perch_core.errors import PerchError
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.results import RunResult, read_results
 from perch_eval.statistics import Rate, Spread
@@ -78,18 +80,23 @@ def plot(found: list[tuple[RunResult, RunResult]], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
-    """Command line."""
+def main() -> int:
+    """Command line; 2 where the results cannot be read."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path)
     parser.add_argument("--out", type=Path, default=Path("out/replanning"))
     arguments = parser.parse_args()
-    found = pairs(read_results(arguments.results))
+    try:
+        found = pairs(read_results(arguments.results))
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     arguments.out.mkdir(parents=True, exist_ok=True)
     plot(found, arguments.out / "replanning.png")
     (arguments.out / "replanning.json").write_text(json.dumps(summary(found), indent=2) + "\n")
     print(json.dumps(summary(found), indent=2))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.flight import Flight
@@ -16,7 +15,9 @@ from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected
 from perch_eval.inspection.recorded import recorded
 from perch_eval.metrics import contact_report, diagnostics, flight_metrics, missed_deadlines, node_durations, perch_window, rates
-from perch_eval.pilot import SUCCESSES
+from perch_eval.goal import SUCCESSES
+from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_sim.scenario import Scenario
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -44,12 +45,12 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         start_time: simulation time at which it was sent [s]; None: the recording begins with it.
 
     Returns:
-        The content of `report.json`.
+        The content of `report.json`; with `unwritten`, the reason, where neither file could be written.
     """
     vehicle = load_vehicle(scenario.vehicle)
-    flight = Flight(folder / "flight.mcap")
+    flight = RecordedFlight(folder / "flight.mcap")
     if start_time is None:
-        first = flight.messages("ground_truth/odometry")
+        first = flight.values("ground_truth/odometry")
         start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
         "outcome": outcome, "message": message, "scenario": scenario.name, "seed": seed,
@@ -58,7 +59,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         **flight_metrics(flight, vehicle, end_time),
         "flight_hash": flight.digest(end_time),
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
-        "missed_deadlines": missed_deadlines(flight),
+        "missed_deadlines": missed_deadlines(flight), "recording_damage": flight.damage,
     }
     inspection = recorded(flight, scenario)
     if inspection is not None:
@@ -66,8 +67,14 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
             "reference_collisions": inspection.reference.collisions, "collisions": inspection.collisions,
             "reference_reprojection_px": inspection.reference.reprojection, "reprojection_px": inspection.flown.reprojection,
             "least_clearance": float(inspection.flown.clearance.min())}
-    (folder / "report.json").write_text(json.dumps(_finite(report), indent=2) + "\n")
-    (folder / "report.html").write_text(_page(flight, scenario, report, vehicle, inspection))
+    files = {"report.json": json.dumps(_finite(report), indent=2) + "\n", "report.html": _page(flight, scenario, report, vehicle, inspection)}
+    try:
+        for name, content in files.items():
+            (folder / name).write_text(content)
+    except OSError as error:
+        for name in files:
+            (folder / name).unlink(missing_ok=True)  # half a report, or one of an earlier flight
+        report["unwritten"] = f"{folder}: the report cannot be written: {error.strerror}"
     return report
 
 
@@ -84,20 +91,18 @@ COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/
 
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
-    rows = [(t, f"mission orders {COMMANDS[m.command]}: {m.reason}") for t, m in flight.messages("controller/command")]
-    for _, m in flight.messages("trajectory"):
-        start = m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
-        length = sum(s.duration for s in m.segments) if m.segments else m.points[-1].time_from_start
-        kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[m.at_end]
-        rows.append((start, f"trajectory {m.id} ({kind}) starts, {length:.2f} s"))
+    rows = [(t, f"mission orders {COMMANDS[c.command]}: {c.reason}") for t, c in flight.values("controller/command")]
+    for _, order in flight.values("trajectory"):
+        kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[order.at_end]
+        rows.append((order.trajectory.start_time, f"trajectory {order.id} ({kind}) starts, {order.trajectory.duration:.2f} s"))
     last = None
-    for t, m in flight.messages("controller/status"):
-        if m.message and m.message != last:
-            rows.append((t, f"controller says: {m.message}"))
-            last = m.message
+    for t, status in flight.values("controller/status"):
+        if status.message and status.message != last:
+            rows.append((t, f"controller says: {status.message}"))
+            last = status.message
     states = {0: "free", 1: "attached to", 2: "bounced off", 3: "collided with", 4: "on"}
-    for t, m in flight.messages("contact"):
-        rows.append((t, f"contact (truth): {states[m.state]} {m.body}" + (f", {m.reason}" if m.reason else "")))
+    for t, contact in flight.values("contact"):
+        rows.append((t, f"contact (truth): {states[contact.state]} {contact.body}" + (f", {contact.reason}" if contact.reason else "")))
     return sorted(rows)
 
 
@@ -132,6 +137,8 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
                                       f" (real-time factor {report['real_time_factor']:.2f})"),
         _row("flight hash", report["flight_hash"][:16]),
     ]
+    if flight.damage:
+        rows.insert(3, _row("recording", f"cut off or damaged ({flight.damage}): the figures are of what can be read"))
     if contact:
         rows.insert(3, _row("contact", f"{contact['state']} at {contact['time']:.3f} s: {contact['normal_speed_m_s']:.2f} m/s normal, "
                                        f"{contact['tangential_speed_m_s']:.2f} m/s tangential, tilt error {contact['tilt_error_deg']:.1f} deg, "

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from perch_core.errors import PerchError
@@ -15,6 +17,8 @@ from perch_eval.shared_memory import SharedMemory
 
 _ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 1.0))
 """Signals to stop with, and how long each has [s]: on a busy machine a recording may need seconds to be finished."""
+_AT_START = ((signal.SIGINT, 0.3), (signal.SIGTERM, 0.2), (signal.SIGKILL, 1.0))
+"""The same while programs load and compile: they have nothing to finish, and may not listen yet."""
 _POLL_S = 0.02
 
 
@@ -56,6 +60,7 @@ class Stack:
                              **(environment or {})}
         self._on_line = on_line
         self._memory = SharedMemory()
+        self._ready = False
         self._started: dict[str, RunningProgram] = {}
 
     def __enter__(self) -> Stack:
@@ -113,6 +118,7 @@ class Stack:
                 raise StackError(f"not ready after {timeout:g} s: {missing}. Logs: {self._log_dir}")
             time.sleep(_POLL_S)
         self.raise_if_ended()
+        self._ready = True
         self._memory.observe(self.pids.values())
 
     def wait(self, done: Callable[[], bool] = lambda: False) -> tuple[Ending, ...]:
@@ -134,19 +140,36 @@ class Stack:
     def stop(self) -> dict[str, Ending]:
         """Stop everything: interrupt, where that does not help terminate, then kill. Repeating it is harmless.
 
+        A second Ctrl-C does not interrupt it, where it is called by the main thread.
+
         Returns:
             How each program ended.
         """
-        self._memory.observe(self.pids.values())
-        for number, patience in _ESCALATION:
-            running = [program for program in self._started.values() if program.running]
-            for program in running:
-                program.signal(number)
-            deadline = time.monotonic() + patience
-            for program in running:
-                program.wait(max(0.0, deadline - time.monotonic()))
-        for program in self._started.values():
-            program.signal(signal.SIGKILL)  # what a program may have left in its group
-        endings = {name: program.ending() for name, program in self._started.items()}
-        self._memory.clean()
-        return endings
+        with _undisturbed():
+            self._memory.observe(self.pids.values())
+            for number, patience in _ESCALATION if self._ready else _AT_START:
+                running = [program for program in self._started.values() if program.running]
+                for program in running:
+                    program.signal(number)
+                deadline = time.monotonic() + patience
+                for program in running:
+                    program.wait(max(0.0, deadline - time.monotonic()))
+            for program in self._started.values():
+                program.signal(signal.SIGKILL)  # what a program may have left in its group
+            endings = {name: program.ending() for name, program in self._started.items()}
+            self._memory.clean()
+            return endings
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore what would interrupt."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)

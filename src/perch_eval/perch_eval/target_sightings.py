@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from perch_core import so3
-from perch_core.scenario import Scenario
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_eval.estimation_flight import EstimatorTrack, Flight
@@ -19,6 +18,7 @@ from perch_perception.tags import BoardLocalizer, to_map
 from perch_perception.tags.map_pose import CalibrationSigma
 from perch_sim.calibration import true_mount
 from perch_sim.rendering import Renderer, build_scene
+from perch_sim.scenario import Scenario
 
 
 @dataclass(frozen=True)

@@ -7,28 +7,21 @@ All nodes of a scenario are run in one process on the ground for a moment of sim
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 
-from perch_core.ros.node import close_nodes  # before numpy: it limits numpy's threads
-
-import rclpy
-from perch_core.ros import qos
-from perch_core.scenario import load_scenario
-from perch_eval.composed_node import create_nodes
 from perch_eval.domain import reserved_domain
+from perch_eval.goal import SUCCESSES
 from perch_eval.in_process import Sensing, fly
 from perch_eval.nodes import ALL_NODES, programs
-from perch_eval.pilot import SUCCESSES
-from perch_msgs.msg import Step
-from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
+from perch_eval.ros.pilot import Pilot
+from perch_eval.stack import Stack
+from perch_sim.scenario import load_scenario
 
 SIMULATED = 1.5   # [s] long enough for VIO to start and the filter to take its poses
+CLOCK_BEGINS = 1.0  # [s] the vehicle's
 PATIENCE = 600.0  # [s] wall clock
 
 
@@ -36,28 +29,25 @@ def warm_up(scenario_name: str = "surface_90") -> bool:
     """Run a scenario's nodes on the ground, then its flight in process; whether both got as far as they should.
 
     A kernel that is left to be compiled in flight keeps its node silent for so long that the vehicle may drop it.
+
+    Raises:
+        PerchError: a node ended, or did not come up.
     """
     scenario = load_scenario(scenario_name)
-    with tempfile.TemporaryDirectory() as folder, reserved_domain() as domain:
+    with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        programs(scenario, composed=ALL_NODES, record=Path(folder) / "flight.mcap", folder=Path(folder))
-        plan = json.loads((Path(folder) / "composed.json").read_text())
-        rclpy.init(args=[])
-        nodes = create_nodes(plan)
-        watch = Node("warm_up")
-        reached = [0.0]
-        watch.create_subscription(
-            Step, "step", lambda m: reached.__setitem__(0, m.stamp.sec + 1e-9 * m.stamp.nanosec), qos.STEP)
-        executor = EventsExecutor()
-        for node in (*nodes, watch):
-            executor.add_node(node)
-        # The vehicle's clock starts at one second.
-        end, last = 1.0 + SIMULATED, time.monotonic() + PATIENCE
-        while reached[0] < end and time.monotonic() < last:
-            executor.spin_once(timeout_sec=0.5)
-        close_nodes([*nodes, watch])
-        rclpy.try_shutdown()
-    return reached[0] >= end and fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
+        folder = Path(name)
+        overrides = {"vehicle": {"start_timeout": PATIENCE, "lockstep_timeout": PATIENCE}}
+        started = programs(scenario, composed=ALL_NODES, record=folder / "flight.mcap", folder=folder, overrides=overrides)
+        with Stack(started, folder) as stack:
+            pilot = Pilot()
+            try:
+                stack.wait_until_ready(pilot.visible_nodes, PATIENCE)
+                pilot.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
+                reached = pilot.time >= CLOCK_BEGINS + SIMULATED
+            finally:
+                pilot.close()
+    return reached and fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
 
 
 if __name__ == "__main__":

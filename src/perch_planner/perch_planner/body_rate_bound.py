@@ -25,7 +25,6 @@ from perch_planner.bounds import (
     smallest,
     split,
     squared,
-    value,
 )
 
 _DEPTH = 20
@@ -231,15 +230,6 @@ def rate_maximum(parts, attained, limit):
         start[top + 1], depth[top + 1] = begin, level
         top += 2
     return attained, proved, place
-
-
-@compiled
-def rate_at(parts, s):
-    """|omega| at one place of a segment."""
-    at = np.zeros((_PARTS, 1))
-    for row in range(_PARTS):
-        at[row, 0] = value(parts[row, :_SIZES[row]], s)
-    return sqrt(_squared_rate(at))
 
 
 @compiled

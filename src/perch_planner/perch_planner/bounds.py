@@ -77,7 +77,7 @@ def split(work, left):
 
 @compiled
 def stays_below(coefficients, bound):
-    """Whether a polynomial stays below a bound on [0, 1]. [M:alg1, decided by subdivision]
+    """Whether a polynomial stays below a bound on [0, 1]. [defines M:alg1, decided by subdivision]
 
     Args:
         coefficients: Bernstein coefficients, shape (n + 1,).

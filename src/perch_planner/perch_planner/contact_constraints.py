@@ -1,4 +1,4 @@
-"""The linear constraints of a perch: end conditions, impact window and tube. [M:eq11, M:eq14, M:eq15]"""
+"""The linear constraints of a perch: end conditions, impact window and tube."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
-from perch_planner.linear_bounds import Bounds
 from perch_planner.problem import PerchProblem, PerchSettings
 
 INSET = 1e-7
@@ -56,7 +55,12 @@ def _bounds(durations, before_end, tube_lower, tube_upper, window, window_lower,
 
 
 @compiled
-def _tube(end_acceleration, share, floor):
+def tube_bounds(end_acceleration, share, floor):
+    """Bounds on the acceleration before contact [m/s^2], two arrays of shape (3,). [defines M:eq15]
+
+    The paper scales each component by (1 - q) and (1 + q): for a negative component that swaps the bounds, so they are
+    sorted here; for a component near zero it leaves no room, so each axis has at least `tube_floor` on both sides.
+    """
     lower, upper = np.empty(3), np.empty(3)
     for d in range(3):
         near, far = (1.0 - share) * end_acceleration[d], (1.0 + share) * end_acceleration[d]
@@ -65,18 +69,9 @@ def _tube(end_acceleration, share, floor):
     return lower, upper
 
 
-def tube_bounds(end_acceleration: np.ndarray, settings: PerchSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds on the acceleration before contact [m/s^2], two arrays of shape (3,). [M:eq15]
-
-    The paper scales each component by (1 - q) and (1 + q): for a negative component that swaps the bounds, so they are
-    sorted here; for a component near zero it leaves no room, so each axis has at least `tube_floor` on both sides.
-    """
-    return _tube(end_acceleration, settings.tube_tolerance, settings.tube_floor)
-
-
 @compiled
 def _window(R_WS, velocity, least, most, tangential):
-    """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [M:eq14]"""
+    """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]"""
     count = 1 + len(_OCTAGON)
     directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
     for k in range(count):
@@ -122,7 +117,8 @@ def _bubbles(count, given, first_in_tube, everywhere):
 
 
 @compiled
-def _instants(duration, tube_time, tube_step):
+def tube_times(duration, tube_time, tube_step):
+    """The instants t_f - t_k + j dt, 0 <= j < t_k / dt, of the tube [s]. [M:eq15]"""
     count = int(np.ceil(tube_time / tube_step - 1e-9))
     out = np.empty(count)
     for j in range(count):
@@ -133,7 +129,7 @@ def _instants(duration, tube_time, tube_step):
 @compiled
 def _contact(points, v, a, j, places, orders, fixed, R_WS, velocity, alpha, share, floor, tube_time, tube_step, least, most,
              tangential):
-    """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] of a problem, for a target that stands still.
+    """Knots, tube and window of a problem, for a target that stands still. [defines M:eq11]
 
     Returns:
         (given, values, before_contact): what is given at start, waypoints and contact, shapes (k, 4) and (k, 4, 3), and
@@ -149,15 +145,19 @@ def _contact(points, v, a, j, places, orders, fixed, R_WS, velocity, alpha, shar
     values[0, 1], values[0, 2], values[0, 3], values[last, 2] = v, a, j, acceleration
     for q in range(len(places)):
         given[places[q], orders[q]], values[places[q], orders[q]] = True, fixed[q]
-    lower, upper = _tube(acceleration, share, floor)
+    lower, upper = tube_bounds(acceleration, share, floor)
     directions, window_lower, window_upper = _window(R_WS, velocity, least, most, tangential)
-    return given, values, (_instants(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
+    return given, values, (tube_times(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
                            window_upper)
 
 
 @compiled
-def conditions_kernel(durations, everywhere, velocity, problem):
-    """All of `Contact` for given durations, in one call.
+def conditions(durations, everywhere, velocity, problem):
+    """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] for given durations.
+
+    A moving target is met where it is at the end. Where there are more durations than segments of the problem, nothing is
+    given at the knots between the last waypoint and contact. The approach runs along -s3, the *outward* normal, so the
+    window reads v_min <= -v(t_f) . s3 <= v_max; all velocities are relative to the surface.
 
     Args:
         durations: of the segments [s], shape (f,).
@@ -165,18 +165,13 @@ def conditions_kernel(durations, everywhere, velocity, problem):
         velocity, problem: attributes of `Contact`.
 
     Returns:
-        (given, values, bubbles, bounds): arguments of `reduced_qp.assemble_kernel`, and fields of `Bounds`.
+        (given, values, bubbles, bounds): arguments of `reduced_qp.assemble`, and fields of `Bounds`.
     """
     given, values, before_contact = _contact(*problem)
     bounds = _bounds(durations, *before_contact)
     bubbles = _bubbles(len(durations), given, bounds[1][0], everywhere)
     given, values = _knots(durations, given, values, velocity)
     return given, values, bubbles, bounds
-
-
-def tube_times(duration: float, settings: PerchSettings) -> np.ndarray:
-    """The instants t_f - t_k + j dt, 0 <= j < t_k / dt, of the tube [s]. [M:eq15]"""
-    return _instants(duration, settings.tube_time, settings.tube_step)
 
 
 class Contact:
@@ -202,26 +197,3 @@ class Contact:
         self.problem = (self.points, start.v, start.a, start.j, *derivatives, R_WS, self.velocity, settings.impact_acceleration,
                         settings.tube_tolerance, settings.tube_floor, settings.tube_time, settings.tube_step, least, most,
                         settings.tangential_speed_max * _INSCRIBED - INSET)
-
-    def knots(self, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is given at the knots and its values; a moving target is met where it is at the end. [M:eq6, M:eq11]
-
-        Where there are more durations than segments of the problem, nothing is given at the knots between the last
-        waypoint and contact.
-
-        Returns:
-            given, bool, shape (f + 1, 4), and values, shape (f + 1, 4, 3).
-        """
-        return conditions_kernel(durations, False, self.velocity, self.problem)[:2]
-
-    def bubbles(self, durations: np.ndarray, everywhere: bool) -> np.ndarray:
-        """Segments with bubbles, bool, shape (f,): those of the tube, those after a knot whose derivatives are all given, or all."""
-        return conditions_kernel(durations, everywhere, self.velocity, self.problem)[2]
-
-    def constraints(self, durations: np.ndarray) -> Bounds:
-        """Tube and impact window for these durations. [M:eq14, M:eq15]
-
-        The approach runs along -s3, the *outward* normal, so [M:eq14] reads v_min <= -v(t_f) . s3 <= v_max; all
-        velocities are relative to the surface.
-        """
-        return Bounds(*conditions_kernel(durations, False, self.velocity, self.problem)[3])

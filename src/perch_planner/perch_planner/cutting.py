@@ -16,9 +16,8 @@ from perch_core.vector3 import cross, dot
 from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import spin_rate
 from perch_planner.bounds import derivative, derivatives_at, value
-from perch_planner.linear_bounds import Bounds, no_bounds
+from perch_planner.linear_bounds import no_bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
-from perch_planner.rotor_thrusts import linear_bounds
 
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
 RIM_ROOM = 1.1     # times the rim's reach at the present tilt, as the tilt changes with the cut
@@ -149,15 +148,3 @@ def limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, hi
                 t += 1
             t, r = t + 1, r + 1
     return owner[:t], segments[:t], places[:t], orders[:t], direction[:t], lower[:r], upper[:r]
-
-
-def rotor_bounds(thrusts: tuple[np.ndarray, np.ndarray], coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray,
-                 low: float, high: float, rotors: tuple) -> Bounds:
-    """Bounds where a rotor's thrust leaves [low, high] [N] or is near to it: linear at the present plan, and good near it.
-
-    Args:
-        thrusts: of `rotor_thrusts.sampled`.
-        coefficients, yaw, durations: the plan.
-        rotors: of `rotor_thrusts.rotor_model`.
-    """
-    return Bounds(*linear_bounds(*thrusts, coefficients, yaw, durations, low, high, *rotors))

@@ -27,7 +27,6 @@ class Question(NamedTuple):
         near: a thrust outside its range by less is cut together with the other limits [m/s^2].
         waypoints: peaks of the thrust in so many segments are stretched rather than cut; those after them only where they
             are high.
-        cutting: cuts are made at all.
     """
 
     p_S: np.ndarray
@@ -44,11 +43,6 @@ class Question(NamedTuple):
     rate: float
     near: float
     waypoints: int
-    cutting: bool
-
-
-NOTHING = Question(*np.zeros((4, 3)), *(9 * [0.0]), 0, False)
-"""No question: for a program without cuts ahead."""
 
 
 class Judgement(NamedTuple):
@@ -100,16 +94,16 @@ def judge(coefficients, yaw, durations, question, patient, later):
         (extrema, results, (least, most, checked, holds, stretch), thrust, other): as in `Judgement`; cuts of the thrust and
         of the other limits, fields of `Bounds`.
     """
-    p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints, cutting = question
+    p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints = question
     extrema, least, most = thrust_extrema(coefficients, durations, low, high)
     broken = most > high or least < low
-    stretch = broken and (not cutting or (patient and _better_stretched(extrema, high, waypoints)))
+    stretch = broken and patient and _better_stretched(extrema, high, waypoints)
     checked = not broken or (later and not stretch and min(high - most, least - low) > -near)
     results, where, holds = np.empty((5, 5)), np.full((5, 2), -1.0), False
     if checked:
         results, where, holds = check(coefficients, yaw, durations, extrema, p_S, v_S, s3, low, high, speed, low_height,
                                       high_height, extension, clearance, rate)
-    cut = cutting and not stretch and not holds
+    cut = not stretch and not holds
     thrust = thrust_cuts(coefficients, durations, extrema, low if cut else -np.inf, high if cut else np.inf, side)
     if not cut:
         where[:] = -1.0

@@ -1,4 +1,4 @@
-"""All limits of a plan, checked on its published Bernstein coefficients. [M:eq16, M:alg1]"""
+"""All limits of a plan, checked on its published Bernstein coefficients."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _enclose(coefficients, limit, attained_elsewhere):
 
 @compiled
 def thrust_extrema(coefficients, durations, low, high):
-    """Least and greatest specific thrust of each segment. [M:eq9, M:eq16]
+    """Least and greatest specific thrust of each segment. [M:eq9] [defines M:eq16]
 
     A segment's extrema are enclosed closely where they break a limit or are those of the whole plan; other segments have
     bounds that are proved, but looser.

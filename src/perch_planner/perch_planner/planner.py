@@ -1,8 +1,8 @@
 """The perching planner: quadratic programs until every limit is proved, or a typed refusal. [M:IV-C]
 
-For given durations a QP [M:eq8] is solved and its plan checked; where a limit is violated, linear bounds are added and
-the QP is solved again (`settings.cuts`); where that does not help, the durations grow [M:IV-C.3]. Each of the three
-loops is bounded, so that a plan ends after at most `iterations_max` programs.
+For given durations a QP is solved and its plan checked; where a limit is violated, linear bounds are added and the QP is
+solved again; where that does not help, the durations grow [M:IV-C.3]. Each of the three loops is bounded, so that a plan
+ends after at most `iterations_max` programs. The procedure as the paper has it: `paper.paper_m`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from time import perf_counter
 import numpy as np
 
 from perch_core.trajectory import FlatTrajectory
+from perch_core.values import Certificate
 from perch_core.vehicle import Vehicle
-from perch_planner import plan_checks, refusals, sturm
-from perch_planner.certificates import Certificate, certificates
+from perch_planner import plan_checks, refusals
+from perch_planner.certificates import certificates
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Attempt, Outcome, Search
@@ -83,15 +84,11 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         raise _refusal(search, outcome)
     if settings.minimum_time:
         outcome = search.shortest(durations, outcome)
-    method = "bernstein"
-    if settings.decider == "sturm":
-        method = "sturm"
-        if not sturm.thrust_below(outcome.coefficients, outcome.durations, search.high):
-            raise PerchRefusal(refusals.SOLVER, "Algorithm 1 [M:alg1]", 0.0,
-                               "Sturm's chain does not confirm the thrust bound that subdivision proves",
-                               certificates(outcome.results, limits, vehicle.mass), search.iterations)
+    duration = float(outcome.durations.sum())
+    if duration > settings.duration_max:
+        raise refusals.too_long(settings, duration, certificates(outcome.results, limits, vehicle.mass), search.iterations)
     trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
-    proofs = certificates(outcome.results, limits, vehicle.mass, method)
+    proofs = certificates(outcome.results, limits, vehicle.mass)
     return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))
 
 
@@ -114,7 +111,8 @@ def _refusal(search: Search, best: Outcome) -> PerchRefusal:
     """Find out what stands in the way: each limit that failed is taken away, then several, until there is a plan."""
     asked = Limits.of(search.settings, search.vehicle)
     proofs = () if best.results is None else certificates(best.results, asked, search.vehicle.mass)
-    tried = f"{search.iterations} programs up to {search.attempts[-1].duration:.2f} s"
+    longest = search.attempts[-1].duration if search.attempts else float(search.first.sum())
+    tried = f"{search.iterations} programs up to {longest:.2f} s"
     alone = {(name,): Search(search.problem, search.settings, search.vehicle, search.limits.without(name))
              for name in _failed(search)}
     for taken, relaxed in alone.items():
@@ -153,6 +151,5 @@ def _needed(proofs: tuple[Certificate, ...], names: tuple[str, ...]) -> tuple[fl
     """By how much the first named limit is exceeded by a plan without it, and its figures in words."""
     by_name = {proof.quantity: proof for proof in proofs}
     first = by_name[names[0]]
-    margin = min(first.minimum - first.lower_limit, first.upper_limit - first.maximum)
     words = ", ".join(f"{n} in [{by_name[n].minimum:.3g}, {by_name[n].maximum:.3g}] {by_name[n].unit}" for n in names)
-    return margin, words
+    return first.margin, words

@@ -138,7 +138,7 @@ class PerchSettings:
     """
 
     impact_acceleration: float = quantity(3.3, unit="m/s^2", above=0.0, high=100.0, doc="alpha of [M:eq11]")
-    impact_speed_min: float = quantity(0.4, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3")
+    impact_speed_min: float = quantity(0.5, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3")
     impact_speed_max: float = quantity(0.6, unit="m/s", low=0.0, high=20.0, doc="v_max of [M:eq14], along -s3")
     tangential_speed_max: float = quantity(0.3, unit="m/s", above=0.0, high=20.0, doc="slip over the surface at contact")
     tube_time: float = quantity(0.15, unit="s", low=0.0, high=2.0, doc="t_k of [M:eq15]")
@@ -155,17 +155,10 @@ class PerchSettings:
     extension: float = quantity(-1.0, unit="m", high=2.0, doc="rim radius that clears the surface; negative: the vehicle's")
     clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of that rim from the surface")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
-    formulation: str = choice("reduced", options=("reduced", "full"), doc="reduced QP, or order 14 as in [M:eq5-8, M:eq17]")
-    bubbles: str = choice("tube", options=("tube", "everywhere"),
-                          doc="segments of full order 14 in the reduced QP; with jerk it is always everywhere")
-    solver: str = choice("daqp", options=("daqp", "osqp", "piqp"), doc="quadratic programming solver")
-    decider: str = choice("bernstein", options=("bernstein", "sturm"), doc="thrust bound: subdivision, or [M:alg1]")
-    stretching: str = choice("adaptive", options=("adaptive", "whole", "segments"),
-                             doc="what grows when a bound is violated: the approach or all, all, or as in [M:IV-C.3]")
-    rotors: str = choice("free", options=("required", "preferred", "free"),
-                         doc="each rotor's thrust stays in its range, on samples: always, where a plan is soon found, or not")
-    rotor_margin: float = quantity(0.005, low=0.0, high=0.4, doc="share of a rotor's range kept free at both its ends")
-    cuts: bool = quantity(True, doc="add linear bounds where a limit is violated, before the time is stretched")
+    solver: str = choice("daqp", options=("daqp", "osqp"), doc="quadratic programming solver; osqp where DAQP has no wheel")
+    rotors: str = choice("preferred", options=("preferred", "required"),
+                         doc="each rotor's thrust stays in its range, on samples: where a plan is soon found, or always")
+    rotor_margin: float = quantity(0.0, low=0.0, high=0.4, doc="share of a rotor's range kept free at both its ends")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
     last_segment_min: float = quantity(0.25, unit="s", low=0.05, high=5.0, doc="shortest last segment")

@@ -1,4 +1,4 @@
-"""The reduced quadratic program: exact elimination of every equality, then whitening. [M:eq4-8, M:eq11, M:eq14, M:eq15]
+"""The reduced quadratic program: exact elimination of every equality, then whitening. [M:eq4-8]
 
 Unknowns of one dimension are the derivatives at the knots and the bubbles of some segments (see reference_element).
 End conditions [M:eq6, M:eq11], waypoints and continuity of the first three derivatives [M:eq7] are then *values* of
@@ -19,7 +19,7 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_planner.bounds import bernstein_row
-from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, GRAMS, HERMITE, TABLES
+from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, HERMITE, TABLES
 
 _POSITIONS = TABLES[0].T.copy()
 
@@ -72,7 +72,7 @@ def _scales(ratio):
 
 @compiled
 def functional(duration, unit, s, order):
-    """Factors of the segment's functions in the order-th time derivative at place s, shape (15,)."""
+    """Factors of the segment's functions in the order-th time derivative at place s, shape (15,). [defines M:eq6]"""
     row, scale = bernstein_row(DEGREE - order, s), _scales(duration / unit)
     out = np.zeros(FUNCTIONS)
     for i in range(len(row)):
@@ -109,7 +109,7 @@ def _roles(given, first):
 
 @compiled
 def _eliminate(durations, unit, first, role, dependent, particular):
-    """All unknowns from the free ones, shape (n, m), with a continuous fourth derivative; completes `particular`."""
+    """All unknowns from the free ones, shape (n, m), with a continuous fourth derivative; completes `particular`. [defines M:eq7]"""
     f, n = len(durations), len(role)
     column = np.full(n, -1)
     m = 0
@@ -174,7 +174,7 @@ def _weigh(durations, unit, first, role, basis, gram, cost_order):
 
 @compiled
 def _reduced_cost(weighted, basis, role):
-    """Z' C Z: of the free unknowns themselves, and of those that depend on them, shape (m, m)."""
+    """Cost Z' C Z of the free unknowns themselves, and of those that depend on them, shape (m, m). [defines M:eq4]"""
     m = basis.shape[1]
     out = np.empty((m, m))
     i = 0
@@ -192,8 +192,23 @@ def _reduced_cost(weighted, basis, role):
 
 
 @compiled
-def assemble_kernel(durations, given, values, bubbles, gram, cost_order):
-    """`assemble` on plain arrays; the fields of `ReducedProgram`."""
+def assemble(durations, given, values, bubbles, gram, cost_order):
+    """Eliminate the equalities and whiten the cost. [M:eq4-8]
+
+    Args:
+        durations: segment durations [s], shape (f,).
+        given: which of position, velocity, acceleration, jerk are given at each knot, bool, shape (f + 1, 4).
+        values: their values in W [m, m/s, ...], shape (f + 1, 4, 3); ignored where not given.
+        bubbles: which segments have bubbles, bool, shape (f,). A segment that starts at a knot with everything given
+            must have them: a bubble then serves the continuity of the fourth derivative.
+        gram, cost_order: of `reference_element.GRAMS`, 4 minimises snap, 3 jerk.
+
+    Returns:
+        Fields of `ReducedProgram`.
+
+    Raises:
+        numpy.linalg.LinAlgError: the cost is not positive definite on what is left free.
+    """
     f = len(durations)
     unit = durations.sum() / f
     first, n = _first_bubbles(bubbles)
@@ -233,8 +248,8 @@ def assemble_kernel(durations, given, values, bubbles, gram, cost_order):
 
 
 @compiled
-def coefficients_kernel(durations, first, unit, spread, centre, w):
-    """`coefficients` on plain arrays."""
+def coefficients(durations, first, unit, spread, centre, w):
+    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; arguments before it: fields of `ReducedProgram`."""
     m, n = spread.shape
     unknowns = np.empty((3, n))
     for d in range(3):
@@ -253,26 +268,3 @@ def coefficients_kernel(durations, first, unit, spread, centre, w):
                 for c in range(DEGREE + 1):
                     out[i, d, c] += share * _POSITIONS[k, c]
     return out
-
-
-def assemble(durations: np.ndarray, given: np.ndarray, values: np.ndarray, bubbles: np.ndarray,
-             cost_order: int) -> ReducedProgram:
-    """Eliminate the equalities and whiten the cost. [M:eq4-8]
-
-    Args:
-        durations: segment durations [s], shape (f,).
-        given: which of position, velocity, acceleration, jerk are given at each knot, bool, shape (f + 1, 4).
-        values: their values in W [m, m/s, ...], shape (f + 1, 4, 3); ignored where not given.
-        bubbles: which segments have bubbles, bool, shape (f,). A segment that starts at a knot with everything given
-            must have them: a bubble then serves the continuity of the fourth derivative.
-        cost_order: 4 minimises snap, 3 jerk.
-
-    Raises:
-        numpy.linalg.LinAlgError: the cost is not positive definite on what is left free.
-    """
-    return ReducedProgram(*assemble_kernel(durations, given, values, bubbles, GRAMS[cost_order], cost_order))
-
-
-def coefficients(program: ReducedProgram, w: np.ndarray) -> np.ndarray:
-    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]."""
-    return coefficients_kernel(*program, w)

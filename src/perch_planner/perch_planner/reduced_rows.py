@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core.jit import compiled
-from perch_planner.linear_bounds import Bounds
-from perch_planner.reduced_qp import ReducedProgram, functional, index
+from perch_planner.reduced_qp import functional, index
 from perch_planner.reference_element import FUNCTIONS, HERMITE
 
 
@@ -47,8 +46,8 @@ def _normalise(rows, lower, upper):
 
 
 @compiled
-def rows_kernel(durations, first, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
-    """`rows_of` on the fields of its arguments."""
+def rows_of(durations, first, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
+    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); arguments: fields of `ReducedProgram` and `Bounds`."""
     m = len(spread)
     rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
     column, constant = np.empty(m), np.empty(3)
@@ -69,10 +68,5 @@ def rows_kernel(durations, first, unit, spread, centre, owner, segments, places,
 @compiled
 def appended(rows, lower, upper, program, bounds):
     """The rows of further bounds below those there are; fields of `ReducedProgram` and `Bounds`."""
-    more, low, high = rows_kernel(*program, *bounds)
+    more, low, high = rows_of(*program, *bounds)
     return np.concatenate((rows, more)), np.concatenate((lower, low)), np.concatenate((upper, high))
-
-
-def rows_of(program: ReducedProgram, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,)."""
-    return rows_kernel(*program, *bounds)

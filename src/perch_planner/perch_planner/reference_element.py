@@ -82,7 +82,7 @@ def _derivative_tables(positions: np.ndarray) -> np.ndarray:
 
 
 def _gram(order: int) -> np.ndarray:
-    """Integrals over [0, 1] of products of the order-th derivatives. [M:eq5 on the reference segment]"""
+    """Integrals over [0, 1] of products of the order-th derivatives: the cost matrix of a segment of 1 s. [defines M:eq5]"""
     n = DEGREE - order
     table = TABLES[order, :n + 1]
     binomials = bernstein.binomials(n)

@@ -8,8 +8,8 @@ import numpy as np
 
 from perch_core.errors import PlanningRefusal
 from perch_core.jit import compiled
+from perch_core.values import Certificate
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_planner.certificates import Certificate
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 
 BAD_INPUT = "bad_input"
@@ -119,8 +119,21 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
                            limits=("speed",))
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
-                           f"the start is {distance:.3f} m in front of the surface's plane; the rim needs {rim:.3f} m",
+                           f"the start is {_place(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it",
                            limits=("clearance",))
     if near >= 0 and not any(problem.target_velocity.tolist()):
-        raise PerchRefusal(BOX, f"clearance of waypoint {near - 1} from the surface's plane", at_waypoint,
-                           f"waypoint {near - 1} is {-at_waypoint:.3f} m behind the surface's plane", limits=("clearance",))
+        raise PerchRefusal(BOX, f"clearance of waypoint {near - 1} from the surface's plane", at_waypoint - limits.clearance,
+                           f"waypoint {near - 1} is {_place(at_waypoint)}; it needs more than {limits.clearance:.3f} m in front of it",
+                           limits=("clearance",))
+
+
+def _place(distance: float) -> str:
+    """A signed distance from the surface's plane [m] in words."""
+    return f"{abs(distance):.3f} m {'in front of' if distance >= 0.0 else 'behind'} the surface's plane"
+
+
+def too_long(settings: PerchSettings, duration: float, certificates: tuple[Certificate, ...] = (), iterations: int = 0) -> PerchRefusal:
+    """The refusal of a plan that would take `duration` [s]."""
+    return PerchRefusal(BOX, "duration_max", settings.duration_max - duration,
+                        f"a plan would take {duration:.2f} s, longer than duration_max {settings.duration_max:g} s; "
+                        "start nearer, ask for fewer waypoints, or raise duration_max", certificates, iterations, ("duration_max",))

@@ -8,13 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.vehicle import Vehicle
-from perch_planner import plan_checks
+from perch_planner import plan_checks, refusals
 from perch_planner.contact_constraints import Contact
-from perch_planner.cutting import rotor_bounds, turning_side
+from perch_planner.cutting import turning_side
 from perch_planner.judgement import Judgement, Question
+from perch_planner.linear_bounds import Bounds
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
-from perch_planner.rotor_thrusts import rotor_model, sampled
-from perch_planner.segment_program import COST_ORDER, FORMULATIONS
+from perch_planner.rotor_thrusts import linear_bounds, rotor_model, sampled
+from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
 from perch_planner.yaw_profile import yaw_coefficients
 
@@ -22,7 +23,6 @@ _CUT_ROUNDS = 24
 _PATIENCE = 5         # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
 _NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
 _PLAIN_STRETCH = 1.15
-_SEGMENT_STRETCH = 1.1  # of the paper's per-segment stretching
 _BISECTIONS = 12
 
 
@@ -71,8 +71,8 @@ class Search:
         self.question = Question(
             problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turning_side(self.end_yaw), self.low,
             self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _NEAR * self.high,
-            len(problem.waypoints), settings.cuts)
-        self.rotors = rotor_model(vehicle) if settings.rotors != "free" else None
+            len(problem.waypoints))
+        self.rotors = rotor_model(vehicle)
         self.attempts: list[Attempt] = []
         self.failures: Counter[str] = Counter()
 
@@ -90,8 +90,7 @@ class Search:
         settings, start = self.settings, self.problem.start
         nothing = Outcome(durations, None, None, None)
         try:
-            program = FORMULATIONS[settings.formulation](self.contact, durations, settings,
-                                                         self.question if settings.cuts else None)
+            program = SegmentProgram(self.contact, durations, settings, self.question)
         except np.linalg.LinAlgError:
             return nothing._replace(failure="solver")
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
@@ -100,7 +99,7 @@ class Search:
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= settings.iterations_max:
                 break
-            found = program.judged(yaw, self.question, patient, rounds > 0)
+            found = program.judged(yaw, patient, rounds > 0)
             if found is None:
                 self._note(duration, np.nan, np.nan, count)
                 break
@@ -110,20 +109,19 @@ class Search:
                 return outcome
             count += found.cuts
             if found.checked:
-                results, holds, thrusts = found.results, found.holds, None
-                if self.rotors is not None:
-                    results, kept, thrusts = self._rotors(found.coefficients, yaw, durations, results)
-                    holds = holds and kept
-                    turning = turning or not kept
-                if holds:
+                low, high = self.limits.rotor_thrust
+                thrusts, row = sampled(found.coefficients, yaw, durations, *self.rotors)
+                kept = low <= row[0] and row[2] <= high
+                results, turning = np.vstack([found.results, [*row, kept]]), turning or not kept
+                if found.holds and kept:
                     return Outcome(durations, found.coefficients, yaw, results)
-                if turning and settings.cuts:
-                    bounds = rotor_bounds(thrusts, found.coefficients, yaw, durations, *self.limits.rotor_thrust, self.rotors)
+                if turning:
+                    bounds = Bounds(*linear_bounds(thrusts, row, found.coefficients, yaw, durations, low, high, *self.rotors))
                     program.replace(bounds)
                     count += len(bounds.lower)
                 outcome = outcome or self._limit(durations, found.coefficients, yaw, results)
             best = outcome
-            if not (found.cuts or turning) or not settings.cuts:
+            if not (found.cuts or turning):
                 break
         # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
         return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or nothing
@@ -141,13 +139,6 @@ class Search:
         name = [n for n, row in zip(plan_checks.NAMES, results) if not row[plan_checks.HOLDS]][-1]
         return Outcome(durations, coefficients, yaw, results, name, self._margin(results, name))
 
-    def _rotors(self, coefficients: np.ndarray, yaw: np.ndarray, durations: np.ndarray, results: np.ndarray):
-        """Rows of `plan_checks.NAMES`, whether the rotors' limits are kept, and their samples."""
-        low, high = self.limits.rotor_thrust
-        thrusts, row = sampled(coefficients, yaw, durations, *self.rotors)
-        kept = low <= row[0] and row[2] <= high
-        return np.vstack([results, [*row, kept]]), kept, (thrusts, row)
-
     def _margin(self, results: np.ndarray, name: str) -> float:
         row, limits = results[plan_checks.NAMES.index(name)], self.limits
         if name == "speed":
@@ -164,8 +155,14 @@ class Search:
         self.attempts.append(Attempt(duration, mass * least, mass * most, cuts))
 
     def run(self) -> tuple[np.ndarray, Outcome]:
-        """Lengthen until every limit is proved, or the time or the number of programs is used up."""
+        """Lengthen until every limit is proved, or the time or the number of programs is used up.
+
+        Raises:
+            PerchRefusal: the first durations are longer than `duration_max` already.
+        """
         durations, best, stretched = self.first, None, 0
+        if not self.settings.minimum_time and float(durations.sum()) > self.settings.duration_max:  # they only grow
+            raise refusals.too_long(self.settings, float(durations.sum()))
         while True:
             outcome = self.try_durations(split_last(durations), patient=stretched < _PATIENCE)
             if outcome.proved:
@@ -180,24 +177,15 @@ class Search:
             durations = grown
 
     def longer(self, durations: np.ndarray, outcome: Outcome) -> np.ndarray:
-        """The next durations. [M:IV-C.3]
+        """The next durations: all are longer where the thrust fails before the last waypoint, else the approach. [M:IV-C.3]
 
         Args:
             durations: of the problem's segments, shape (waypoints + 1,).
             outcome: what they gave.
         """
-        last = len(durations) - 1
-        violated = np.zeros(last + 1, bool)
-        if outcome.extrema is not None:
-            outside = (outcome.extrema[:, 4] > self.high) | (outcome.extrema[:, 1] < self.low)
-            for i in np.flatnonzero(outside):
-                violated[min(i, last)] = True
-        if self.settings.stretching == "segments" and violated.any():
-            grown = np.where(violated, _SEGMENT_STRETCH * durations, durations)
-        elif self.settings.stretching == "adaptive" and not violated[:last].any():
-            grown = lengthen_approach(durations)
-        else:
-            grown = outcome.stretch * durations
+        before = None if outcome.extrema is None else outcome.extrema[:len(durations) - 1]
+        early = before is not None and ((before[:, 4] > self.high) | (before[:, 1] < self.low)).any()
+        grown = outcome.stretch * durations if early else lengthen_approach(durations)
         return with_last_segment(grown, self.settings)
 
     def shortest(self, durations: np.ndarray, outcome: Outcome) -> Outcome:

@@ -84,43 +84,22 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
     return np.asarray(result.x, float), str(result.info.status)
 
 
-def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
-    import piqp
-
-    n = rows.shape[1]
-    solver = piqp.DenseSolver()
-    solver.settings.eps_abs = solver.settings.eps_rel = 1e-10
-    solver.setup(np.eye(n), np.zeros(n), None, None, rows, lower, upper, None, None)
-    status = solver.solve()
-    return np.asarray(solver.result.x, float), str(status)
-
-
-_SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp, "piqp": _piqp}
-_MODULES = {"daqp": "daqp", "osqp": "osqp", "piqp": "piqp"}
-NAMES = tuple(_SOLVERS)
-_SOLVED = ("solved", "status.piqp_solved", "piqp_solved")
-
-
-def available() -> tuple[str, ...]:
-    """Names of the solvers that are installed, the fastest first."""
-    from importlib.util import find_spec
-
-    return tuple(name for name in NAMES if find_spec(_MODULES[name]) is not None)
+SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp}
 
 
 def least_norm(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: str = "daqp") -> Solution:
-    """The shortest w with `lower <= rows @ w <= upper`. [M:eq8 in whitened coordinates]
+    """The shortest w with `lower <= rows @ w <= upper`. [defines M:eq8, in whitened coordinates]
 
     Args:
         rows: rows of unit length, shape (r, n).
         lower, upper: bounds, infinite where there is none, shape (r,).
-        solver: `daqp`, `osqp` or `piqp`.
+        solver: `daqp` or `osqp`.
     """
     if _contains_zero(lower, upper):
         return Solution(np.zeros(rows.shape[1]), True, 0.0, "unconstrained optimum")
-    w, status = _SOLVERS[solver](rows, lower, upper)
+    w, status = SOLVERS[solver](rows, lower, upper)
     residual = _residual(rows, lower, upper, w) if w.shape == rows.shape[1:] else np.inf
     if residual == np.inf:
         return Solution(np.zeros(rows.shape[1]), False, np.inf, status)
     # A solver that says "infeasible" is not overruled by a residual; one that says "solved" is.
-    return Solution(w, status.lower() in _SOLVED and residual <= FEASIBILITY, residual, status)
+    return Solution(w, status.lower() == "solved" and residual <= FEASIBILITY, residual, status)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_core.scenario import Disturbance
 from perch_core.vehicle import Vehicle
+from perch_sim.scenario import Disturbance
 
 PLATE_POINTS = 8  # on the rim of the velcro plate
 TIP_POINTS = 8    # on the rim of each rotor disc

@@ -15,10 +15,10 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.catenary import Catenary
-from perch_core.scenario import Cable, Grip
 from perch_sim.attachment import FREE, Attachment
 from perch_sim.contact_event import ContactEvent, ContactState
 from perch_sim.dynamics import Hold
+from perch_sim.scenario import Cable, Grip
 
 TOUCH = 0.01       # nearer than this the cable is in the claw [m]
 LEAVING = 0.02     # ... and it has left when it is this far beyond the tolerance of position [m]
@@ -91,8 +91,14 @@ class CableMonitor:
         self._before = [math.inf] * len(cables)   # distance one update ago
         self._nearest: list[ContactEvent | None] = [None] * len(cables)  # of this pass
         self._attachment: Attachment | None = None
+        self._open = False  # let go, and not yet out of reach of what was held
         self.hold: Hold = FREE
         self.crashed = False
+
+    def release(self) -> None:
+        """Open the gripper; it can close again when no cable is within reach."""
+        self._open = self._open or self._attachment is not None
+        self._attachment, self.hold = None, FREE
 
     def update(self, time: float, x: np.ndarray) -> list[ContactEvent]:
         """What changed since the last call, one control period ago.
@@ -107,10 +113,12 @@ class CableMonitor:
             return []
         R_WB = so3.quat_to_matrix(x[3:7])
         gripper_W = x[:3] - self._offset * R_WB[:, 2]
-        events = []
-        for k, line in enumerate(self._lines):
-            near = line.nearest(gripper_W)
-            if near.distance <= self._grip.position + LEAVING:
+        events, nearest = [], [line.nearest(gripper_W) for line in self._lines]
+        self._open = self._open and min(near.distance for near in nearest) <= self._offset + self._reach
+        for k, (line, near) in enumerate(zip(self._lines, nearest)):
+            if self._open:
+                pass
+            elif near.distance <= self._grip.position + LEAVING:
                 events += self._within_reach(time, k, x, R_WB, gripper_W, near)
             else:
                 events += self._missed(k)
@@ -139,7 +147,7 @@ class CableMonitor:
         if not refusal and (near.distance < TOUCH or near.distance >= self._before[k]):
             square = R_WB[:, 2] - (R_WB[:, 2] @ near.direction) * near.direction
             self._attachment = Attachment(time, -1, gripper_W, near.point_W, x[3:7], square / np.linalg.norm(square), np.zeros(3))
-            self.hold = self._attachment.hold(time)
+            self.hold, self._nearest[k] = self._attachment.hold(time), None
             return [event._replace(state=ContactState.ATTACHED)]
         known = self._nearest[k]
         if refusal and (known is None or near.distance < known.offset):

@@ -9,8 +9,8 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.camera import CameraMount
-from perch_core.scenario import Scenario
 from perch_sim import seeding
+from perch_sim.scenario import Scenario
 
 # One sigma of a careful calibration of a unit of this size.
 FOCAL_ERROR = 0.003                # of each focal length [-]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_sim.camera_timing import CameraTiming, Frame
 from perch_sim.drawing import ImageToCome
-from perch_sim.state_history import StateHistory
+from perch_sim.rendering import Pose
+from perch_sim.state_history import Place, StateHistory, between
 
 POSES = 5  # of the body, spread over an exposure
 
@@ -46,7 +48,8 @@ class CameraStream:
             start: time at which the pad is where the scene has it [ns].
         """
         self.mount = mount
-        self._timing, self._begin, self._noise = timing, draw, noise
+        self._timing, self._begin = timing, draw
+        self._seed, self._drawn = noise.bit_generator.seed_seq, 0
         self._velocity, self._start = target_velocity, start
         self.most_waiting: int | None = None
         self.dropped = 0
@@ -89,8 +92,13 @@ class CameraStream:
         return self.most_waiting is not None and waiting >= self.most_waiting
 
     def _draw(self, frame: Frame, history: StateHistory) -> ImageToCome:
-        instants = np.linspace(frame.start, frame.end, POSES)
-        p_WB, q_WB = history.poses([int(t) for t in instants])
-        poses = list(zip(p_WB, so3.quat_to_matrix(q_WB)))
-        shift = self._velocity * (frame.middle - self._start) * 1e-9
-        return self._begin(poses, self._noise.spawn(1)[0], shift)
+        places = [history.around(int(t)) for t in np.linspace(frame.start, frame.end, POSES)]
+        seed = np.random.SeedSequence(self._seed.entropy, spawn_key=(*self._seed.spawn_key, self._drawn))
+        self._drawn += 1
+        return self._begin(partial(_exposure, places, seed, self._velocity * (frame.middle - self._start) * 1e-9))
+
+
+def _exposure(places: list[Place], seed: np.random.SeedSequence, shift: np.ndarray) -> tuple[list[Pose], np.random.Generator, np.ndarray]:
+    """The arguments of `Renderer.render`."""
+    p_WB, q_WB = between(places)
+    return list(zip(p_WB, so3.quat_to_matrix(q_WB))), np.random.default_rng(seed), shift

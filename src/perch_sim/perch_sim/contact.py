@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core import so3
-from perch_core.scenario import Adhesion
 from perch_sim.attachment import FREE, Attachment
 from perch_sim.contact_event import ContactEvent, ContactState
 from perch_sim.dynamics import Hold
 from perch_sim.obstacles import Obstacles
+from perch_sim.scenario import Adhesion
 
 SEPARATION = 0.05      # a touch is over when nothing has touched for so long [s]
 CRASH_SPEED = 2.0      # rotors and frame do not survive a faster impact [m/s]
@@ -83,6 +83,10 @@ class ContactMonitor:
     def free(self) -> bool:
         """Whether nothing was touched lately."""
         return not (self._touched or self.attached)
+
+    def release(self) -> None:
+        """Let go; what is touched still is not held again before it was left."""
+        self._attachment, self.hold = None, FREE
 
     def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
         """What changed at this instant.

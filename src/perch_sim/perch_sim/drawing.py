@@ -19,18 +19,25 @@ import numpy as np
 
 from perch_core.camera import CameraMount, Region
 from perch_core.processes import end_with_parent, give_way
-from perch_core.scenario import Scenario
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
+from perch_sim.scenario import Scenario
 
 NICE = 5             # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
 GREETING = b"ready"
+Exposure = Callable[[], tuple[Sequence[Pose], np.random.Generator, np.ndarray]]  # what `Renderer.render` takes, worked out when it is drawn
 PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [B]
 
 
 class ImageToCome(Protocol):
-    """An image that is being drawn."""
+    """An image that is being drawn.
+
+    Attributes:
+        on_demand: it is drawn when somebody looks at it; nobody needs to wait for it.
+    """
+
+    on_demand: bool
 
     def done(self, timeout: float = 0.0) -> bool:
         """Whether it is there; waits for it up to `timeout` [s]."""
@@ -48,8 +55,14 @@ class Drawing(Protocol):
 
     cameras: tuple[str, ...]
 
-    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+    def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
         """Begin the image of one exposure: `Renderer.render` of that camera."""
+
+    def ready(self) -> bool:
+        """Whether images that are ordered now come without delay."""
+
+    def close(self) -> None:
+        """End what draws."""
 
 
 class DrawnOnDemand:
@@ -64,20 +77,35 @@ class DrawnOnDemand:
         Args:
             scenario: what is seen.
             seed: of the flight.
-            cameras: names of those that take images.
-
-        Raises:
-            ConfigError: the scenario's vehicle or board does not exist.
+            cameras: names of those that take images; the scene is laid out when somebody looks at the first of them.
         """
         self.cameras = tuple(cameras)
-        self._renderers = {name: Renderer(scene, mount, seed) for name, scene, mount in _seen(scenario, seed, cameras)}
+        self._scenario, self._seed = scenario, seed
+        self._seen: dict[str, tuple[Scene, CameraMount]] = {}  # they share the scene, and with it its textures
+        self._renderers: dict[str, Renderer] = {}
 
-    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+    def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
         """As `Drawing.draw`."""
-        return _Undrawn(partial(self._renderers[camera].render, poses, rng, target_shift))
+        return _Undrawn(partial(self._render, camera, exposure))
+
+    def _render(self, camera: str, exposure: Exposure, region: Region | None) -> np.ndarray:
+        if not self._seen:
+            self._seen = {name: (scene, mount) for name, scene, mount in _seen(self._scenario, self._seed, self.cameras)}
+        if camera not in self._renderers:
+            self._renderers[camera] = Renderer(*self._seen[camera], self._seed)
+        return self._renderers[camera].render(*exposure(), region=region)
+
+    def ready(self) -> bool:
+        """Always."""
+        return True
+
+    def close(self) -> None:
+        """Nothing to end."""
 
 
 class _Undrawn:
+    on_demand = True
+
     def __init__(self, render: Callable[..., np.ndarray]) -> None:
         self._render, self._image = render, None
 
@@ -117,9 +145,9 @@ class DrawnInProcesses:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def draw(self, camera: str, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+    def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
         """As `Drawing.draw`."""
-        return self._draftsmen[camera].draw(poses, rng, target_shift)
+        return self._draftsmen[camera].draw(exposure)
 
     def ready(self) -> bool:
         """Whether every process has laid out its textures and drawn a first image, or has ended."""
@@ -162,12 +190,14 @@ class _Draftsman:
             self.receive(0.0)
         return self._ready or self._ended
 
-    def draw(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray) -> ImageToCome:
+    def draw(self, exposure: Exposure) -> ImageToCome:
         image = _Ordered(self)
         self._ordered.append(image)
         try:
-            self._orders.send((poses, rng, target_shift))
+            self._orders.send(exposure())
         except OSError:
+            self._end()
+        if self._ended:  # a process that is going away closes its pipes one by one: the order may have found a reader still
             self._end()
         return image
 
@@ -192,6 +222,8 @@ class _Draftsman:
 
 
 class _Ordered:
+    on_demand = False
+
     def __init__(self, draftsman: _Draftsman) -> None:
         self._draftsman, self._complete, self._image = draftsman, False, None
 

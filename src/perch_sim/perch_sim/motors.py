@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,19 +15,25 @@ class MotorCommandError(PerchError):
 
 
 class Motors:
-    """Holds the last good command and says what the rotors aim at."""
+    """Holds the last good command and says what the rotors aim at.
+
+    Attributes:
+        timeout: armed motors stop when no good command came for so long [ns].
+        timed_out: they have.
+        starts: how often they were started after they had been stopped by command.
+    """
 
     def __init__(self, speed_min: float, speed_max: float, timeout: int) -> None:
         """
         Args:
             speed_min, speed_max: of an armed rotor [rad/s].
-            timeout: armed motors stop when no good command came for so long [ns].
+            timeout: as above.
         """
-        self._low, self._high, self._timeout = speed_min, speed_max, timeout
+        self._low, self._high, self.timeout = speed_min, speed_max, timeout
         self._speeds, self._armed, self._received = np.zeros(4), False, 0
-        self.timed_out = False
+        self.timed_out, self.starts = False, 0
 
-    def command(self, now: int, armed: bool, speeds: np.ndarray) -> None:
+    def command(self, now: int, armed: bool, speeds: Sequence[float]) -> None:
         """Take a command.
 
         Args:
@@ -35,17 +42,20 @@ class Motors:
             speeds: rotor speeds (4,) [rad/s], limited to the armed range.
 
         Raises:
-            MotorCommandError: a speed is not finite; the command before it stays until it times out.
+            MotorCommandError: a speed is not finite, or there are not four; the command before it stays until it times out.
         """
         values = [float(s) for s in speeds]
+        if len(values) != 4:
+            raise MotorCommandError(f"motor_command: rotor_speed has {len(values)} entries, needs 4")
         if armed and not math.isfinite(sum(values)):
             raise MotorCommandError(f"motor_command: rotor_speed {values} is not finite")
+        self.starts += armed and not self._armed and not self.timed_out
         self._armed, self._received, self.timed_out = armed, now, False
         if armed:
             self._speeds = np.array([min(max(s, self._low), self._high) for s in values])
 
     def target(self, now: int) -> np.ndarray:
         """Speeds that the rotors aim at, (4,) [rad/s]."""
-        if self._armed and now - self._received > self._timeout:
+        if self._armed and now - self._received > self.timeout:
             self._armed, self.timed_out = False, True
         return self._speeds if self._armed else np.zeros(4)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_core.scenario import Scenario
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
+from perch_sim.scenario import Scenario
 
 FAR = 1e9          # extent of a plane without an end [m]
 PANEL_DEPTH = 0.1  # the panel is this thick [m]

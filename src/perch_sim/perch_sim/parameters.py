@@ -15,7 +15,6 @@ class VehicleParameters:
 
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
-    lockstep: bool = quantity(True, doc="false: paced by the wall clock")
     participants: tuple[str, ...] = text(
         ("controller",), doc="nodes that the lockstep waits for: controller, vio, vio_model, target_localizer, "
         "powerline_mapper, mission, recorder; an empty name: none")

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_core.scenario import Scenario
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding
@@ -17,6 +16,7 @@ from perch_sim.contact import ContactMonitor
 from perch_sim.contact_event import ContactEvent
 from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch
 from perch_sim.obstacles import make_obstacles
+from perch_sim.scenario import Scenario
 from perch_sim.state_history import TrueState
 from perch_sim.wind import WindField
 
@@ -79,6 +79,11 @@ class Plant:
     def hold(self) -> Hold:
         """What holds the vehicle: the velcro, the gripper, or nothing."""
         return self.contact.hold if self.contact.attached else self.cables.hold
+
+    def release(self) -> None:
+        """Velcro and gripper let go: a latch on the arming line of the motors opens them."""
+        self.contact.release()
+        self.cables.release()
 
     @property
     def rotor_thrust(self) -> np.ndarray:

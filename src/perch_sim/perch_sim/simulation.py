@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.errors import ConfigError
-from perch_core.scenario import Scenario
 from perch_core.surface import PerchSurface
 from perch_core.timing import CONTROL_PERIOD_NS
 from perch_core.vehicle import Vehicle, load_vehicle
@@ -28,14 +27,15 @@ from perch_sim.camera_timing import CameraTiming
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing
 from perch_sim.imu import Imu, ImuSample
+from perch_sim.lockstep.tasks import START
 from perch_sim.motors import Motors
 from perch_sim.obstacles import pad_surface
 from perch_sim.plant import SUBSTEPS, Plant
 from perch_sim.rendering.sensor import control_exposure
+from perch_sim.scenario import Scenario
 from perch_sim.state_history import StateHistory, TrueState
 
 SECOND = 1_000_000_000
-START = SECOND          # ROS reads a time of zero as "no time yet", so the flight starts at 1 s
 MEMORY = 60_000_000     # how far back an exposure may reach [ns]
 MOTOR_TIMEOUT = 100_000_000  # a motor controller stops without commands for so long [ns]
 
@@ -70,7 +70,7 @@ class Simulation:
             raise ConfigError(f"vehicles/{scenario.vehicle}", "imu.rate",
                               f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
-        self.motors = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout)
+        self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout), 0
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
@@ -102,7 +102,10 @@ class Simulation:
         return pad_surface(self.scenario, (self.time - START) * 1e-9)
 
     def advance(self) -> Output:
-        """One control period with the motors' present command."""
+        """One control period with the motors' present command; what holds the vehicle lets go when they are started."""
+        if self.motors.starts != self._starts:
+            self._starts = self.motors.starts
+            self.plant.release()
         result = self.plant.advance(self.motors.target(self.time))
         for state in result.states:
             self._history.append(state)

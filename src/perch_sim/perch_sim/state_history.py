@@ -38,6 +38,10 @@ class TrueState(NamedTuple):
         return self.x[10:13]
 
 
+Place = tuple[TrueState, TrueState, float]
+"""Two states and the share of the way from one to the other."""
+
+
 class StateHistory:
     """States at increasing times, as far back as a camera can ask."""
 
@@ -54,8 +58,8 @@ class StateHistory:
         Raises:
             LookupError: the time lies outside the history.
         """
-        a, b, s = self._around(time)
-        p, q = _between([(a, b, s)])
+        a, b, s = self.around(time)
+        p, q = between([(a, b, s)])
         return TrueState(time, np.concatenate([p[0], q[0], a.x[7:] + s * (b.x[7:] - a.x[7:])]))
 
     def poses(self, times: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -64,10 +68,14 @@ class StateHistory:
         Raises:
             LookupError: a time lies outside the history.
         """
-        return _between([self._around(time) for time in times])
+        return between([self.around(time) for time in times])
 
-    def _around(self, time: int) -> tuple[TrueState, TrueState, float]:
-        """The states before and after a time [ns], and the share of the way from one to the other."""
+    def around(self, time: int) -> Place:
+        """The states before and after a time [ns], and the share of the way from one to the other.
+
+        Raises:
+            LookupError: the time lies outside the history.
+        """
         states = self._states
         if not states or not states[0].time <= time <= states[-1].time:
             span = f"[{states[0].time}, {states[-1].time}]" if states else "an empty history"
@@ -81,7 +89,7 @@ class StateHistory:
         return a, b, (time - a.time) / (b.time - a.time)
 
 
-def _between(places: list[tuple[TrueState, TrueState, float]]) -> tuple[np.ndarray, np.ndarray]:
+def between(places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
     """Positions (n, 3) and attitudes (n, 4) at shares of the way between states."""
     # The weights in plain floats: the same bits for one time and for many.
     weights = np.array([((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), (b.time - a.time) * 1e-9 * s * (1 - s), 1 - s, s)

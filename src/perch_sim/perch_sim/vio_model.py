@@ -6,6 +6,9 @@ Error model, per pose: position and yaw drift as random walks, roll and pitch do
 comes white noise on position, attitude and velocity. A filter's pose is smooth: from frame to frame it jumps by a
 millimetre or two, while its drift grows to a centimetre within a flight. The covariance that goes with a pose is the
 white part plus what the drift has grown to.
+
+A VIO knows its biases, too: once it has started, each of its estimates is off by a constant error of a known size, while the truth
+walks away from what it was at turn-on.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.config import quantity, text
+from perch_core.vehicle import ImuConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,15 +29,17 @@ class VioModelParameters:
     """Parameters of the node `vio_model`."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml")
-    seed: int = quantity(1, low=0, high=2**31 - 1)
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="the vehicle's: the biases of its IMU are known by it")
     camera: str = text("down", doc="whose frames are answered")
-    latency: float = quantity(0.040, unit="s", low=0.0, high=1.0,
-                              doc="exposure to output in real time; in lockstep the scenario's latency.vio counts")
+    latency: float = quantity(0.0, unit="s", low=0.0, high=1.0,
+                              doc="exposure to output, by the stamps of the truth; 0 where a schedule lets the output count later")
     position_drift: float = quantity(0.004, unit="m/sqrt(s)", low=0.0, doc="random walk of each axis")
     yaw_drift: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="random walk")
     position_noise: float = quantity(0.0015, unit="m", low=0.0, doc="1 sigma of each axis, white")
     attitude_noise: float = quantity(0.0015, unit="rad", low=0.0, doc="1 sigma of each axis, white")
     velocity_noise: float = quantity(0.03, unit="m/s", low=0.0, doc="1 sigma of each axis, white")
+    gyro_bias_error: float = quantity(0.0005, unit="rad/s", above=0.0, doc="of each axis' estimate, 1 sigma")
+    accel_bias_error: float = quantity(0.015, unit="m/s^2", above=0.0, doc="of each axis' estimate, 1 sigma")
 
 
 class VioEstimate(NamedTuple):
@@ -44,6 +50,7 @@ class VioEstimate(NamedTuple):
     v_WB: np.ndarray        # (3,) [m/s]
     pose_variance: np.ndarray   # x, y, z [m^2], about x, y, z of the map [rad^2], (6,)
     velocity_variance: float    # of each axis [m^2/s^2]
+    covariance: np.ndarray      # of (p, v, theta), theta a rotation vector in B, with what the drift of yaw makes correlated, (9, 9)
 
 
 class VioModel:
@@ -74,7 +81,29 @@ class VioModel:
         variance = np.concatenate([
             np.full(3, k.position_noise**2 + k.position_drift**2 * age),
             np.full(3, k.attitude_noise**2) + np.array([0.0, 0.0, k.yaw_drift**2 * age])])
-        return VioEstimate(
-            so3.quat_rotate(turn, p_WB) + self._drift + k.position_noise * draw[7:10],
-            so3.quat_multiply(turn, so3.quat_multiply(shake, q_WB)),
-            so3.quat_rotate(turn, v_WB) + k.velocity_noise * draw[10:13], variance, k.velocity_noise**2)
+        p = so3.quat_rotate(turn, p_WB) + self._drift + k.position_noise * draw[7:10]
+        q = so3.quat_multiply(turn, so3.quat_multiply(shake, q_WB))
+        v = so3.quat_rotate(turn, v_WB) + k.velocity_noise * draw[10:13]
+        of_yaw = np.array([-p[1], p[0], 0.0, -v[1], v[0], 0.0, *so3.quat_to_matrix(q)[2]])  # e3 x p, e3 x v, R^T e3
+        white = [*variance[:3], *[k.velocity_noise**2] * 3, *[k.attitude_noise**2] * 3]
+        return VioEstimate(p, q, v, variance, k.velocity_noise**2, np.diag(white) + k.yaw_drift**2 * age * np.outer(of_yaw, of_yaw))
+
+
+class BiasModel:
+    """What a VIO would have found the biases to be."""
+
+    def __init__(self, params: VioModelParameters, imu: ImuConfig, turn_on: np.ndarray, rng: np.random.Generator) -> None:
+        """
+        Args:
+            params: how wrong the estimates are.
+            imu: how far the truth walks.
+            turn_on: true biases as the flight began, gyro [rad/s] and accelerometer [m/s^2], (6,).
+            rng: draws the errors.
+        """
+        sigma = np.repeat([params.gyro_bias_error, params.accel_bias_error], 3)
+        self._estimate = turn_on + sigma * rng.standard_normal(6)
+        self._variance, self._walk = sigma**2, np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) ** 2
+
+    def at(self, age: float) -> tuple[np.ndarray, np.ndarray]:
+        """The estimates and their variances, (6,) each, so long [s] after the start."""
+        return self._estimate, self._variance + self._walk * age

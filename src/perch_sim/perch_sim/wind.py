@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from perch_core.scenario import Wind
+from perch_sim.scenario import Wind
 
 LENGTH = 5.0          # scale of the turbulence a few metres above ground [m]
 LEAST_AIRSPEED = 1.0  # speed at which gusts pass when there is no steady wind [m/s]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import radians, tan
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,12 +11,15 @@ from perch_control.allocation import mixing_columns
 from perch_control.geometric.rehearsal import flown, rehearsed
 from perch_control.geometric.step import control_step
 from perch_control.guidance import Running
+from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.reference import Following
 from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
 from perch_core.vehicle import Vehicle
 
-NO_COMPENSATION = (0.0,) * 6
+if TYPE_CHECKING:
+    from perch_control.parameters import ControllerParameters
+
 _RATE_RESERVE = 1.3  # commanded rates may exceed what a plan may ask for by this factor, so that feedback has room
 
 
@@ -33,38 +36,24 @@ def packed_vehicle(vehicle: Vehicle) -> tuple:
     )
 
 
-class ControlOutput(NamedTuple):
-    """What a controller answers in one period.
-
-    Attributes:
-        rotor_speed: commanded speeds [rad/s], 4 floats.
-        wrench: wanted collective thrust [N] and moments in B [N m], 4 floats.
-        rotor_thrust: thrusts that the rotors will have after the lead time [N], 4 floats.
-        q_C: commanded attitude xyzw, 4 floats.
-        w_C: commanded body rates in B [rad/s], 3 floats.
-        dw_C: commanded angular acceleration in B [rad/s^2], 3 floats.
-    """
-
-    rotor_speed: tuple[float, ...]
-    wrench: tuple[float, ...]
-    rotor_thrust: tuple[float, ...]
-    q_C: tuple[float, ...]
-    w_C: tuple[float, ...]
-    dw_C: tuple[float, ...]
-
-
-class GeometricController:
+class GeometricController(Law):
     """Geometric tracking on SE(3) with rotor lead and prioritised saturation. [M:eq2]"""
 
     name = "geometric"
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
-        self.vehicle, self.gains = vehicle, gains
+        super().__init__(vehicle)
+        self.gains = gains
         self._vehicle = packed_vehicle(vehicle)
         self._gains = (*gains.position, *gains.velocity, *gains.attitude, *gains.rate)
         self._wide, self._narrow = tan(radians(gains.cone_deg)), tan(radians(gains.cone_contact_deg))
         self._rate_max = _RATE_RESERVE * vehicle.body_rate_max
         self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 16, RotorEstimate.at_idle(vehicle))
+
+    @classmethod
+    def build(cls, vehicle: Vehicle, params: ControllerParameters) -> GeometricController:
+        """With the vehicle's gains."""
+        return cls(vehicle, params.gain_set(vehicle.name))
 
     @property
     def lead(self) -> float:
@@ -101,9 +90,6 @@ class GeometricController:
     def believe(self, vehicle: Vehicle) -> None:
         """Fly a vehicle that differs from the one at the start in its thrust."""
         self.vehicle, self._vehicle = vehicle, packed_vehicle(vehicle)
-
-    def begin(self) -> None:
-        """Take over in flight: nothing is remembered from one period to the next."""
 
     def prepare(self, source, contact: bool, running: Running | None = None):
         """The reference to follow for a trajectory: one that ends in contact is rehearsed and offset first.

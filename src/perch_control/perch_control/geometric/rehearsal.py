@@ -14,7 +14,6 @@ import numpy as np
 
 from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
-from perch_core.timing import CONTROL_PERIOD
 from perch_core.vector3 import quaternion_of
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.geometric.step import control_step, drag_compensation, predicted
@@ -74,14 +73,14 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
     Returns:
         The reference to follow; `source` itself where it is too short, or where the rehearsal comes no closer.
     """
-    T = source.duration
+    T, period = source.duration, controller.period
     first = np.zeros((4, 3)) if running is None else _apart(running.setpoint, source.setpoint(0.0))
-    n = int((T if first.any() else min(_SPAN, T)) / CONTROL_PERIOD)
-    growth = n * CONTROL_PERIOD - _QUIET
+    n = int((T if first.any() else min(_SPAN, T)) / period)
+    growth = n * period - _QUIET
     if growth < _QUIET:
         return source
-    begin, lead = (0.0 if first.any() else T - n * CONTROL_PERIOD), controller.lead
-    times = np.arange(n) * CONTROL_PERIOD + lead
+    begin, lead = (0.0 if first.any() else T - n * period), controller.lead
+    times = np.arange(n) * period + lead
     table = packed_many(source, begin + times)
     start, rotors = _on_reference(running.setpoint if first.any() else source.setpoint(begin), vehicle)
     end = source.setpoint(T)
@@ -92,7 +91,7 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
     for _ in range(_ROUNDS):
         shifted = table.copy()
         shifted[:, :15] += _offset(delta, growth, first).many(times)[:, :15]
-        final = controller.rehearse(start, rotors, shifted, CONTROL_PERIOD, n * CONTROL_PERIOD)
+        final = controller.rehearse(start, rotors, shifted, period, n * period)
         miss = np.array([final[0:3], final[3:6]]) - wanted
         error = float(np.linalg.norm(miss[0]) / _POSITION_SCALE + np.linalg.norm(miss[1]) / _SPEED_SCALE)
         if error < least:

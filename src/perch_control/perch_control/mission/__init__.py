@@ -1,10 +1,14 @@
-"""The mission: arm, take off, look, plan, fly, verify, recover. Free of ROS; `mission_node` wraps it."""
+"""Missions: arm, take off, look, plan, fly, verify, recover. `perch_control.mission_component` brings them to their channels."""
 
-from perch_control.mission.adhesion import AdhesionMonitor, AdhesionLimits
+from perch_control.mission.adhesion import AdhesionLimits, AdhesionMonitor
+from perch_control.mission.inspection import InspectionMission
 from perch_control.mission.machine import MissionMachine
 from perch_control.mission.settings import MissionSettings
+from perch_control.mission.surface import SurfaceMission
 from perch_control.mission.values import (
     Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanAnswer, PlanQuery, Result, State, Target)
+from perch_control.mission.wire import PowerlineMission
 
-__all__ = ["AdhesionLimits", "AdhesionMonitor", "Command", "ControllerState", "Goal", "Inputs", "MissionMachine",
-           "MissionSettings", "Mode", "Outcome", "Outputs", "Phase", "PlanAnswer", "PlanQuery", "Result", "State", "Target"]
+__all__ = ["AdhesionLimits", "AdhesionMonitor", "Command", "ControllerState", "Goal", "InspectionMission", "Inputs", "MissionMachine",
+           "MissionSettings", "Mode", "Outcome", "Outputs", "Phase", "PlanAnswer", "PlanQuery", "PowerlineMission", "Result", "State",
+           "SurfaceMission", "Target"]

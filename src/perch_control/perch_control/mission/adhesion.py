@@ -11,6 +11,7 @@ from perch_core import so3
 from perch_core.config import quantity
 from perch_core.vehicle import GRAVITY
 from perch_control.mission.values import State, Target
+from perch_control.period import NOMINAL_PERIOD
 
 
 _LEAST = 0.8  # what vibration and a wrong attitude make of a vehicle at rest [m/s^2]
@@ -41,16 +42,19 @@ class AdhesionMonitor:
     degrees), so that what counts as balanced is at most half of that, and a hover must not count as aligned.
     """
 
-    def __init__(self, limits: AdhesionLimits, imu_rate: float = 500.0) -> None:
-        self._limits = limits
-        self._samples: deque[np.ndarray] = deque(maxlen=max(3, round(limits.window * imu_rate)))
+    def __init__(self, limits: AdhesionLimits) -> None:
+        self.limits = limits
+        self._samples: deque[np.ndarray] = deque(maxlen=_count(limits, NOMINAL_PERIOD))
 
     def reset(self) -> None:
         """Forget the past."""
         self._samples.clear()
 
-    def add(self, specific_force_B: np.ndarray) -> None:
-        """Take IMU samples in, shape (n, 3) [m/s^2]."""
+    def add(self, specific_force_B: np.ndarray, period: float = NOMINAL_PERIOD) -> None:
+        """Take IMU samples in, shape (n, 3) [m/s^2], that come with a period [s]."""
+        count = _count(self.limits, period)
+        if count != self._samples.maxlen:
+            self._samples = deque(self._samples, count)
         self._samples.extend(np.asarray(specific_force_B, float).reshape(-1, 3))
 
     @property
@@ -71,13 +75,23 @@ class AdhesionMonitor:
         """The vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""
         if not self.filled:
             return False
-        limits = self._limits
+        limits = self.limits
         b3, s3 = so3.quat_rotate(state.q_WB, _UP), so3.quat_rotate(target.q_WS, _UP)
         return bool(
             np.linalg.norm(state.p_WB - target.p_WS) < limits.distance
             and so3.angle_between(b3, s3) < min(np.radians(limits.tilt_deg), max(_LEAST_TILT, 0.5 * so3.angle_between(s3, _UP)))
             and np.linalg.norm(state.v_WB) < limits.speed
             and self.imbalance(state.q_WB) < min(limits.unbalanced, max(_LEAST, 0.5 * _unbalanced_in_flight(b3))))
+
+    @staticmethod
+    def tells(state: State) -> bool:
+        """Whether this attitude tells rest from flight: nothing hovers in it."""
+        return _unbalanced_in_flight(so3.quat_rotate(state.q_WB, _UP)) > 2.0 * _LEAST
+
+
+def _count(limits: AdhesionLimits, period: float) -> int:
+    """Samples in the window."""
+    return max(3, round(limits.window / period))
 
 
 def _unbalanced_in_flight(b3: np.ndarray) -> float:

@@ -1,47 +1,108 @@
-"""The mission's state machine: one method per phase, called once per tick."""
+"""What all missions share: arm, take off, look, recover, end. What is done at the target is said by each kind."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from itertools import count
+
 import numpy as np
 
+from perch_core.values import PerchGoal, PowerlineMap
 from perch_control.mission.adhesion import AdhesionMonitor
-from perch_control.mission.moves import LEAD, Moves, Place, place_of
-from perch_control.mission.running_perch import RunningPerch
-from perch_control.mission.running_plan import RunningPlan
+from perch_control.mission.moves import Look, Moves, Place
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.usable_target import usable
-from perch_control.mission.values import (
-    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, PlanQuery, Result, Target)
-from perch_control.mission.waypoints import waypoint_lines
+from perch_control.mission.values import Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, Result, Target
 
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
 
-class MissionMachine:
-    """Find the target, plan, fly, perch, verify; recover when it fails. [M:II, Fig. 2]
+class MissionMachine(ABC):
+    """One goal, from arming to its outcome. [M:II, Fig. 2]
 
     `tick` maps what is known to what shall be done. Every phase ends in another phase, in an outcome, or by its own
     time limit, so that a goal always ends; a cancelled or failed goal ends in a hover, or on the ground.
+
+    A kind of mission says what it looks for (`target`), where from (`pattern`, `legs`), and what it does where the target has been seen
+    and the vehicle rests (`at_target`); phases of its own are added to `phases`.
+
+    Attributes:
+        phase, message, time_to_contact: as the feedback tells them.
+        phases: what is done in each phase.
     """
 
-    def __init__(self, settings: MissionSettings) -> None:
+    unseen = "no target seen"
+    """Words for a target that is not seen."""
+    legs = 0
+    """Places of the pattern that are flown to before anything else."""
+
+    def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
+        """
+        Args:
+            settings: times, speeds, limits.
+            ids: numbers of the trajectories to come; never the same twice for one controller.
+            moves: those of the goals before; None: this is the first one.
+        """
         self.settings = settings
         self.phase = Phase.IDLE
         self.message = ""
         self.time_to_contact = float("nan")
+        self.phases: dict[Phase, Callable[[Inputs, Outputs], None]] = {
+            Phase.ARMING: self._arming, Phase.TAKE_OFF: self._take_off, Phase.SEARCHING: self._searching,
+            Phase.RECOVERING: self._recovering}
         self._adhesion = AdhesionMonitor(settings.adhesion)
         self._goal: Goal | None = None
-        self._next_id = 1
+        self._ids = count(1) if ids is None else ids
+        self._moves = Moves(settings) if moves is None else moves
+
+    # -- what a kind says --------------------------------------------------------------------------------------------
+
+    @classmethod
+    def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
+        """Why a goal cannot be flown, beyond what holds for all missions; empty: it can."""
+        return ""
+
+    def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
+        """What is looked for, out of what is known.
+
+        Args:
+            pad: as localised last.
+            lines: the newest map.
+            p_WB: where the vehicle is [m], shape (3,).
+        """
+        return pad
+
+    def pattern(self) -> list[Look]:
+        """Places around the search hover (forward, left, up [m], turn [rad]): a pad may be out of view, the vehicle turns and rises."""
+        rise, turn = self.settings.search_rise, np.radians(self.settings.search_yaw_deg)
+        return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
+                (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
+
+    def reach(self, offset: np.ndarray, p: np.ndarray, target: Target | None) -> np.ndarray:
+        """How much of an offset of the pattern (forward, left, up [m]) from the search place `p` [m] is flown."""
+        return offset
+
+    @abstractmethod
+    def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
+        """The target has been seen for long enough, and the vehicle rests: what is done now."""
+
+    def holds(self, inputs: Inputs) -> bool:
+        """In a recovery: the vehicle is held after all."""
+        return False
 
     # -- interface ---------------------------------------------------------------------------------------------------
+
+    def reconfigure(self, settings: MissionSettings) -> None:
+        """New settings count from the next tick on; the moves under way stay."""
+        self.settings, self._adhesion.limits = settings, settings.adhesion
 
     def start(self, goal: Goal, time: float) -> None:
         """Take a goal; the machine must be idle."""
         self._goal, self._attempts_left = goal, goal.attempts
         self._failure: str | None = None
-        self._moves = Moves(self.settings)
-        self._running: RunningPerch | RunningPlan | None = None
-        self._perch_id = 0
+        self._moves.settings = self.settings
+        self._flown_id = 0
         self._contact_time = float("nan")
         self._cancelled = False
         self._enter(Phase.ARMING, time, "waiting for the estimator")
@@ -49,7 +110,7 @@ class MissionMachine:
     def tick(self, inputs: Inputs) -> Outputs:
         """Advance by one tick."""
         outputs = Outputs()
-        self._adhesion.add(inputs.specific_force_B)
+        self._adhesion.add(inputs.specific_force_B, inputs.imu_period)
         self.time_to_contact = float("nan")
         if self.phase is Phase.IDLE:
             return outputs
@@ -58,20 +119,18 @@ class MissionMachine:
         elif inputs.controller is ControllerState.FAILED and self.phase is not Phase.PERCHED:
             self._end(outputs, Result.TRACKING_LOST, f"controller gave up: {inputs.controller_message}")
         else:
-            getattr(self, f"_{self.phase.value}")(inputs, outputs)
+            self.phases[self.phase](inputs, outputs)
         return outputs
 
     # -- phases ------------------------------------------------------------------------------------------------------
 
     def _arming(self, inputs: Inputs, outputs: Outputs) -> None:
-        if inputs.controller in _FLYING:
-            self._moves.hover = place_of(inputs.state)
-            self._enter(Phase.TAKE_OFF, inputs.time, "already flying: going to the search place")
-            self._go(inputs, outputs, self._moves.search_place(self._goal, inputs.state))
+        if inputs.controller is ControllerState.ATTACHED:
+            self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; the service `depart` comes first")
+        elif inputs.controller in _FLYING:
+            self._go_to_search(inputs, outputs, "already flying: going to the search place")
         elif inputs.controller is ControllerState.ARMED:
-            self._moves.hover = place_of(inputs.state)
-            self._enter(Phase.TAKE_OFF, inputs.time, "taking off")
-            self._go(inputs, outputs, self._moves.search_place(self._goal, inputs.state))
+            self._go_to_search(inputs, outputs, "taking off", on_ground=True)
         elif self._elapsed(inputs) > self.settings.arming_timeout:
             outputs.commands.append((Command.DISARM, "arming took too long"))
             why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
@@ -90,8 +149,8 @@ class MissionMachine:
         if self._lost(inputs, outputs):
             return
         target = inputs.target
-        good, why = usable(target, self._entered_search, self._goal, self.settings)
-        if self._goal.mode is Mode.POWERLINE and self._moves.looked < self.settings.mapping_legs:
+        good, why = usable(target, self._entered_search, self._goal, self.settings, self.unseen)
+        if self._moves.looked < self.legs:
             if self._moves.arrived(inputs.time, inputs.state):
                 self._go_on_looking(inputs, outputs, "mapping the lines")
             return
@@ -100,10 +159,7 @@ class MissionMachine:
                 self._seen_since = inputs.time
                 self.message = "target in view"
             if inputs.time - self._seen_since >= self.settings.target_settle and self._moves.arrived(inputs.time, inputs.state):
-                if self._goal.mode is Mode.INSPECTION:
-                    self._inspect(inputs, outputs)
-                else:
-                    self._ask_plan(inputs, outputs, target)
+                self.at_target(inputs, outputs, target)
             return
         if self._elapsed(inputs) > self._goal.search_timeout:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
@@ -113,88 +169,15 @@ class MissionMachine:
 
     def _go_on_looking(self, inputs: Inputs, outputs: Outputs, message: str) -> None:
         """Fly to the next place of the pattern."""
-        self._go(inputs, outputs, self._moves.next_look(self._goal, inputs.state, inputs.target))
+        place = self._moves.next_look(self._goal, self.pattern(), lambda offset, p: self.reach(offset, p, inputs.target))
+        self._go(inputs, outputs, place)
         self.message = message
-
-    def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs):
-            return
-        if inputs.plan is None:
-            return
-        if not inputs.plan.success:
-            self._end(outputs, Result.REFUSED, f"planner refused: {inputs.plan.message}")
-            return
-        if self._goal.mode is Mode.POWERLINE:
-            self._fly(RunningPlan(inputs.plan, self._target, self.settings), outputs)
-        else:
-            self._fly(RunningPerch(inputs.plan, self._target, self._target), outputs)
-        self._enter(Phase.TRACKING, inputs.time, f"perching, {inputs.plan.duration:.2f} s")
-
-    def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
-        end = self._running.end
-        self.time_to_contact = end - inputs.time
-        if inputs.trajectory_id == self._perch_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
-            self._missed(inputs, f"perch given up: {inputs.controller_message}")
-            return
-        if self._goal.mode is Mode.POWERLINE:
-            self._look_ahead(inputs, outputs)
-        elif self._goal.replan:
-            self._replan(inputs, outputs)
-        if inputs.time > end - self.settings.contact_early:
-            self._adhesion.reset()
-            self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
-
-    def _verifying(self, inputs: Inputs, outputs: Outputs) -> None:
-        end = self._running.end
-        self.time_to_contact = end - inputs.time
-        if self._adhesion.attached(inputs.state, self._running.target):
-            self._contact_time = inputs.time
-            self._adhesion.reset()
-            outputs.commands.append((Command.ATTACHED, "the surface carries the vehicle"))
-            self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
-        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
-            self._missed(inputs, f"no adhesion: {inputs.controller_message}")
-        elif self._goal.mode is Mode.POWERLINE and inputs.time <= end + self.settings.contact_time:
-            self._look_ahead(inputs, outputs)
-        elif inputs.time > end + self.settings.contact_time + 0.2:
-            if self._goal.mode is Mode.SURFACE:  # a powerline plan goes on into its recovery by itself
-                outputs.commands.append((Command.HOVER, "no adhesion"))
-            self._missed(inputs, "no adhesion")
-
-    def _inspect(self, inputs: Inputs, outputs: Outputs) -> None:
-        """From the present hover along the waypoints; the controller's line terms keep the line in view and all lines away."""
-        places = [self._moves.hover, *self.settings.places]
-        outputs.reference = waypoint_lines(places, self.settings.inspection_speed, inputs.time + LEAD)
-        outputs.trajectory_id = self._perch_id = self._new_id()
-        self._inspected = inputs.time + LEAD + outputs.reference.duration
-        self._enter(Phase.INSPECTING, inputs.time, f"inspecting, {outputs.reference.duration:.1f} s")
-
-    def _inspecting(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs):
-            return
-        if inputs.trajectory_id == self._perch_id and inputs.controller is ControllerState.HOVERING:
-            if inputs.time < self._inspected:
-                self._missed(inputs, f"inspection given up: {inputs.controller_message}")
-            else:
-                self._end(outputs, Result.PERCHED, f"inspected along {len(self.settings.places)} waypoints")
-        elif inputs.time > self._inspected + self.settings.arming_timeout:
-            outputs.commands.append((Command.HOVER, "the inspection does not end"))
-            self._missed(inputs, f"the inspection does not end: {inputs.controller_message}")
-
-    def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._adhesion.free_fall():
-            outputs.commands.append((Command.ARM, "came off the surface"))
-            outputs.commands.append((Command.HOVER, "came off the surface"))
-            self._missed(inputs, "came off the surface after the motors stopped")
-        elif self._elapsed(inputs) > self.settings.rest_time:
-            result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
-            self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
 
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
         resting = inputs.controller is ControllerState.HOVERING and self._moves.slow(inputs.state)
-        if self._gripped(inputs):
+        if self.holds(inputs):
             self._contact_time = inputs.time
-            outputs.commands.append((Command.ATTACHED, "the gripper has closed all the same"))
+            outputs.commands.append((Command.ATTACHED, "it holds all the same"))
             self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
             return
         if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
@@ -203,71 +186,30 @@ class MissionMachine:
             outputs.commands.append((Command.LAND, "recovery took too long"))
             self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; no hover within {self.settings.phase_timeout:g} s, landing")
         elif resting and self._elapsed(inputs) > self.settings.settle_time:
-            self._attempts_left -= 1
-            if self._cancelled:
-                self._end(outputs, Result.CANCELLED, "cancelled; hovering")
-            elif self._attempts_left > 0:
-                self._moves.hover = place_of(inputs.state)
-                self._enter(Phase.TAKE_OFF, inputs.time, f"{self._failure}; {self._attempts_left} attempts left")
-                self._go(inputs, outputs, self._moves.search_place(self._goal, inputs.state))
-            else:
-                self._end(outputs, Result.MISSED, f"{self._failure}; recovered to a hover")
+            self._recovered(inputs, outputs)
 
-    def _gripped(self, inputs: Inputs) -> bool:
-        """An abort came so late that the vehicle passed the wire on its way out, and holds it."""
-        return (isinstance(self._running, RunningPlan) and -self.settings.contact_early < inputs.time - self._running.end < 1.0
-                and self._adhesion.attached(inputs.state, self._running.target))
+    def _recovered(self, inputs: Inputs, outputs: Outputs) -> None:
+        """The recovery has ended in a hover."""
+        self._attempts_left -= 1
+        if self._cancelled:
+            self._end(outputs, Result.CANCELLED, "cancelled; hovering")
+        elif self._attempts_left > 0:
+            self._go_to_search(inputs, outputs, f"{self._failure}; {self._attempts_left} attempts left")
+        else:
+            self._end(outputs, Result.MISSED, f"{self._failure}; recovered to a hover")
 
-    # -- planning ----------------------------------------------------------------------------------------------------
+    def _go_to_search(self, inputs: Inputs, outputs: Outputs, message: str, on_ground: bool = False) -> None:
+        """From where the vehicle stands or hovers to the search place."""
+        self._moves.begin(self._goal, inputs.state, on_ground)
+        self._enter(Phase.TAKE_OFF, inputs.time, message)
+        self._go(inputs, outputs, self._moves.search_place(self._goal))
 
-    def _ask_plan(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
-        self._target = target
-        latency, lead = self.settings.planning_times(self._goal.mode)
-        zero = np.zeros(3)
-        p, yaw = self._moves.hover
-        outputs.query = PlanQuery(inputs.time + lead, p, zero, zero, zero, yaw, target, self._goal, latency)
-        self._enter(Phase.PLANNING, inputs.time, "planning")
-
-    def _replan(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Refine the target in flight and continue from the running plan's future (M's future work)."""
-        better = self._running.better(inputs.plan, inputs.time, self.settings)
-        if better is not None:
-            if better is not self._running:
-                self._fly_better(better, outputs)
-            return
-        latency, lead = self.settings.planning_times(self._goal.mode)
-        asked = self._running.query(inputs.time, self._usable_now(inputs), self._goal, self.settings, inputs.time + lead, latency)
-        if asked is not None:
-            self._running, outputs.query = asked
-
-    def _look_ahead(self, inputs: Inputs, outputs: Outputs) -> None:
-        """On the way to a wire: follow the map as it gets better, and keep a way out ready."""
-        if inputs.plan is not None:
-            outputs.way_out, better = self._running.answered(inputs.plan, inputs.time)
-            outputs.trajectory_id = self._perch_id
-            if better is not None:
-                self._fly_better(better, outputs)
-        target = self._usable_now(inputs)
-        moved = self._running.moved(inputs.time, target, self._goal)
-        if moved is not None and outputs.perch is None and outputs.way_out is None:
-            self._running = moved
-            outputs.perch, outputs.trajectory_id = moved.plan, self._perch_id
-        outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
-
-    def _fly(self, running: RunningPerch | RunningPlan, outputs: Outputs) -> None:
-        self._running, self._perch_id = running, self._new_id()
-        outputs.perch, outputs.trajectory_id = running.plan, self._perch_id
-
-    def _fly_better(self, better: RunningPerch | RunningPlan, outputs: Outputs) -> None:
-        self._fly(better, outputs)
-        self.message = f"re-planned, {better.plan.duration:.2f} s"
+    def _go(self, inputs: Inputs, outputs: Outputs, place: Place) -> None:
+        outputs.reference, outputs.trajectory_id = self._moves.go(inputs.time, place), self._new_id()
 
     def _usable_now(self, inputs: Inputs) -> Target | None:
         """The target, where it is fresh and certain enough to plan on."""
         return inputs.target if usable(inputs.target, self._entered_search, self._goal, self.settings)[0] else None
-
-    def _go(self, inputs: Inputs, outputs: Outputs, place: Place) -> None:
-        outputs.reference, outputs.trajectory_id = self._moves.go(inputs.time, place), self._new_id()
 
     # -- endings -----------------------------------------------------------------------------------------------------
 
@@ -316,5 +258,4 @@ class MissionMachine:
         return inputs.time - self._since
 
     def _new_id(self) -> int:
-        self._next_id += 1
-        return self._next_id - 1
+        return next(self._ids)

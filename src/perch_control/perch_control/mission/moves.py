@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from perch_core import so3
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Goal, Mode, State, Target
+from perch_control.mission.values import Goal, State, Target
 
 LEAD = 0.04       # a move starts this long after its decision: after the mission's own latency [s]
 TURN_RATE = 0.6   # mean yaw rate of a move [rad/s]
 
 Place = tuple[np.ndarray, float]
 """Position of a hover in W [m], shape (3,), and its yaw [rad]."""
+Look = tuple[np.ndarray, float]
+"""A place around the search hover: forward, left, up [m], shape (3,), and a turn [rad]."""
+Reach = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def place_of(state: State) -> Place:
@@ -24,49 +28,51 @@ def place_of(state: State) -> Place:
 
 
 class Moves:
-    """Where the vehicle was armed, where the last move ends, and whether it has got there."""
+    """Where the vehicle took off, where the last move ends, and whether it has got there: kept from goal to goal.
+
+    Attributes:
+        settings: speeds and times.
+        home: where the vehicle stood when it was armed last; below where it hovered at the first goal, if nobody saw that.
+        hover: where the last move ends, or the vehicle was when there was none.
+        wire: the place on a wire that was perched on last, None: a surface.
+    """
 
     def __init__(self, settings: MissionSettings) -> None:
         self.settings = settings
-        self.home: Place | None = None    # where the vehicle stood when it was armed
-        self.hover: Place | None = None   # where the last move ends
+        self.home: Place | None = None
+        self.hover: Place | None = None
+        self.wire: Target | None = None
         self.began = 0.0                  # when the last move was decided [s]
         self.length = 0.0                 # from then to its end [s]
         self.looked = 0                   # places of the search pattern that were flown to
 
-    def search_place(self, goal: Goal, state: State) -> Place:
-        """The goal's search pose, or above the place where the vehicle stood."""
-        if self.home is None:
-            self.home = place_of(state)
+    def begin(self, goal: Goal, state: State, on_ground: bool) -> None:
+        """Go on from the vehicle's state: armed on the ground, or in the air."""
+        self.hover = p, yaw = place_of(state)
+        if on_ground:
+            self.home = self.hover
+        elif self.home is None:
+            self.home = p - np.array([0.0, 0.0, goal.takeoff_height]), yaw
+
+    def search_place(self, goal: Goal) -> Place:
+        """The goal's search pose, or above the place where the vehicle took off."""
         p, yaw = self.home
         if goal.search_position is not None:
             return goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
         return p + np.array([0.0, 0.0, goal.takeoff_height]), yaw
 
-    def pattern(self, goal: Goal) -> list[tuple[np.ndarray, float]]:
-        """Places around the search hover (forward, left, up [m], turn [rad]).
+    def next_look(self, goal: Goal, pattern: Sequence[Look], reach: Reach) -> Place:
+        """The next place of a pattern around the search hover.
 
-        A pad may be out of view: the vehicle turns and rises. Lines have to be seen from different places: it moves
-        up and down, and nearer, as the error of a distance grows with its square, and back. The first `mapping_legs` of these
-        are flown before any plan.
+        Args:
+            goal: what was asked for.
+            pattern: the places.
+            reach: shortens an offset (forward, left, up [m]), given the search place [m].
         """
-        rise, turn = self.settings.search_rise, math.radians(self.settings.search_yaw_deg)
-        if goal.mode is not Mode.SURFACE:
-            reach, near = self.settings.mapping_reach, self.settings.mapping_approach
-            return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
-        return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
-                (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
-
-    def next_look(self, goal: Goal, state: State, target: Target | None) -> Place:
-        """The next place of the pattern; towards lines no nearer to the target than `mapping_standoff`."""
-        pattern = self.pattern(goal)
         offset, turn = pattern[self.looked % len(pattern)]
         self.looked += 1
-        p, yaw = self.search_place(goal, state)
-        if goal.mode is Mode.POWERLINE and offset[0] > 0.0:
-            room = 0.0 if target is None else float(np.linalg.norm(target.p_WS - p)) - self.settings.mapping_standoff
-            offset = np.array([min(offset[0], max(room, 0.0)), *offset[1:]])
-        return p + so3.exp(np.array([0.0, 0.0, yaw])) @ offset, yaw + turn
+        p, yaw = self.search_place(goal)
+        return p + so3.exp(np.array([0.0, 0.0, yaw])) @ reach(offset, p), yaw + turn
 
     def go(self, time: float, place: Place) -> FlatTrajectory:
         """A move from the present hover to another, at rest at both ends."""

@@ -16,12 +16,11 @@ import math
 import numpy as np
 
 from perch_core import so3
-from perch_core.timing import CONTROL_PERIOD, TICK_STEPS
 from perch_core.trajectory import StateSample
+from perch_core.values import AtEnd
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, State, Target
+from perch_control.mission.values import TICK, Goal, PlanAnswer, PlanQuery, State, Target
 
-_TICK = TICK_STEPS * CONTROL_PERIOD  # the mission's period [s]
 _AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
 _DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
 
@@ -69,7 +68,7 @@ class RunningPlan:
         if start < self.end - s.way_out_until:
             return self._ask(start, self.state(start), self.target, goal, recovery=True)
         soonest = time + s.ahead_latency + _DECISION
-        if not self._leaving and self.end - _TICK < soonest < self.end + s.contact_time:
+        if not self._leaving and self.end - TICK < soonest < self.end + s.contact_time:
             self._leaving = True
             start = max(soonest, self.end)
             return self._ask(start, self._continued(time, present, start), self.target if target is None else target, goal, recovery=True)
@@ -116,7 +115,9 @@ class RunningPlan:
         if not s.shift_distance < float(np.linalg.norm(offset)) < s.shift_max:
             return None
         rest = self.plan.sampled.rest_of(time - self.plan.start_time, offset)
-        plan = dataclasses.replace(self.plan, trajectory=None, sampled=rest, start_time=rest.start_time, duration=self.end - rest.start_time)
+        left = self.end - rest.start_time
+        plan = dataclasses.replace(self.plan, trajectory=rest, sampled=rest, start_time=rest.start_time, duration=left,
+                                   at_end=AtEnd.RECOVER, recovery_start=float(left))
         following = RunningPlan(plan, target, s, self._replanned_at)
         following.covered, following._asked = self.covered, self._asked  # ways out stay: centimetres do not matter there
         following._leaving = self._leaving

@@ -10,7 +10,6 @@ import numpy as np
 from perch_core.config import part, quantity
 from perch_core.errors import ConfigError
 from perch_control.mission.adhesion import AdhesionLimits
-from perch_control.mission.values import Mode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +66,6 @@ class MissionSettings:
         """The waypoints: positions in W [m], shape (3,), and yaws [rad]."""
         return [(np.array(self.waypoints[k:k + 3]), math.radians(self.waypoints[k + 3])) for k in range(0, len(self.waypoints), 4)]
 
-    def planning_times(self, mode: Mode) -> tuple[float, float]:
-        """From the request of a plan from a hover, or of a better one for a surface, to its use, and to its start [s]."""
-        latency = self.powerline_latency if mode is Mode.POWERLINE else self.planner_latency
-        return latency, max(self.plan_lead, latency + 0.04)
+    def lead(self, latency: float) -> float:
+        """From the request of a plan to its start, where it is used `latency` after the request [s]."""
+        return max(self.plan_lead, latency + 0.04)

@@ -8,12 +8,12 @@ import numpy as np
 
 from perch_core import so3
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Goal, Mode, Target
+from perch_control.mission.values import Goal, Target
 
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-def usable(target: Target | None, since: float, goal: Goal, settings: MissionSettings) -> tuple[bool, str]:
+def usable(target: Target | None, since: float, goal: Goal, settings: MissionSettings, unseen: str = "no tags seen") -> tuple[bool, str]:
     """Whether a target is fresh and certain enough to plan on, and why not.
 
     Args:
@@ -21,9 +21,10 @@ def usable(target: Target | None, since: float, goal: Goal, settings: MissionSet
         since: older sightings do not count [s].
         goal: what was asked for.
         settings: limits.
+        unseen: words for a target that is not seen.
     """
     if target is None or target.time < since:
-        return False, "no tags seen" if goal.mode is Mode.SURFACE else "no lines mapped"
+        return False, unseen
     if target.position_sigma > settings.target_position_sigma:
         return False, f"position uncertain by {target.position_sigma:.3f} m"
     if target.attitude_sigma > math.radians(settings.target_attitude_sigma_deg):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
-from typing import Any
 
 import numpy as np
 
 from perch_control.modes import Command, State as ControllerState
+from perch_control.period import NOMINAL_PERIOD
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, StateSample
+from perch_core.values import AtEnd, MappedPowerline
+
+TICK = 0.02  # the mission decides so often [s]
 
 
 class Phase(str, Enum):
@@ -46,10 +49,11 @@ class Result(IntEnum):
     TIMEOUT = 6
     BAD_GOAL = 7
     CRASHED = 8
+    PERCHED_ALREADY = 9
 
 
 class Mode(IntEnum):
-    """What is perched on: MODE_* of the Perch action; or a powerline that is inspected along the mission's waypoints."""
+    """Missions that come with perch_control: MODE_* of the Perch action. See `perch_control.mission.missions`."""
 
     SURFACE = 0
     POWERLINE = 1
@@ -83,7 +87,7 @@ class Target:
         q_WS: attitude xyzw, shape (4,).
         position_sigma: largest 1-sigma of the position [m].
         attitude_sigma: largest 1-sigma of the attitude [rad].
-        lines: the map of powerlines that the target belongs to (opaque to the mission); None for a pad.
+        lines: the map of powerlines that the target belongs to; none for a pad.
         line: id of the target's line in that map.
     """
 
@@ -92,7 +96,7 @@ class Target:
     q_WS: np.ndarray
     position_sigma: float
     attitude_sigma: float
-    lines: Any = None
+    lines: tuple[MappedPowerline, ...] = ()
     line: int = 0
 
 
@@ -102,7 +106,7 @@ class Goal:
 
     takeoff_height: float
     search_timeout: float
-    mode: Mode = Mode.SURFACE
+    mode: int = Mode.SURFACE
     perch_point: np.ndarray | None = None
     perch_pitch: float = 0.0
     perception_aware: bool = False
@@ -140,7 +144,7 @@ class PlanQuery:
     target: Target
     goal: Goal
     latency: float = 0.0
-    current: Any = None
+    current: FlatTrajectory | SampledTrajectory | None = None
     duration: float | None = None
     state: StateSample | None = None
     recovery: bool = False
@@ -154,18 +158,21 @@ class PlanAnswer:
     Attributes:
         success: there is a plan.
         message: the planner's words.
-        trajectory: the message to pass on (opaque to the mission); None: it is to be made from `sampled`.
+        trajectory: what is flown.
         start_time: when it starts [s].
         duration: from its start to the contact [s].
-        sampled: the states of a powerline plan.
+        sampled: the states of a powerline plan, with unit quaternions.
+        at_end, recovery_start: as in `TrajectoryOrder`.
     """
 
     success: bool
     message: str
-    trajectory: Any = None
+    trajectory: FlatTrajectory | SampledTrajectory | None = None
     start_time: float = 0.0
     duration: float = 0.0
     sampled: SampledTrajectory | None = None
+    at_end: AtEnd = AtEnd.CONTACT
+    recovery_start: float = -1.0
 
 
 @dataclass(frozen=True)
@@ -183,6 +190,7 @@ class Inputs:
     specific_force_B: np.ndarray  # IMU samples since the last tick [m/s^2], shape (n, 3)
     plan: PlanAnswer | None = None
     cancel: bool = False
+    imu_period: float = NOMINAL_PERIOD  # [s]
 
 
 @dataclass(frozen=True)

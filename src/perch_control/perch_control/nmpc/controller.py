@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perch_control.geometric import ControlOutput, GeometricController, packed_vehicle
-from perch_control.geometric.controller import NO_COMPENSATION
-from perch_control.guidance import Running
+from perch_control.geometric import GeometricController, packed_vehicle
+from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.nmpc.condensing import solve_condensed
 from perch_control.nmpc.iteration import answer, apply, begin, finish, input_bounds
 from perch_control.nmpc.linearisation import Linearisation
@@ -17,12 +16,15 @@ from perch_control.nmpc.qp import QpFailure
 from perch_control.nmpc.reference_rows import ReferenceRows
 from perch_control.nmpc.riccati import Workspace
 from perch_control.nmpc.settings import NmpcSettings
+from perch_control.period import NOMINAL_PERIOD
 from perch_control.reference import Following, Resting
 from perch_control.rotor_lag import RotorEstimate, lag_behind
 from perch_core.errors import ConfigError
 from perch_core.jit import COMPILED
-from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from perch_control.parameters import ControllerParameters
 
 _REFERENCE_FLOOR = 0.5   # specific thrust below which the reference's attitude is noise [m/s^2]
 _RATE_RESERVE = 1.2
@@ -31,21 +33,23 @@ _ACTIVE_SETS = 12        # tried in one period before the dense QP is solved
 _FAR_LINE = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 1.0, 0.01)
 
 
-class NmpcController:
+class NmpcController(Law):
     """Owns the iterate (states and inputs over the horizon); falls back to the geometric law where the QP fails and for
     references that are guidance by state (a recovery)."""
 
     name = "nmpc"
+    slow = True
 
     def __init__(self, vehicle: Vehicle, settings: NmpcSettings, fallback: GeometricController) -> None:
-        self.vehicle, self.settings, self.fallback = vehicle, settings, fallback
+        super().__init__(vehicle)
+        self._nominal, self.settings, self.fallback = vehicle, settings, fallback
         N, n = settings.nodes, 17 if settings.thrust_states else 13
-        self._spacing = max(1, round(settings.horizon / N / CONTROL_PERIOD))
-        self._dt = self._spacing * CONTROL_PERIOD
+        self._spacing = max(1, round(settings.horizon / N / self.period))
+        self._dt = self._spacing * self.period
         self._layout = StageLayout(n, settings.lines.any)
         self._stages = Linearisation(vehicle, self._dt, self._layout, N + 1)
         self._constants = packed_vehicle(vehicle)
-        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR, self.settings.nodes * self._spacing)
+        self._rows = self._new_rows()
         self._R = np.zeros((N + 1, REFERENCE))
         self.X, self.U = np.zeros((N + 1, n)), np.zeros((N, INPUTS))
         self._start, self._target = np.zeros(n), np.zeros((N, INPUTS))
@@ -58,6 +62,11 @@ class NmpcController:
         self.failures = 0
         self._weights()
         self._warm_up()
+
+    @classmethod
+    def build(cls, vehicle: Vehicle, params: ControllerParameters) -> NmpcController:
+        """Compiled, or found compiled; seconds the first time, a tenth of one later."""
+        return cls(vehicle, params.nmpc, GeometricController.build(vehicle, params))
 
     @property
     def compiled(self) -> bool:
@@ -75,7 +84,7 @@ class NmpcController:
         s, n = self.settings, self._layout.states
         self._rate_max = s.rate_max or _RATE_RESERVE * self.vehicle.body_rate_max
         self._thrust_rate_max = s.thrust_rate_max or _thrust_rate(self.vehicle)
-        self._lag = lag_behind(self.vehicle.motor_time_constant, s.lead, CONTROL_PERIOD)
+        self._lag = lag_behind(self.vehicle.motor_time_constant, s.lead, self.period)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
@@ -97,6 +106,11 @@ class NmpcController:
         self.settings, self.fallback = settings, fallback
         self._weights()
 
+    def retuned(self, params: ControllerParameters) -> NmpcController:
+        """As `retune`; it is not compiled again."""
+        self.retune(params.nmpc, GeometricController.build(self._nominal, params))
+        return self
+
     def begin(self) -> None:
         """Take over in flight: the first iterate is the reference."""
         self._warm = False
@@ -104,13 +118,22 @@ class NmpcController:
     def believe(self, vehicle: Vehicle) -> None:
         """Fly a vehicle that differs from the one at the start in its thrust: what is compiled in knows thrusts alone."""
         self.vehicle, self._constants = vehicle, packed_vehicle(vehicle)
-        self._rows = ReferenceRows(self._constants, _REFERENCE_FLOOR, self.settings.nodes * self._spacing)
+        self._rows = self._new_rows()
         self._weights()
         self.fallback.believe(vehicle)
 
-    def prepare(self, source: Any, contact: bool, running: Running | None = None) -> Any:
-        """The reference to follow for a trajectory: itself; the horizon sees the rotors' limits before they act."""
-        return source
+    def pace(self, period: float) -> None:
+        """The nodes stay where they are compiled to be, a whole number of new periods apart."""
+        if period == self.period:
+            return
+        self.period, self._spacing = period, max(1, round(self._dt / period))
+        self._rows = self._new_rows()
+        self._weights()
+        self.fallback.pace(period)
+
+    def _new_rows(self) -> ReferenceRows:
+        period = self.period if self.period == NOMINAL_PERIOD else self._dt / self._spacing
+        return ReferenceRows(self._constants, _REFERENCE_FLOOR, self.settings.nodes * self._spacing, period)
 
     def lines(self, lines: tuple[tuple[float, ...], ...]) -> None:
         """Powerlines for the soft terms: (centre, direction, half length, radius), 8 floats each; the first is watched."""
@@ -172,7 +195,7 @@ class NmpcController:
 
     def _fill_lines(self, z: np.ndarray) -> None:
         weights = self.settings.lines
-        self._line_time += CONTROL_PERIOD if self._lines else 0.0
+        self._line_time += self.period if self._lines else 0.0
         ramp = min(self._line_time / weights.ramp_time, 1.0) if weights.ramp_time > 0.0 else float(bool(self._lines))
         flat = [v for k in range(LINES) for v in (self._lines[k] if k < len(self._lines) else _FAR_LINE)]
         watched = ramp if self._lines else 0.0

@@ -13,7 +13,6 @@ import numpy as np
 from perch_control.reference import packed_many
 from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
-from perch_core.timing import CONTROL_PERIOD
 from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, times
 from perch_core.vehicle import GRAVITY
 
@@ -101,14 +100,15 @@ def take(rows, stamps, first, spacing, out):
 class ReferenceRows:
     """Rows of the running reference, kept by control period in a ring as long as the horizon."""
 
-    def __init__(self, vehicle: tuple, floor: float, periods: int) -> None:
+    def __init__(self, vehicle: tuple, floor: float, periods: int, period: float) -> None:
         """
         Args:
             vehicle: packed constants.
             floor: see `reference_row`.
             periods: length of the horizon in control periods.
+            period: control period [s].
         """
-        self._vehicle, self._floor = vehicle, floor
+        self._vehicle, self._floor, self._period = vehicle, floor, period
         self._source: Any = None
         self._rows, self._stamps = np.zeros((periods + 1, 17)), np.full(periods + 1, _NEVER)
 
@@ -124,8 +124,8 @@ class ReferenceRows:
         if source is not self._source:
             self._source = source
             self._stamps[:] = _NEVER
-        first = round(elapsed / CONTROL_PERIOD)
+        first = round(elapsed / self._period)
         periods = missing(self._stamps, first, spacing, len(out))
         if len(periods):
-            keep(packed_many(source, periods * CONTROL_PERIOD), periods, self._floor, self._vehicle, self._rows, self._stamps)
+            keep(packed_many(source, periods * self._period), periods, self._floor, self._vehicle, self._rows, self._stamps)
         take(self._rows, self._stamps, first, spacing, out)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Iterable
 
-from perch_core.timing import CONTROL_PERIOD_NS
-
 WINDOW = 500        # answers from which the clocks' offset and the figures are taken
+NEVER = 1 << 62
 MOVED = 50          # so many late answers on end: stamps have lost time to the wall clock (a vehicle catches up 25 steps at most)
 
 
@@ -31,15 +30,16 @@ class Deadlines:
     In real time stamps advance with the wall clock, so `clock - stamp` is the same for every answer but for delays. Its
     least value in the last second belongs to an undelayed answer. An answer is *missed* when it leaves more than one
     period later than that: its successor was due by then. Whoever delayed it counts: the vehicle, the node, or the
-    operating system. Where the vehicle gives up time that it cannot catch up, the stamps stay behind the wall clock for
-    good: `MOVED` answers are missed, then those count as undelayed that come as late. In lockstep there are no deadlines, and nobody
-    calls this.
+    operating system. The period is that of the stamps, whatever the IMU's rate. Where the vehicle gives up time that it cannot catch up, the stamps stay behind the wall clock for
+    good: `MOVED` answers are missed, then those count as undelayed that come as late. Where time is simulated
+    there are no deadlines, and nobody calls this.
     """
 
     def __init__(self) -> None:
         self.answers = 0
         self.missed = 0
         self._last: int | None = None
+        self._period = self._coming_period = NEVER  # least interval of stamps, as `_least`
         self._least = self._coming = self._fresh = 0  # least offset of the last window and of the present one; its length
         self._on_end = self._on_end_least = 0  # late answers in a row and their least offset
         self._lateness: deque[int] = deque(maxlen=WINDOW)
@@ -54,16 +54,21 @@ class Deadlines:
         offset = now - stamp
         if self._fresh == 0:
             self._least, self._coming = (offset if self._last is None else self._coming), offset
+            self._period, self._coming_period = self._coming_period, NEVER
         self._fresh = (self._fresh + 1) % WINDOW
         self._coming = min(self._coming, offset)
+        interval = 0 if self._last is None else stamp - self._last
+        if interval > 0:
+            self._coming_period = min(self._coming_period, interval)
+        period = min(self._period, self._coming_period)
         lateness = offset - min(self._least, self._coming)
         self._lateness.append(lateness)
-        late = lateness > CONTROL_PERIOD_NS
+        late = lateness > period
         self._on_end = self._on_end + 1 if late else 0
         self._on_end_least = offset if self._on_end <= 1 else min(self._on_end_least, offset)
         if self._on_end == MOVED:
             self._least = self._coming = self._on_end_least
-        skipped = 0 if self._last is None else max(0, (stamp - self._last) // CONTROL_PERIOD_NS - 1)
+        skipped = max(0, round(interval / period) - 1)
         self.missed += skipped + late
         self.answers += 1 + skipped
         self._last = stamp

@@ -1,4 +1,4 @@
-"""The base of every node and its main loop."""
+"""From a component to a node: its executable, alone or together with others in one process."""
 
 from __future__ import annotations
 
@@ -6,107 +6,101 @@ import inspect
 import os
 import signal
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import Any, Callable, Generic, Iterator, NoReturn, Sequence, TypeVar
+from dataclasses import dataclass
+from typing import Any, NoReturn
 
-for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")  # one core per node; must be set before numpy is imported
-
+from perch_core.ros.component_node import ComponentNode  # first: it sets the threads of numpy  # isort: skip
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from perch_core.component import Component
+from perch_core.errors import ConfigError, PerchError
+from perch_core.processes import freeze_heap
+from perch_core.registry import resolved
+from perch_core.ros.arrival import ArrivalNode
+from perch_core.ros.priority import priority
+from perch_core.ros.wiring import Wiring
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.parameter import parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 
-from perch_core.errors import ConfigError
-from perch_core.processes import freeze_heap
-from perch_core.ros import qos
-from perch_core.ros.backlog import Backlog
-from perch_core.ros.composition import composition
-from perch_core.ros.conversions import to_stamp
-from perch_core.ros.parameters import Parameters
-from perch_core.ros.priority import priority
-
-T = TypeVar("T")
 LOOK = 0.1  # [s] wall clock, between looks for a signal to stop
+LOCKSTEP = "perch_sim.ros.participant_node:ParticipantNode"  # the host that the simulator brings; nothing here knows the simulator otherwise
 
 
-class PerchNode(Node, Generic[T]):
-    """A node with typed parameters and diagnostics.
+@dataclass(frozen=True)
+class NodeOf:
+    """A node that can be started.
 
-    Subclasses are created by their module's `create(**kwargs)`, where `kwargs` go to `rclpy.node.Node`
-    (`cli_args`, `parameter_overrides`, `namespace`, `context`): so the same class runs alone and composed.
+    Attributes:
+        name: of the node and its executable.
+        component: what it does.
+        choose: its component by the parameter `type`, where there are several.
+        deadline: output whose answers have a deadline in real time; empty: none.
+        lockstep: host of its node in lockstep, `module:class`.
     """
 
-    def __init__(self, name: str, parameters: type[T], on_change: Callable[[T], None] | None = None,
-                 **kwargs: Any) -> None:
-        self._unwatched: set[Subscription] = set()
-        super().__init__(name, **kwargs)
-        try:
-            self._parameters_of_node = Parameters(self, parameters, on_change)
-        except ConfigError:
-            self.destroy_node()
-            raise
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.STATUS)
+    name: str
+    component: type[Component]
+    deadline: str = ""
+    lockstep: str = LOCKSTEP
+    choose: Callable[[str], type[Component]] | None = None
 
-    @property
-    def params(self) -> T:
-        """The present parameters."""
-        return self._parameters_of_node.value
+    def create(self, wiring: Wiring | None = None, **kwargs: Any) -> ComponentNode:
+        """The node, of the host that the parameter `lockstep` asks for. `kwargs` go to `rclpy.node.Node`.
 
-    @property
-    def subscriptions(self) -> Iterator[Subscription]:
-        """Those that the executor watches."""
-        return (subscription for subscription in super().subscriptions if subscription not in self._unwatched)
-
-    def create_backlog(self, msg_type: type, topic: str, profile: QoSProfile) -> Backlog:
-        """Subscribe to a topic without being woken by its messages; `profile.depth` of them are kept."""
-        backlog = Backlog(profile.depth)
-
-        def subscribe() -> None:
-            subscription = self.create_subscription(msg_type, topic, lambda _: None, profile, raw=True)
-            self._unwatched.add(subscription)
-            backlog.subscribe(subscription)
-
-        composition.subscribe(self.resolve_topic_name(topic), backlog.keep, subscribe)
-        return backlog
-
-    def publish_diagnostics(self, time: float, values: dict[str, Any], level: int = 0, message: str = "ok") -> None:
-        """Publish one status of this node on /diagnostics.
-
-        Args:
-            time: simulation time [s].
-            values: what to show; numbers are written with six digits.
-            level: 0 ok, 1 warning, 2 error.
-            message: one line for people.
+        Raises:
+            ConfigError: a parameter is refused.
         """
-        status = DiagnosticStatus(level=bytes([level]), name=self.get_fully_qualified_name(), message=message,
-                                  hardware_id="perch")
-        status.values = [KeyValue(key=key, value=f"{v:.6g}" if isinstance(v, float) else str(v))
-                         for key, v in values.items()]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = to_stamp(float(time))
-        self._diagnostics.publish(array)
+        wiring, given = wiring or Wiring(), _given(self.name, kwargs, {"lockstep": bool, "type": str})
+        component = self.choose(given["type"]) if self.choose is not None and "type" in given else self.component
+        if given.get("lockstep"):
+            return resolved(self.lockstep)(self.name, component, wiring, **kwargs)
+        return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
+
+    def main(self) -> None:
+        """Entry point of the executable: run until SIGINT or SIGTERM; exit code 0, or 2 when the caller's parameters are refused."""
+        run(lambda wiring: [self.create(wiring)], None)
+
+
+def node(name: str, component: type[Component], deadline: str = "", lockstep: str = LOCKSTEP,
+         choose: Callable[[str], type[Component]] | None = None) -> NodeOf:
+    """A node file is `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
+    return NodeOf(name, component, deadline, lockstep, choose)
+
+
+def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> dict[str, Any]:
+    """Parameters that decide what the node is: their given values, read before there is one."""
+    probe = Node(name, enable_rosout=False, start_parameter_services=False, **{k: v for k, v in kwargs.items() if k != "wiring"})
+    try:
+        given = {key: parameter.value for key, parameter in probe._parameter_overrides.items() if key in kinds}
+        for key, value in given.items():
+            if not isinstance(value, kinds[key]):
+                raise ConfigError(name, key, f"{value!r} is not of type {kinds[key].__name__}")
+        return given
+    finally:
+        probe.destroy_node()
 
 
 class StopSignal:
     """Becomes true with SIGINT or SIGTERM.
 
     rclpy's own handlers end a wait by an exception out of whatever callback runs, which EventsExecutor cannot pass on;
-    a flag lets the callback finish.
+    a flag lets the callback finish. Until `patient` is set there is no callback: then it ends the process at once.
     """
 
     def __init__(self) -> None:
-        self._set = False
+        self._set = self.patient = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
     def _handle(self, *_: Any) -> None:
         self._set = True
+        if not self.patient:
+            raise SystemExit(0)
 
     def __bool__(self) -> bool:
         return self._set
@@ -130,41 +124,53 @@ def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
         executor.spin_until_future_complete(stopped, timeout_sec=LOOK)
 
 
-def settle() -> None:
-    """Call when all nodes are there: does at once what would hold up a callback later."""
-    inspect.getmodule(inspect.currentframe())  # the first line of a log looks for the files of all modules: 0.1 s
-    freeze_heap()
+def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
+    """Connect nodes that share a process; all of them are there by now."""
+    for one in nodes:
+        executor.add_node(one)
+        one.connect()
+    for one in nodes:
+        one.wiring.run_on(executor)
 
 
 def close_nodes(nodes: Sequence[Node]) -> None:
     """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
     with ExitStack() as endings:
-        for node in nodes:
-            endings.callback(node.destroy_node)
-        for node in nodes:
-            if (close := getattr(node, "close", None)) is not None:
-                endings.callback(close)
+        for one in nodes:
+            endings.callback(one.destroy_node)
+        for one in nodes:
+            endings.callback(one.close)
 
 
-def spin_main(create: Callable[..., Node], args: list[str] | None = None) -> None:
-    """Run one node until SIGINT or SIGTERM; exits the process with 0, or 2 when the caller's parameters are refused."""
+def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | None) -> NoReturn:
+    """Run the nodes that `create` makes until SIGINT or SIGTERM.
+
+    Exit code 0, or 2 when a parameter is refused.
+    """
+    nodes: list[ComponentNode] = []
     stop = StopSignal()
     try:
         _check_parameter_files(sys.argv if args is None else args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = create()
-    except (ConfigError, rclpy.exceptions.InvalidParameterValueException) as error:
-        _refuse(str(error))
-    except RuntimeError as error:  # rcl refuses command lines and parameter files with this one
-        _refuse(" ".join(str(error).split()))
-    priority.nodes = 1
-    settle()
-    executor = EventsExecutor()
-    executor.add_node(node)
-    try:
+        nodes += create(Wiring())
+        priority.nodes = len(nodes)
+        executor = EventsExecutor()
+        connect(nodes, executor)
+        inspect.getmodule(inspect.currentframe())  # the first line of a log looks for the files of all modules: 0.1 s
+        freeze_heap()
+        for one in nodes:
+            if isinstance(one, ArrivalNode):
+                one.wiring.from_thread(one.hurry)  # while it spins: the executor's threads are raised, too
+        stop.patient = True
         spin_until_stopped(executor, stop)
+    except (PerchError, rclpy.exceptions.InvalidParameterValueException, rclpy.exceptions.InvalidParameterTypeException) as error:
+        _refuse(str(error))
+    except RuntimeError as error:
+        if nodes:
+            raise
+        _refuse(" ".join(str(error).split()))  # rcl refuses command lines and parameter files with this one
     finally:
-        close_nodes([node])
+        close_nodes(nodes)
         rclpy.try_shutdown()
     sys.exit(0)
 

@@ -1,38 +1,41 @@
-"""ROS parameters as a frozen dataclass: declared once with unit and range, refused when unknown or out of range."""
+"""ROS parameters as a frozen dataclass: declared once with type, unit and range; refused when unknown or out of range."""
 
 from __future__ import annotations
 
+import math
 import typing
 from array import array
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import Field, fields, is_dataclass
 from typing import Any, TypeVar
-
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from perch_core import config
 from perch_core.errors import ConfigError
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 T = TypeVar("T")
 
-_FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+HOST = "lockstep"  # parameters of the host, beside the component's own
+_FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.", HOST)
 
 
-def _leaves(cls: type, prefix: str = "") -> dict[str, Any]:
-    """Dotted name -> field of every parameter of a configuration class."""
+def _leaves(cls: type, prefix: str = "") -> dict[str, tuple[Field, Any]]:
+    """Dotted name -> field and type of every parameter of a configuration class."""
     hints = typing.get_type_hints(cls)
-    out = {}
+    out: dict[str, tuple[Field, Any]] = {}
     for item in fields(cls):
-        name = f"{prefix}{item.name}"
-        if is_dataclass(hints[item.name]):
-            out.update(_leaves(hints[item.name], f"{name}."))
+        name, kind = f"{prefix}{item.name}", hints[item.name]
+        if is_dataclass(kind):
+            out.update(_leaves(kind, f"{name}."))
         else:
-            out[name] = item
+            out[name] = item, kind
     return out
 
 
-def _nest(flat: dict[str, Any]) -> dict[str, Any]:
+def nested(flat: dict[str, Any]) -> dict[str, Any]:
+    """Dotted names as nested mappings."""
     out: dict[str, Any] = {}
     for name, value in flat.items():
         *groups, leaf = name.split(".")
@@ -43,13 +46,30 @@ def _nest(flat: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _describe(item: Any) -> str:
+def _numeric(kind: Any) -> bool:
+    return kind in (float, int) or any(map(_numeric, typing.get_args(kind)))
+
+
+def descriptor(item: Field, kind: Any, read_only: bool) -> ParameterDescriptor:
+    """What `ros2 param describe` shows: meaning, unit, range, options.
+
+    Ranges of lists stand in the description only: ROS has none for them. An exclusive bound becomes the next number above it.
+    """
     meta = item.metadata
-    unit = f" [{meta['unit']}]" if meta.get("unit") else ""
-    span = "".join(f" {word} {meta[key]:g}" for key, word in (("above", ">"), ("low", ">="), ("high", "<="))
-                   if meta.get(key) is not None)
-    options = f" one of {', '.join(meta['options'])}" if meta.get("options") else ""
-    return f"{meta.get('doc', '')}{unit}{span}{options}".strip()
+    low, high, above = (meta.get(key) for key in ("low", "high", "above"))
+    optional = type(None) in typing.get_args(kind)
+    out = ParameterDescriptor(description=meta.get("doc", ""), read_only=read_only, dynamic_typing=optional)
+    unit = f"[{meta['unit']}]" if meta.get("unit") else ""
+    entries = kind not in (float, int) and _numeric(kind)
+    out.additional_constraints = ", ".join(part for part in (
+        unit, f"> {above:g}" if above is not None and _numeric(kind) else "", f"one of {', '.join(meta['options'])}" if meta.get("options") else "",
+        f"each >= {low:g}" if entries and low is not None else "", f"each <= {high:g}" if entries else "") if part)
+    if kind is float and "high" in meta:
+        least = float(low) if above is None else math.nextafter(above, math.inf)
+        out.floating_point_range = [FloatingPointRange(from_value=least, to_value=float(high))]
+    elif kind is int and "high" in meta:
+        out.integer_range = [IntegerRange(from_value=int(low) if above is None else math.floor(above) + 1, to_value=int(high), step=1)]
+    return out
 
 
 def _plain(value: Any) -> Any:
@@ -66,41 +86,64 @@ def _value_at(instance: Any, name: str) -> Any:
 class Parameters(typing.Generic[T]):
     """The parameters of a node. `.value` is the present frozen dataclass; it is replaced as a whole on every change."""
 
-    def __init__(self, node: Node, cls: type[T], on_change: typing.Callable[[T], None] | None = None) -> None:
+    def __init__(self, node: Node, cls: type[T], changeable: tuple[str, ...], on_change: Callable[[T], None]) -> None:
         """Declare every field of `cls` on `node` and read its overrides.
 
         Args:
             node: its name is the source in error messages.
             cls: configuration class (see perch_core.config); nested parts become dotted names.
+            changeable: beginnings of the names that may change after the start; the others are read-only.
             on_change: called with the new value after an accepted `ros2 param set`; it may raise ConfigError to refuse.
-                None: the parameters are fixed after the start.
 
         Raises:
             ConfigError: an override is unknown, of the wrong type or out of range.
         """
         self._node, self._cls, self._on_change = node, cls, on_change
         self._leaves = _leaves(cls)
-        overrides = {name: p.value for name, p in node._parameter_overrides.items()}
+        overrides = {name: _plain(p.value) for name, p in node._parameter_overrides.items()}
         for name in overrides:
             if name not in self._leaves and not name.startswith(_FOREIGN):
                 raise config.unknown(node.get_name(), name, "parameter", self._leaves)
         self.value: T = config.from_mapping(
-            cls, _nest({n: v for n, v in overrides.items() if n in self._leaves}), node.get_name())
-        for name, item in self._leaves.items():
-            descriptor = ParameterDescriptor(description=_describe(item), dynamic_typing=True,
-                                             read_only=on_change is None)
-            node.declare_parameter(name, _plain(_value_at(self.value, name)), descriptor, ignore_override=True)
+            cls, nested({n: v for n, v in overrides.items() if n in self._leaves}), node.get_name())
+        for name, (item, kind) in self._leaves.items():
+            fixed = not any(name.startswith(beginning) for beginning in changeable)
+            node.declare_parameter(name, self._shown(name, kind, self.value), descriptor(item, kind, fixed), ignore_override=True)
         node.add_on_set_parameters_callback(self._set)
 
-    def _set(self, changes: list[Parameter]) -> SetParametersResult:
+    def _shown(self, name: str, kind: Any, within: T) -> Any:
+        """A value as ROS takes it; an empty list has no type of its own there."""
+        value = _plain(_value_at(within, name))
+        if value == []:
+            element = next((a for a in typing.get_args(kind) if isinstance(a, type)), str)
+            empty = {float: Parameter.Type.DOUBLE_ARRAY, int: Parameter.Type.INTEGER_ARRAY}.get(element, Parameter.Type.STRING_ARRAY)
+            return Parameter(name, empty, []).value
+        return value
+
+    def checked(self, changes: list[Parameter]) -> list[Parameter]:
+        """Changes as they can be made, with whole numbers as real ones where these are wanted.
+
+        Raises:
+            ConfigError: it names a parameter that is unknown, of another type, or out of range; rclpy's own refusals do not.
+        """
+        for change in changes:
+            if change.name not in self._leaves and not self._node.has_parameter(change.name):
+                raise config.unknown(self._node.get_name(), change.name, "parameter", self._leaves)
+        value = self._changed(changes)
+        return [Parameter(change.name, value=self._shown(change.name, self._leaves[change.name][1], value)) if change.name in self._leaves
+                else change for change in changes]
+
+    def _changed(self, changes: list[Parameter]) -> T:
         mine = {p.name: _plain(p.value) for p in changes if p.name in self._leaves}
-        if not mine:
-            return SetParametersResult(successful=True)
         flat = {name: _plain(_value_at(self.value, name)) for name in self._leaves} | mine
+        return config.from_mapping(self._cls, nested(flat), self._node.get_name())
+
+    def _set(self, changes: list[Parameter]) -> SetParametersResult:
+        if not any(change.name in self._leaves for change in changes):
+            return SetParametersResult(successful=True)
         try:
-            value = config.from_mapping(self._cls, _nest(flat), self._node.get_name())
-            if self._on_change is not None:
-                self._on_change(value)
+            value = self._changed(changes)
+            self._on_change(value)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self.value = value

@@ -37,7 +37,7 @@ class Priority:
         return ""
 
     def give_way(self) -> None:
-        """Let others go first: in lockstep everyone waits for the chain of a step, and a slow participant has its latency.
+        """Let others go first: everyone waits for the chain of a simulated step, and a slow participant has its latency.
 
         Not where it shares its process: a neighbour may be of the chain.
         """

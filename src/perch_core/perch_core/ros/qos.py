@@ -1,11 +1,21 @@
 """The QoS profiles of the graph, by purpose.
 
-Publishers are reliable throughout: a reliable publisher serves best-effort subscribers too, and in lockstep a lost
-message would stop the vehicle. Gated and chain topics are transient local, so that a node that is matched late still
-counts every message.
+Publishers are reliable: a reliable publisher serves best-effort subscribers too. Subscribers to sensors and states are best
+effort, so that camera drivers, which publish best effort, are heard as well, and the newest is worth more than the complete;
+those to orders are reliable. What a late subscriber must know (facts, the newest map) is transient local; orders are not: a
+restarted controller must not carry out an old one.
 """
 
+from typing import NamedTuple
+
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+
+class Qos(NamedTuple):
+    """Profiles of one purpose: `publish` and `subscribe`."""
+
+    publish: QoSProfile
+    subscribe: QoSProfile
 
 
 def _profile(depth: int, latched: bool = False, reliable: bool = True) -> QoSProfile:
@@ -16,10 +26,16 @@ def _profile(depth: int, latched: bool = False, reliable: bool = True) -> QoSPro
     )
 
 
-STEP = _profile(1000, latched=True)     # `step`: every participant sees every step
-CHAIN = _profile(100, latched=True)     # imu, odometry, motor_command, status: one message per step (or per n steps)
-GATED = _profile(100, latched=True)     # results of slow participants: trajectory, vio/odometry, target/pose, powerlines
-LATCHED = _profile(1, latched=True)     # camera_info and other facts
-IMAGE = _profile(5)                     # images
-STATUS = _profile(10)                   # diagnostics, debug output
-SENSOR = _profile(5, reliable=False)    # for subscribers that prefer the newest to the complete
+SENSOR = Qos(_profile(200), _profile(200, reliable=False))        # imu, odometry, motor_command: up to 1000 Hz
+IMAGE = Qos(_profile(5), _profile(5, reliable=False))             # images, camera_info
+STATE = Qos(_profile(50), _profile(50))                           # statuses, results of perception
+ORDER = Qos(_profile(50), _profile(50))                           # trajectories, commands
+LATCHED = Qos(_profile(1, latched=True), _profile(1, latched=True))         # facts, the newest map
+EVENT = Qos(_profile(100, latched=True), _profile(100, latched=True))       # contacts: all of them, also for who comes late
+STATIC = Qos(_profile(50, latched=True), _profile(50, latched=True))        # /tf_static
+CLOCK = Qos(_profile(10), _profile(10, reliable=False))
+
+
+def kept(purpose: Qos) -> QoSProfile:
+    """For who keeps every message of a topic: reliable, and with room for seconds of it."""
+    return QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=purpose.publish.durability)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from perch_core.scenario import Adhesion
-from perch_sim.contact_event import ContactEvent, ContactState
+from perch_core.values import Contact
+from perch_sim.contact_event import ContactState
+from perch_sim.scenario import Adhesion
 
 SUCCESS = "perched"
 CAUSES = ("not_found", "refused", "lost_track", "missed_pad", "too_fast", "too_slow", "tilt", "came_off", "crash", "timeout",
@@ -23,7 +24,7 @@ _BY_OUTCOME = {"not_found": "not_found", "refused": "refused", "timeout": "timeo
                "bad_goal": "refused"}
 
 
-def cause_of(outcome: str, contacts: Sequence[ContactEvent], adhesion: Adhesion) -> str:
+def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> str:
     """`perched`, or one of `CAUSES`. A perch counts only where the truth shows the vehicle attached at the end; an inspection that
     came to its end is a success too, where the truth shows no collision.
 
@@ -34,19 +35,19 @@ def cause_of(outcome: str, contacts: Sequence[ContactEvent], adhesion: Adhesion)
     """
     if outcome == "perched":
         return SUCCESS if _holds(contacts) else "came_off"
-    if outcome == "inspected" and not any(c.state is ContactState.COLLISION for c in contacts):
+    if outcome == "inspected" and not any(c.state == ContactState.COLLISION for c in contacts):
         return SUCCESS
     touches = [c for c in contacts if c.state in (ContactState.BOUNCED, ContactState.COLLISION)]
     if outcome in _BY_OUTCOME and not touches:
         return _BY_OUTCOME[outcome]
     if not touches:
         return "missed_pad" if outcome == "missed" else "lost_track"
-    if any(c.state is ContactState.COLLISION for c in touches[:1]) or any("crashed" in c.reason for c in touches):
-        return "crash" if touches[0].body != "pad" or touches[0].state is ContactState.COLLISION else _bounce(touches[0], adhesion)
+    if any(c.state == ContactState.COLLISION for c in touches[:1]) or any("crashed" in c.reason for c in touches):
+        return "crash" if touches[0].body != "pad" or touches[0].state == ContactState.COLLISION else _bounce(touches[0], adhesion)
     return _bounce(touches[0], adhesion)
 
 
-def _bounce(touch: ContactEvent, adhesion: Adhesion) -> str:
+def _bounce(touch: Contact, adhesion: Adhesion) -> str:
     """Which limit of the velcro a touch missed by most."""
     if "outside the pad" in touch.reason:
         return "missed_pad"
@@ -57,10 +58,10 @@ def _bounce(touch: ContactEvent, adhesion: Adhesion) -> str:
     return max(ratios, key=lambda name: ratios[name])
 
 
-def _holds(contacts: Sequence[ContactEvent]) -> bool:
+def _holds(contacts: Sequence[Contact]) -> bool:
     holder = ""  # pad or cable
     for c in contacts:
-        if c.state is ContactState.ATTACHED:
+        if c.state == ContactState.ATTACHED:
             holder = c.body
         elif c.body == holder:
             holder = ""

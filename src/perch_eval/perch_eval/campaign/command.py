@@ -24,7 +24,7 @@ EXAMPLES = """examples:
   python3 scripts/campaign.py contact                           config/campaigns/contact.yaml, in process, on all cores
   python3 scripts/campaign.py my.yaml --engine stack --jobs 1   the real nodes, each flight in a ROS domain of its own
   python3 scripts/campaign.py contact --resume                  go on after an interruption
-  python3 scripts/campaign.py contact --cluster tcp://host:8786 on a Dask cluster (`local`: one on this machine)
+  python3 scripts/campaign.py contact --cluster tcp://host:8786 on a Dask cluster
 
 exit code: 0 every run was flown (whatever came of it), 1 some could not be carried out, 2 the caller's mistake,
 130 interrupted (results so far are kept; --resume goes on)"""
@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--engine", metavar="NAME", help=f"{' or '.join(ENGINES)}, or your own as module:function (default: the file's)")
     out.add_argument("--runs", type=count, metavar="N", help="flights, with grids per grid point (default: the file's)")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes (default: %(default)s)")
-    out.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler, or 'local'")
+    out.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler (SECURITY.md)")
     out.add_argument("--resume", action="store_true", help="go on with the results in --out")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of results and report (default: out/campaigns/<name>)")
     return out
@@ -91,7 +91,7 @@ def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None
           + (f"Dask {cluster}" if cluster else f"{jobs} process{'es' if jobs > 1 else ''}"), flush=True)
     progress = Progress(len(campaign.runs), len(finished), sum(r.cause == SUCCESS for r in known))
     try:
-        for result in (on_cluster(tasks, cluster, jobs) if cluster else in_pool(tasks, jobs)):
+        for result in (on_cluster(tasks, cluster) if cluster else in_pool(tasks, jobs)):
             results.add(result)
             progress.add(result.cause == SUCCESS)
     finally:

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from perch_core.config import LARGEST_NUMBER
 from perch_core.errors import ConfigError
 
+LARGEST_SEED = 2**31 - 1
 KINDS = ("choice", "uniform", "normal", "grid")
 
 
@@ -55,18 +57,42 @@ def parse(source: str, key: str, entry: Any) -> Distribution:
         raise ConfigError(source, key, f"{dict(entry)!r} needs exactly one of {', '.join(KINDS)}"
                           " (normal may have low and high)")
     kind, values = kinds[0], entry[kinds[0]]
-    if not isinstance(values, (list, tuple)) or not values:
+    if not isinstance(values, list) or not values:
         raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not a list")
+    if len({_sort(v) for v in values}) > 1 or "" in map(_sort, values):
+        raise ConfigError(source, f"{key}.{kind}", f"{values!r} are not all numbers (of at most {LARGEST_NUMBER:g}), words, true or false, or vectors")
     if kind in ("uniform", "normal"):
         if len(values) != 2 or not all(_is_number(v) for v in values):
-            raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not two numbers")
+            raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not two numbers of at most {LARGEST_NUMBER:g}")
         if kind == "uniform" and not values[0] < values[1]:
             raise ConfigError(source, f"{key}.uniform", f"{values[0]} is not below {values[1]}")
         if kind == "normal" and not values[1] > 0:
             raise ConfigError(source, f"{key}.normal", f"sigma {values[1]} is not > 0")
-    limits = {name: float(entry[name]) for name in ("low", "high") if name in entry}
+    limits = {name: entry[name] for name in ("low", "high") if name in entry}
+    for name, value in limits.items():
+        if not _is_number(value):
+            raise ConfigError(source, f"{key}.{name}", f"{value!r} is not a number of at most {LARGEST_NUMBER:g}")
     return Distribution(kind, tuple(tuple(v) if isinstance(v, list) else v for v in values), **limits)
 
 
+def parse_seed(source: str, key: str, entry: Any) -> Distribution:
+    """The distribution of flights' seeds: a grid or a choice.
+
+    Raises:
+        ConfigError: anything else than whole numbers in the range of seeds.
+    """
+    found = parse(source, key, entry)
+    if found.kind not in ("grid", "choice") or not all(type(v) is int and 0 <= v <= LARGEST_SEED for v in found.values):
+        raise ConfigError(source, key, f"{entry!r} is not a grid or choice of whole numbers in [0, {LARGEST_SEED}]")
+    return found
+
+
+def _sort(value: Any) -> str:
+    """What values of one quantity have in common; empty: what none can have."""
+    if isinstance(value, list):
+        return f"{len(value)} numbers" if value and all(map(_is_number, value)) else ""
+    return "number" if _is_number(value) else type(value).__name__ if isinstance(value, (str, bool)) else ""
+
+
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER

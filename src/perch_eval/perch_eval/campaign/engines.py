@@ -17,6 +17,7 @@ import cv2
 import yaml
 
 from perch_core.errors import PerchError
+from perch_core.processes import one_thread_for_sums
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.results import RunResult
@@ -62,6 +63,7 @@ def resolve(name: str) -> Callable[[Task], RunResult]:
 def carry_out(task: Task) -> RunResult:
     """Fly one run; whatever goes wrong is a result as well."""
     began = time.perf_counter()
+    one_thread_for_sums()
     cv2.setNumThreads(1)  # runs share the cores already; OpenCV's own threads cost each of them 15 % more CPU time
     try:
         result = resolve(task.engine)(task)
@@ -71,20 +73,20 @@ def carry_out(task: Task) -> RunResult:
 
 
 def fly_in_process(task: Task) -> RunResult:
-    """One run on the in-process engine."""
+    """One run in this process."""
     from perch_eval.in_process import Sensing, fly
-    from perch_eval.in_process.recording import TracedFlight, write
     from perch_eval.metrics import flight_metrics
 
     scenario = scenario_of(task.scenario, f"run {task.run.number}")
     trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5 if task.keep else 0.0)
-    metrics = flight_metrics(TracedFlight(trace), load_vehicle(scenario.vehicle), trace.end_time)
+    metrics = flight_metrics(trace.flight, load_vehicle(scenario.vehicle), trace.end_time)
     if task.keep:
-        from perch_eval.report import build_report  # and with it matplotlib: most workers keep no flight
+        from perch_eval.report import build_report  # and with it matplotlib and ROS: most workers keep no flight
+        from perch_eval.ros.recorded_flight import write
 
         folder = Path(task.keep)
         folder.mkdir(parents=True, exist_ok=True)
-        write(trace, folder / "flight.mcap")
+        write(folder / "flight.mcap", trace.timeline())
         (folder / "scenario.yaml").write_text(yaml.safe_dump(task.scenario))
         build_report(folder, scenario, task.run.seed, trace.outcome, trace.message, trace.wall_time, trace.end_time)
     return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion),
@@ -94,8 +96,8 @@ def fly_in_process(task: Task) -> RunResult:
 def fly_on_the_stack(task: Task) -> RunResult:
     """One run on the real nodes: composed, in lockstep, in a ROS domain of its own."""
     from perch_eval.demo import fly
-    from perch_eval.flight import Flight
     from perch_eval.nodes import ALL_NODES
+    from perch_eval.ros.recorded_flight import RecordedFlight
 
     with contextlib.ExitStack() as stack:
         folder = Path(task.keep or stack.enter_context(tempfile.TemporaryDirectory(prefix="perch-run-")))
@@ -105,18 +107,10 @@ def fly_on_the_stack(task: Task) -> RunResult:
         log = stack.enter_context(open(folder / "flight.log", "w"))
         with contextlib.redirect_stdout(log):
             report = fly(str(file), task.run.seed, folder, composed=ALL_NODES)
-        contacts = contact_events(Flight(folder / "flight.mcap"))
+        contacts = [contact for _, contact in RecordedFlight(folder / "flight.mcap").values("contact")]
         adhesion = scenario_of(task.scenario, str(file)).adhesion
     return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, adhesion), report["outcome"],
                      report["message"], metrics=flatten(report, report["simulated_time_s"]))
-
-
-def contact_events(flight: Any) -> list:
-    """The contacts of a recorded flight."""
-    from perch_sim.contact_event import ContactEvent, ContactState
-
-    return [ContactEvent(t, ContactState(m.state), m.body, m.normal_speed, m.tangential_speed, m.tilt_error, m.offset, m.reason)
-            for t, m in flight.messages("contact")]
 
 
 def flatten(metrics: dict[str, Any], end_time: float) -> dict[str, float | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sqlite3
 from dataclasses import dataclass, field
@@ -57,24 +58,26 @@ class Results:
         Raises:
             ResultsError: it holds another campaign's results, or results and `resume` is not asked for, or it is damaged.
         """
-        self._db = sqlite3.connect(path)
+        try:
+            self._db = sqlite3.connect(path)
+        except sqlite3.Error as error:
+            raise _unreadable(path, error) from None
         try:
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(_SCHEMA)
             known = dict(self._db.execute("SELECT key, value FROM campaign"))
-            _read(self._db)
-        except sqlite3.Error as error:
+            finished = len(_read(self._db))
+        except _DAMAGE as error:
             self._db.close()
-            raise ResultsError(f"{path} cannot be read as results ({error}): choose another --out") from None
+            raise _unreadable(path, error) from None
         if known and known.get("digest") != digest:
             self._db.close()
             raise ResultsError(f"{path} holds results of campaign {known.get('name')!r} with other settings: "
                                "choose another --out, or the settings of then")
-        if self.finished() and not resume:
-            count = len(self.finished())
+        if finished and not resume:
             self._db.close()
-            raise ResultsError(f"{path} already holds {count} results: --resume goes on with them, another --out starts anew")
+            raise ResultsError(f"{path} already holds {finished} results: --resume goes on with them, another --out starts anew")
         with self._db:
             self._db.executemany("INSERT OR REPLACE INTO campaign VALUES (?, ?)", [("name", name), ("digest", digest)])
 
@@ -102,15 +105,30 @@ class Results:
 
 
 def read_results(path: Path) -> list[RunResult]:
-    """Every result in a file, by number, also while a campaign is writing it."""
-    db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    """Every result in a file, by number, also while a campaign is writing it.
+
+    Raises:
+        ResultsError: it cannot be read.
+    """
     try:
-        return _read(db)
-    finally:
-        db.close()
+        with contextlib.closing(sqlite3.connect(f"{Path(path).absolute().as_uri()}?mode=ro", uri=True)) as db:
+            return _read(db)
+    except _DAMAGE as error:
+        raise _unreadable(path, error) from None
+
+
+_DAMAGE = (sqlite3.Error, ValueError, TypeError, RecursionError)  # of the file, of JSON in it, of its columns, of JSON's depth
+
+
+def _unreadable(path: Path, error: Exception) -> ResultsError:
+    return ResultsError(f"{path} cannot be read as results ({error}): choose another --out")
 
 
 def _read(db: sqlite3.Connection) -> list[RunResult]:
     rows = db.execute("SELECT run, seed, cause, outcome, message, vary, metrics, wall_time FROM runs ORDER BY run")
-    return [RunResult(n, seed, cause, outcome, message, json.loads(vary), json.loads(metrics), wall)
+    return [RunResult(int(n), int(seed), str(cause), str(outcome), str(message), dict(json.loads(vary)), _figures(json.loads(metrics)), float(wall))
             for n, seed, cause, outcome, message, vary, metrics, wall in rows]
+
+
+def _figures(metrics: dict[str, Any]) -> dict[str, float | None]:
+    return {name: None if value is None else float(value) for name, value in dict(metrics).items()}

@@ -10,6 +10,7 @@ import copy
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,18 @@ from typing import Any
 import numpy as np
 
 from perch_core import config
-from perch_core.config import choice, part, quantity, text
+from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
-from perch_core.scenario import Scenario
-from perch_eval.campaign.distributions import Distribution, parse
+from perch_core.vehicle import Vehicle
+from perch_eval.campaign.distributions import LARGEST_SEED, Distribution, parse, parse_seed
+from perch_eval.flyable import check_flight, check_names
+from perch_eval.in_process.parameters import check_parameters
+from perch_sim.scenario import Scenario
+from perch_sim.scenario_files import scenario_mapping
+
+
+RUNS_MAX = 20_000
+"""Of a campaign, all points of its grids together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +45,13 @@ class SensingChoice:
 class _File:
     """A campaign's file."""
 
-    name: str = text()
+    name: str = label()
     description: str = text("")
     scenario: str = text("surface_90", doc="name in config/scenarios, or a file")
     engine: str = choice("in_process", options=("in_process", "stack"))
     sensing: SensingChoice = part(SensingChoice)
-    runs: int = quantity(100, low=1, high=1_000_000, doc="flights; with grids: flights per grid point")
-    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of the campaign: draws and the flights' seeds come from it")
+    runs: int = quantity(100, low=1, high=RUNS_MAX, doc="flights; with grids: flights per grid point")
+    seed: int = quantity(1, low=0, high=LARGEST_SEED, doc="of the campaign: draws and the flights' seeds come from it")
     vary: dict[str, Any] = text(None, doc="name -> distribution")
     map: tuple[str, ...] = quantity((), doc="two varied names: axes of the success map")
     keep_worst: int = quantity(5, low=0, high=100, doc="flights whose full reports are kept")
@@ -110,8 +119,8 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     """
     file = config.find("campaigns", path)
     content = config.load(_File, file)
-    base = config.read_yaml(config.find("scenarios", content.scenario))
-    vary = {name: parse(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
+    base = scenario_mapping(content.scenario)
+    vary = {name: (parse_seed if name == "seed" else parse)(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
     mappable = [name for name in vary if name != "seed"]  # one run a seed: no rate
     for axis in content.map:
         if axis not in mappable:
@@ -120,37 +129,64 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
         raise ConfigError(str(file), "map", f"needs two names, has {len(content.map)}")
     engine = engine or content.engine
     sensing = {"vio": content.sensing.vio, "target": content.sensing.target}
+    flights = math.prod([runs or content.runs, *(len(d.values) for d in vary.values() if d.kind == "grid")])
+    if flights > RUNS_MAX:
+        raise ConfigError(str(file), "runs", f"{flights} flights on all points of the grids are more than {RUNS_MAX}")
     drawn = _draw(vary, runs or content.runs, content.seed)
     axes = content.map or tuple(mappable[:2])
     decisive = json.dumps([engine, sensing, base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
     campaign = Campaign(content.name, content.description, engine, sensing, axes if len(axes) == 2 else (),
                         content.keep_worst, base, vary, drawn, hashlib.sha256(decisive.encode()).hexdigest())
-    for run in drawn:
-        scenario_of(campaign.mapping(run), f"{file}: run {run.number} ({_words(run.values)})")
+    _check(campaign, str(file))
     return campaign
+
+
+def _check(campaign: Campaign, file: str) -> None:
+    """Make sure that every run can be flown: its scenario, what that names, and the nodes' parameters.
+
+    Raises:
+        ConfigError: names the run and its values.
+    """
+    vehicles: dict[tuple[str, str], Vehicle] = {}
+    parameters: dict[str, Any] = {}
+    different = {json.dumps(run.values): run for run in reversed(campaign.runs)}
+    for run in sorted(different.values(), key=lambda run: run.number):
+        source = f"{file}: run {run.number} ({_words(run.values)})"
+        scenario = scenario_of(campaign.mapping(run), source)
+        named = scenario.vehicle, scenario.target.board
+        if named not in vehicles:
+            vehicles[named] = check_names(scenario, source)
+        if campaign.engine == "stack":
+            check_flight(scenario, source, vehicles[named])
+        if scenario.parameters != parameters:
+            check_parameters(scenario, source)
+            parameters = scenario.parameters
 
 
 def place(mapping: dict[str, Any], name: str, value: Any) -> None:
     """Set a dotted name in a scenario's mapping; a number names an entry of a vector that is zero otherwise."""
     *groups, leaf = name.split(".")
-    if groups and groups[0] == "parameters" and len(groups) >= 2:
-        mapping.setdefault("parameters", {}).setdefault(groups[1], {})[".".join((*groups[2:], leaf))] = value
-        return
-    if leaf.isdigit() and groups:
+    value = list(value) if isinstance(value, tuple) else value
+    if groups[:1] == ["parameters"] and len(groups) >= 2:
+        _group(mapping, groups[:2])[".".join((*groups[2:], leaf))] = value
+    elif groups and leaf.isascii() and leaf.isdigit():
         *outer, vector = groups
         target = _group(mapping, outer)
-        entries = list(target.get(vector, (0.0, 0.0, 0.0)))
+        entries = target.get(vector, [0.0, 0.0, 0.0])
+        if not isinstance(entries, list):
+            raise ConfigError("campaign", f"vary.{name}", f"{vector} is no vector")
         if int(leaf) >= len(entries):
             raise ConfigError("campaign", f"vary.{name}", f"{vector} has {len(entries)} entries")
-        entries[int(leaf)] = value
-        target[vector] = entries
-        return
-    _group(mapping, groups)[leaf] = list(value) if isinstance(value, tuple) else value
+        target[vector] = [*entries[:int(leaf)], value, *entries[int(leaf) + 1:]]
+    else:
+        _group(mapping, groups)[leaf] = value
 
 
 def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
     for group in groups:
-        mapping = mapping.setdefault(group, {})
+        if mapping.get(group) is None:
+            mapping[group] = {}
+        mapping = mapping[group]
         if not isinstance(mapping, dict):
             raise ConfigError("campaign", f"vary.{'.'.join(groups)}", f"{group} is a value, not a group")
     return mapping

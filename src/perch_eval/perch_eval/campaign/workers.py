@@ -9,22 +9,26 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
 
 from perch_core.errors import PerchError
 from perch_core.processes import end_with_parent
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.results import RunResult
 
+END_LIMIT = 5  # of a worker that is told to end [s]
 ATTEMPTS = 3  # a run whose worker died so often is given up
 
 
+def _end(*_: object) -> None:
+    """An exception, so that nodes are stopped on the way out; the pool takes one out of a run for its result, so there is a limit."""
+    signal.alarm(END_LIMIT)
+    sys.exit(1)
+
+
 def prepare_worker() -> None:
-    """One thread per library, Ctrl-C is the campaign's own matter, and no worker outlives its campaign."""
-    for name in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
-        os.environ[f"{name}_NUM_THREADS"] = "1"
+    """Ctrl-C is the campaign's own matter, and no worker outlives its campaign."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # an exception, so that nodes are stopped on the way out
+    signal.signal(signal.SIGTERM, _end)
     end_with_parent(signal.SIGTERM)
 
 
@@ -79,38 +83,30 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def on_cluster(tasks: Sequence[Task], address: str, jobs: int) -> Iterator[RunResult]:
+def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
     """Carry out tasks on a Dask cluster; Dask repeats what a lost worker had under way.
 
     Args:
         tasks: what to carry out.
-        address: of the scheduler (`tcp://host:8786`), or `local` for a cluster of `jobs` processes here.
-        jobs: workers of a local cluster.
+        address: of the scheduler (`tcp://host:8786`).
 
     Raises:
         PerchError: the scheduler does not answer.
     """
-    from distributed import Client, LocalCluster, as_completed
+    from distributed import Client, as_completed
 
-    cluster: Any = None
-    if address == "local":
-        cluster = LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
     try:
-        try:
-            client = Client(cluster or address, timeout="20s")
-        except (OSError, TimeoutError, ValueError) as error:
-            raise PerchError(f"--cluster {address}: {error or 'no answer from the scheduler'}") from None
-        with client:
-            futures = {client.submit(carry_out, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
-                       task for task in tasks}
-            for future in as_completed(list(futures)):
-                task = futures.pop(future)
-                try:
-                    result = future.result()  # may be lost with its worker even now: Dask then carries it out again
-                except Exception as error:
-                    result = dead(task, f"{type(error).__name__}: {error}")
-                future.release()
-                yield result
-    finally:
-        if cluster is not None:
-            cluster.close()
+        client = Client(address, timeout="20s")
+    except (OSError, TimeoutError, ValueError) as error:
+        raise PerchError(f"--cluster {address}: {error or 'no answer from the scheduler'}") from None
+    with client:
+        futures = {client.submit(carry_out, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
+                   task for task in tasks}
+        for future in as_completed(list(futures)):
+            task = futures.pop(future)
+            try:
+                result = future.result()  # may be lost with its worker even now: Dask then carries it out again
+            except Exception as error:
+                result = dead(task, f"{type(error).__name__}: {error}")
+            future.release()
+            yield result

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core import config
-from perch_core.scenario import Scenario
-from perch_eval.control_flights.flight import LEAD, TAKE_OFF_SPEED, ControlFlight
+from perch_eval.control_flights.flight import ControlFlight, scenario_of
+from perch_eval.control_flights.pilot import LEAD, TAKE_OFF_SPEED
 
 SCENARIO = "surface_90"
 CONTROLLERS = {"geometric": ("geometric", False), "geometric + L1": ("geometric", True),
@@ -47,34 +46,34 @@ class Compared:
 def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
     """Take off, hover until the adaptation has settled, then a line and a hover, or the perch on the wall; estimated state."""
     law, adaptive = CONTROLLERS[controller]
-    mapping = {**config.read_yaml(config.find("scenarios", SCENARIO)), **CONDITIONS[condition],
-               "parameters": {"controller": {"controller.type": law, "controller.adaptive": adaptive}}}
-    flight = ControlFlight(config.from_mapping(Scenario, mapping, SCENARIO), seed)
+    flight = ControlFlight(scenario_of(SCENARIO, CONDITIONS[condition], {"controller.type": law, "controller.adaptive": adaptive}), seed)
     flight.arm()
     flight.run(flight.time + 0.2)
-    height = flight.scenario.mission.takeoff_height
-    place = flight.odometry.estimate.p_WB + (0.0, 0.0, height)
-    flight.go(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
+    pilot, height = flight.pilot, flight.scenario.mission.takeoff_height
+    place = pilot.p_WB + (0.0, 0.0, height)
+    pilot.go(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
     flight.run(flight.time + LEAD + height / TAKE_OFF_SPEED + SETTLE)
     begin = flight.time
     if maneuver == "line":
-        ordered = flight.go(LINE, LINE_TIME)
+        order = pilot.go(LINE, LINE_TIME)
         end = begin + LEAD + LINE_TIME
         flight.run(end + HOVER)
     else:
-        ordered = flight.perch(place)
-        end = flight.contact_due
+        order = flight.perch(place)
+        end = pilot.contact_due
         flight.run(min(end, flight.time + 10.0) + 1.0)
-    if not ordered:
+    if order is None or not flight.flew(order):
         return Compared((np.nan,) * 3, f"not begun: {flight.events[-1][2]}")
-    table = np.array(flight.references)
+    flown = flight.loop.trace.flight
     # A vehicle that has touched the wall follows no reference.
-    touched = min([c.time for c in flight.contacts if c.time > begin], default=np.inf)
-    table = table[(table[:, 0] >= begin) & (table[:, 0] <= min(end if maneuver == "perch" else np.inf, touched))]
+    touched = min([t for t, c in flown.values("contact") if t > begin], default=np.inf)
+    wanted = flown.reference()
+    during = (wanted.t >= begin) & (wanted.t <= min(end if maneuver == "perch" else np.inf, touched))
+    times, p = wanted.t[during], wanted.p[during]
     if maneuver == "perch":  # the controller's own reference differs from the plan by what its rehearsal adds
-        table = table[table[:, 0] >= flight.plan.start_time]
-        table[:, 1:4] = [flight.plan.sample(t - flight.plan.start_time).p for t in table[:, 0]]
-    rmse = np.sqrt(np.mean((table[:, 1:4] - table[:, 4:7]) ** 2, axis=0))
+        times = times[times >= flight.plan.start_time]
+        p = np.array([flight.plan.sample(t - flight.plan.start_time).p for t in times])
+    rmse = np.sqrt(np.mean((p - flown.states("ground_truth/odometry").at(times).p) ** 2, axis=0))
     return Compared(tuple(rmse.tolist()), _outcome(flight, maneuver))
 
 
@@ -84,6 +83,6 @@ def _outcome(flight: ControlFlight, maneuver: str) -> str:
     if maneuver == "perch":
         if flight.simulation.plant.contact.attached:
             return "perched"
-        refused = next((c.reason for c in flight.contacts if c.body == "pad" and c.reason), "")
-        return f"missed: {refused}" if refused else f"missed, {flight.controller.state.name.lower()}"
-    return "held" if flight.controller.state.name == "HOVERING" else flight.controller.state.name.lower()
+        refused = next((c.reason for c in flight.loop.trace.contacts if c.body == "pad" and c.reason), "")
+        return f"missed: {refused}" if refused else f"missed, {flight.state.name.lower()}"
+    return "held" if flight.state.name == "HOVERING" else flight.state.name.lower()

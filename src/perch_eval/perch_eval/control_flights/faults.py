@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from perch_control.modes import Command, State, StepResult
-from perch_core import config, so3
-from perch_core.errors import PerchError
-from perch_core.scenario import Scenario
+from perch_control.modes import Command, State
+from perch_core import so3
+from perch_core.values import Ask, OdometryState, seconds
 from perch_core.vehicle import GRAVITY
-from perch_eval.control_flights.flight import LEAD, TAKE_OFF_SPEED, ControlFlight
+from perch_eval.control_flights.flight import ControlFlight, scenario_of
+from perch_eval.control_flights.pilot import LEAD, TAKE_OFF_SPEED
 from perch_eval.control_flights.way_out import Search, search
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
@@ -30,32 +30,7 @@ END_STATES = ("hovering", "landed", "perched")
 """What counts as a way out."""
 
 
-class FaultyFlight(ControlFlight):
-    """A flight into whose odometry a fault can reach.
-
-    Attributes:
-        corrupt: what becomes of stamp [s] and sample; it returns None where no odometry comes at all.
-    """
-
-    def __init__(self, scenario: Scenario, seed: int) -> None:
-        super().__init__(scenario, seed)
-        self.corrupt: Callable[[float, tuple[float, ...]], tuple[float, tuple[float, ...]] | None] | None = None
-        self._answered = 0.0
-
-    def answer(self, time: float) -> StepResult | None:
-        """As the node in real time: where odometry does not come for `blind_after`, the IMU's samples are answered."""
-        given = (time, self.odometry.sample)
-        if self.corrupt is not None:
-            given = self.corrupt(*given)
-        if given is not None:
-            self._answered = time
-            return self.controller.step(*given)
-        if time - self._answered < self.params.blind_after and not self.controller.blind:
-            return None
-        return self.controller.step_blind(time)
-
-
-Strike = Callable[[FaultyFlight, np.random.Generator], str]
+Strike = Callable[[ControlFlight, np.random.Generator], str]
 
 
 @dataclass(frozen=True)
@@ -75,39 +50,44 @@ class Fault:
     scenario: dict = field(default_factory=dict)
 
 
-def _stale(flight: FaultyFlight, rng: np.random.Generator) -> str:
+def _stale(flight: ControlFlight, rng: np.random.Generator) -> str:
     if rng.random() < 0.5:
-        flight.corrupt = lambda time, sample: None
+        flight.loop.filters["controller", "odometry"] = lambda now, state: None
         return "no odometry any more"
-    last = flight.time, flight.odometry.sample
-    flight.corrupt = lambda time, sample: last
+    last = flight.pilot.believed
+    flight.loop.filters["controller", "odometry"] = lambda now, state: last
     return "the last sample again and again"
 
 
-def _jump(flight: FaultyFlight, rng: np.random.Generator) -> str:
+def _jump(flight: ControlFlight, rng: np.random.Generator) -> str:
     offset = rng.normal(size=3)
     offset *= rng.uniform(0.3, 2.0) / np.linalg.norm(offset)
     lasting = rng.uniform(0.01, 1.0) if rng.random() < 0.5 else np.inf
     end = flight.time + lasting
 
-    def jumped(time: float, sample: tuple[float, ...]) -> tuple[float, tuple[float, ...]]:
-        return time, sample if time > end else (*(np.array(sample[:3]) + offset).tolist(), *sample[3:])
+    def jumped(now: int, state: OdometryState) -> OdometryState:
+        return state if seconds(now) > end else state._replace(p_WB=tuple((np.array(state.p_WB) + offset).tolist()))
 
-    flight.corrupt = jumped
+    flight.loop.filters["controller", "odometry"] = jumped
     return f"position jumps by ({offset[0]:.2f}, {offset[1]:.2f}, {offset[2]:.2f}) m" + (f" for {lasting:.2f} s" if np.isfinite(lasting) else " for good")
 
 
-def _lose_vio(flight: FaultyFlight, rng: np.random.Generator) -> str:
-    flight.sensing.vio_lost = True
+def _lose_vio(flight: ControlFlight, rng: np.random.Generator) -> str:
+    for channel in ("vio/state", "vio/odometry"):
+        flight.loop.filters["estimator", channel] = lambda now, value: None
     return "no VIO pose any more"
 
 
-def _silence(flight: FaultyFlight, rng: np.random.Generator) -> str:
-    flight.orders_lost = True
+def _lose_orders(flight: ControlFlight) -> None:
+    flight.loop.filters["controller", "trajectory"] = lambda now, order: None
+
+
+def _silence(flight: ControlFlight, rng: np.random.Generator) -> str:
+    _lose_orders(flight)
     return "no trajectory any more"
 
 
-def _kick(flight: FaultyFlight, rng: np.random.Generator) -> str:
+def _kick(flight: ControlFlight, rng: np.random.Generator) -> str:
     axis = rng.normal(size=3) * (1.0, 1.0, 0.3)
     w = axis / np.linalg.norm(axis) * rng.uniform(8.0, 20.0)
     x, plant = flight.simulation.state, flight.simulation.plant
@@ -115,40 +95,37 @@ def _kick(flight: FaultyFlight, rng: np.random.Generator) -> str:
     return f"a blow turns the vehicle with ({w[0]:.1f}, {w[1]:.1f}, {w[2]:.1f}) rad/s"
 
 
-def _weaken(flight: FaultyFlight, rng: np.random.Generator) -> str:
-    vehicle, plant = flight.vehicle, flight.simulation.plant
+def _weaken(flight: ControlFlight, rng: np.random.Generator) -> str:
+    vehicle, plant = flight.simulation.vehicle, flight.simulation.plant
     hover = vehicle.mass * 9.81 / (4.0 * vehicle.thrust_max)
     share = rng.uniform(0.95, 1.3) * hover
     plant.body = plant.body._replace(thrust_coefficient=plant.body.thrust_coefficient * share)
     return f"all rotors give at most {100 * share / hover:.0f} % of the weight"
 
 
-def _fence(flight: FaultyFlight, rng: np.random.Generator) -> str:
-    limits, axis = flight.params.flight, rng.integers(3)
+def _fence(flight: ControlFlight, rng: np.random.Generator) -> str:
+    parameters = flight.controller.config
+    limits, axis = parameters.flight, rng.integers(3)
     low, high = list(limits.fence_low), list(limits.fence_high)
-    p, outside = flight.odometry.estimate.p_WB, rng.uniform(-0.3, 1.5)
+    p, outside = flight.pilot.p_WB, rng.uniform(-0.3, 1.5)
     if axis == 2 or rng.random() < 0.5:
         high[axis] = float(p[axis] - outside)
     else:
         low[axis] = float(p[axis] + outside)
-    law = flight.controller.law
-    flight.controller.use(law, flight.controller.maneuvers.gains, config.replace(flight.controller.settings, fence_low=tuple(low), fence_high=tuple(high)))
+    flight.controller.reconfigure(replace(parameters, flight=replace(limits, fence_low=tuple(low), fence_high=tuple(high))))
     return f"the fence stands {abs(outside):.2f} m {'behind' if outside > 0 else 'ahead of'} the vehicle along {'xyz'[axis]}"
 
 
-def _nothing(flight: FaultyFlight, rng: np.random.Generator) -> str:
+def _nothing(flight: ControlFlight, rng: np.random.Generator) -> str:
     return "the velcro does not hold"
 
 
-def _abort(flight: FaultyFlight, rng: np.random.Generator) -> str:
+def _abort(flight: ControlFlight, rng: np.random.Generator) -> str:
+    _lose_orders(flight)
     if rng.random() < 0.5:
-        flight.orders_lost = True
-        return f"abort: {flight.controller.abort()}"
-    flight.orders_lost = True
-    try:
-        flight.controller.command(Command.HOVER, "the goal was cancelled")
-    except PerchError as error:
-        return f"cancel: {error}"
+        flight.loop.request("controller", "abort", Ask())
+        return "abort"
+    flight.pilot.order(Command.HOVER, "the goal was cancelled")
     return "cancel: hover"
 
 
@@ -202,18 +179,17 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
         seed: of the flight and of the fault's moment and size.
         overrides: further changes to the scenario.
     """
-    parameters = {"controller": {"flight.silence_time": SILENCE_TIME}}
-    mapping = {**config.read_yaml(config.find("scenarios", SCENARIO)), "parameters": parameters, **fault.scenario, **(overrides or {})}
-    flight = FaultyFlight(config.from_mapping(Scenario, mapping, SCENARIO), seed)
+    scenario = scenario_of(SCENARIO, {**fault.scenario, **(overrides or {})}, {"flight.silence_time": SILENCE_TIME})
+    flight = ControlFlight(scenario, seed)
     rng = seeding.stream(seed, f"fault {fault.name}")
     flight.arm()
     begin, height = flight.time + 0.2, flight.scenario.mission.takeoff_height
     rise = max(1.0, height / TAKE_OFF_SPEED)
     ready = begin + LEAD + rise + PAUSE
-    place = flight.odometry.estimate.p_WB + (0.0, 0.0, height)
-    contact = ready + 2.0 * LEAD + flight.perch_plan(place, 0.0, np.zeros(3)).duration
+    place = flight.pilot.p_WB + (0.0, 0.0, height)
+    contact = ready + 2.0 * LEAD + flight.perch_plan(place, begin, np.zeros(3)).duration
     moment = rng.uniform(begin, contact)
-    script = [(begin, lambda: flight.go(np.array([0.0, 0.0, height]), rise)),
+    script = [(begin, lambda: flight.pilot.go(np.array([0.0, 0.0, height]), rise)),
               (ready, lambda: flight.perch(place))]
     struck, done, phase, before, best, first = False, "", "", (0.0,) * 4, 0.0, 0
     resting = flight.time
@@ -221,33 +197,33 @@ def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
         while script and flight.time >= script[0][0]:
             script.pop(0)[1]()
         if not struck and flight.time >= moment:
-            struck, phase, before, first = True, flight.controller.state.name, _situation(flight), len(flight.events)
+            struck, phase, before, first = True, flight.state.name, _situation(flight), len(flight.events)
             done = fault.strike(flight, rng)
             best, plant = _best_impact(flight), copy.deepcopy(flight.simulation.plant)
         flight.step()
-        if flight.controller.state is not State.HOVERING:
+        if flight.state is not State.HOVERING:
             resting = flight.time
-        if struck and flight.controller.state in (State.RECOVERING, State.LANDING, State.FAILED):
+        if struck and flight.state in (State.RECOVERING, State.LANDING, State.FAILED):
             script.clear()  # the mission gives up
-        off = flight.controller.state in (State.DISARMED, State.FAILED)
+        off = flight.state in (State.DISARMED, State.FAILED, State.ATTACHED)
         if struck and not script and (flight.time - resting > SETTLE or off and flight.time > moment + 1.0):
             break
-    if flight.controller.state in (State.DISARMED, State.FAILED):
+    if flight.state in (State.DISARMED, State.FAILED, State.ATTACHED):
         flight.run(flight.time + 1.0)  # what has come off falls within this
-    touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.contacts if c.state is ContactState.COLLISION}))
+    touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.loop.trace.contacts if c.state == ContactState.COLLISION}))
     end = _end(flight)
     return Ending(fault.name, seed, moment - begin, phase, done, before, best, end, touched,
                   tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]),
                   None if end in END_STATES else search(plant))
 
 
-def _situation(flight: FaultyFlight) -> tuple[float, float, float, float]:
+def _situation(flight: ControlFlight) -> tuple[float, float, float, float]:
     x, pad = flight.simulation.state, flight.simulation.pad
     tilt = np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x.q_WB)[2, 2], -1.0, 1.0)))
     return float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt)
 
 
-def _best_impact(flight: FaultyFlight) -> float:
+def _best_impact(flight: ControlFlight) -> float:
     """A bound of physics: no controller arrives at the floor more slowly, if it has to stop at all."""
     body, x = flight.simulation.plant.body, flight.simulation.state
     up = body.thrust_coefficient.sum() * body.speed_max**2 / body.mass - GRAVITY
@@ -256,7 +232,7 @@ def _best_impact(flight: FaultyFlight) -> float:
     return float(np.sqrt(max(fall**2 - 2.0 * up * height, 0.0)))
 
 
-def _end(flight: FaultyFlight) -> str:
+def _end(flight: ControlFlight) -> str:
     """The end by the truth; the controller's word counts for a hover alone."""
     plant, x = flight.simulation.plant, flight.simulation.state
     if plant.crashed:
@@ -264,8 +240,8 @@ def _end(flight: FaultyFlight) -> str:
     if plant.contact.attached:
         return "perched"
     tilt = _situation(flight)[3]
-    if x.p_WB[2] < flight.vehicle.perch_offset + 0.02 and tilt < 20.0 and np.linalg.norm(x.v_WB) < 0.1:
+    if x.p_WB[2] < flight.simulation.vehicle.perch_offset + 0.02 and tilt < 20.0 and np.linalg.norm(x.v_WB) < 0.1:
         return "landed"
-    if flight.controller.state is State.HOVERING and np.linalg.norm(x.v_WB) < 0.5 and tilt < 20.0:
+    if flight.state is State.HOVERING and np.linalg.norm(x.v_WB) < 0.5 and tilt < 20.0:
         return "hovering"
     return "lost"

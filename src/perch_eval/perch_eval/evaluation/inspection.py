@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from perch_core.scenario import load_scenario
 from perch_eval.campaign.progress import Progress
 from perch_eval.evaluation.perching import source_digest
 from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.in_process.stand_ins import MAP_ERROR
 from perch_eval.inspection.figures import metrics_figure, paths_figure
-from perch_eval.inspection.flight import MAP_ERROR, fly
+from perch_eval.inspection.flight import fly
 from perch_eval.inspection.layout import random_layout
 from perch_eval.statistics import Spread
+from perch_sim.scenario import load_scenario
 
 SCENARIO, SEED = "inspection", 1
 REFERENCE_COLLISIONS = 2

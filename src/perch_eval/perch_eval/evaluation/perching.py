@@ -14,7 +14,6 @@ import numpy as np
 import yaml
 
 from perch_core import config
-from perch_core.scenario import load_scenario
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.campaign.causes import SUCCESS
@@ -24,8 +23,9 @@ from perch_eval.campaign.results import Results, ResultsError, RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.campaign.workers import in_pool
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.flight import Flight
 from perch_eval.statistics import Rate, Spread
+from perch_sim.scenario import load_scenario
+from perch_sim.scenario_files import scenario_mapping
 
 CONDITIONS = {"surface_60": (60, 1.7), "surface_90": (90, 1.7), "surface_60_far": (60, 3.0), "surface_90_far": (90, 3.0)}
 """Scenario -> inclination [deg] and distance [m]."""
@@ -62,7 +62,7 @@ def _flights(effort: Effort) -> list[RunResult]:
     """Every flight of every condition; finished ones of the same code are not flown again."""
     tasks = []
     for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in CONDITIONS):
-        mapping = config.read_yaml(config.find("scenarios", name))
+        mapping = scenario_mapping(name)
         tasks.append(Task(Run(number, seed, {"scenario": name}), mapping, "in_process", SENSING))
     effort.state.mkdir(parents=True, exist_ok=True)
     file = effort.state / "flights.sqlite"
@@ -137,15 +137,12 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
 def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section]:
     """Fig. 5 and 6 from the first seed at 90 deg, 1.7 m, with the figures of all seeds beside the paper's."""
     from perch_eval.in_process import Sensing, fly
-    from perch_eval.in_process.recording import write
 
     five = Section("m_fig_5", "[M] Fig. 5: tracking, localisation and thrust at 90 deg, 1.7 m", "Seed 1; truth, estimate and reference.")
     six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
     scenario = load_scenario("surface_90")
     trace = fly(scenario, 1, Sensing(**SENSING), linger=0.5)
-    effort.state.mkdir(parents=True, exist_ok=True)
-    write(trace, effort.state / "fig_5.mcap")
-    flight, vehicle = Flight(effort.state / "fig_5.mcap"), load_vehicle(scenario.vehicle)
+    flight, vehicle = trace.flight, load_vehicle(scenario.vehicle)
     for section, name, data, caption in (
             (five, "m_fig_5_tracking.png", plots.tracking_figure(flight), "Position and velocity over time"),
             (five, "m_fig_5_path.png", plots.path_figure(flight), "Path from the side with b3 as arrows"),
@@ -172,30 +169,30 @@ def _engines() -> Section:
     from perch_eval.demo import fly as fly_on_the_stack
     from perch_eval.nodes import ALL_NODES
     from perch_eval.in_process import Sensing, fly
-    from perch_eval.in_process.trace import TRUTH
+    from perch_eval.ros.recorded_flight import RecordedFlight
 
     out = Section("engines", "The engine flies what the nodes fly",
                   "surface_90, seed 1, cameras rendered: once on the real ROS 2 nodes (composed, in lockstep), once on the in-process engine "
                   "that flies the tables above.")
-    mapping = {**config.read_yaml(config.find("scenarios", "surface_90")),
+    mapping = {**scenario_mapping("surface_90"),
                "nodes": ["vehicle", "vio", "estimator", "target_localizer", "perching_planner", "controller", "mission"]}
     with tempfile.TemporaryDirectory(prefix="perch-evaluate-") as folder:
         file = Path(folder) / "surface_90.yaml"
         file.write_text(yaml.safe_dump(mapping))
         try:
             report = fly_on_the_stack(str(file), 1, Path(folder) / "stack", composed=ALL_NODES)
-            states = Flight(Path(folder) / "stack" / "flight.mcap").states("ground_truth/odometry")
+            states = RecordedFlight(Path(folder) / "stack" / "flight.mcap").states("ground_truth/odometry")
         except Exception as error:  # without ROS, or with a node missing, the tables still stand
             out.missing("greatest difference of position", "", f"the stack did not fly: {error}")
             return out
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:  # loads the same sources as the nodes
             trace = pool.submit(fly, load_scenario(file), 1, Sensing(**SENSING)).result()
-    rows = trace.part(TRUTH)
-    if states is None or len(states.t) < len(rows):
-        out.claim("greatest difference of position", f"{0 if states is None else len(states.t)} of {len(rows)} steps on the stack "
+    rows = trace.flight.states("ground_truth/odometry")
+    if states is None or len(states.t) < len(rows.t):
+        out.claim("greatest difference of position", f"{0 if states is None else len(states.t)} of {len(rows.t)} steps on the stack "
                   f"({report['outcome']})", "", False, "the same flight")
         return out
-    worst = float(np.abs(states.p[:len(rows)] - rows[:, 0:3]).max())
-    out.claim("greatest difference of position", f"{worst:.1e} m over {len(rows)} steps", "", worst < 1e-7, "below 1e-7 m")
+    worst = float(np.abs(states.p[:len(rows.t)] - rows.p).max())
+    out.claim("greatest difference of position", f"{worst:.1e} m over {len(rows.t)} steps", "", worst < 1e-7, "below 1e-7 m")
     out.show("outcome", f"{report['outcome']} on the stack, {trace.outcome} in process")
     return out

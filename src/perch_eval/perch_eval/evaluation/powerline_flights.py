@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.ros.conversions import to_array, to_seconds
-from perch_core.ros.trajectories import from_message
-from perch_core.scenario import Scenario
 from perch_core.trajectory import SampledTrajectory
+from perch_core.values import AtEnd, TrajectoryOrder, seconds
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.causes import SUCCESS, cause_of
 from perch_eval.campaign.engines import Task, flatten
@@ -23,6 +21,8 @@ from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
 from perch_eval.metrics import flight_metrics, touch_of
 from perch_sim.cable_contact import CableLine
+from perch_sim.scenario import Scenario
+from perch_sim.scenario_files import scenario_mapping
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = {"vio": "rendered", "target": "rendered"}
@@ -34,11 +34,10 @@ AROUND = 1.5  # the map is judged within this of the target point [m]
 def fly_line(task: Task) -> RunResult:
     """One perch on a line, the same as by the real nodes, with the errors at the perching point among its metrics."""
     from perch_eval.in_process import Sensing, fly
-    from perch_eval.in_process.recording import TracedFlight
 
     scenario = scenario_of(task.scenario, f"run {task.run.number}")
     trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5)
-    flight, vehicle = TracedFlight(trace), load_vehicle(scenario.vehicle)
+    flight, vehicle = trace.flight, load_vehicle(scenario.vehicle)
     metrics = flatten(flight_metrics(flight, vehicle, trace.end_time), trace.end_time)
     metrics |= perching_errors(flight, scenario, vehicle.wire_offset) | mapping_errors(flight, scenario)
     metrics["other_lines_touched"] = float(_others_touched(flight, scenario))
@@ -55,7 +54,13 @@ def _target(scenario: Scenario) -> int:
 def _others_touched(flight: Flight, scenario: Scenario) -> int:
     """How often something else than the target was hit or gripped: another cable, or what is no cable, in flight."""
     target, states = f"cable {_target(scenario)}", (1, 2, 3)
-    return sum(m.state in states and m.body.startswith("cable") and m.body != target for _, m in flight.messages("contact"))
+    return sum(c.state in states and c.body.startswith("cable") and c.body != target for _, c in flight.values("contact"))
+
+
+def _perches(flight: Flight) -> list[tuple[float, TrajectoryOrder]]:
+    """The planned perches, in order."""
+    return [(t, order) for t, order in flight.values("trajectory")
+            if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER) and isinstance(order.trajectory, SampledTrajectory)]
 
 
 def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> dict[str, float | None]:
@@ -72,14 +77,12 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
         `perching_tilt_deg`: angle between the b3 axes. None where the flight did not get there.
     """
     none: dict[str, float | None] = {"perching_position_m": None, "perching_in_map_m": None, "perching_tilt_deg": None}
-    plans = [m for _, m in flight.messages("trajectory") if m.at_end in (1, 3) and m.points]
-    truth = flight.states("ground_truth/odometry")
+    plans, truth = _perches(flight), flight.states("ground_truth/odometry")
     if not plans or truth is None:
         return none
-    plan = from_message(plans[-1])
-    if not isinstance(plan, SampledTrajectory):
-        return none
-    perch_time = plans[-1].recovery_start if plans[-1].recovery_start > 0 else plan.duration
+    order = plans[-1][1]
+    plan = order.trajectory
+    perch_time = order.recovery_start if order.recovery_start > 0 else plan.duration
     end = plan.start_time + perch_time
     touch = touch_of(flight)
     if touch is not None and touch[1].state == 3 and touch[0] < end:
@@ -106,18 +109,18 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
         its estimated pose and the true one from its true pose.
     """
     none: dict[str, float | None] = {"mapping_m": None, "mapping_in_map_m": None}
-    plans = [t for t, m in flight.messages("trajectory") if m.at_end in (1, 3) and m.points]
+    plans = _perches(flight)
     truth, estimate = flight.states("ground_truth/odometry"), flight.states("odometry")
-    maps = [m for t, m in flight.messages("powerlines") if plans and t <= plans[0] and m.lines]
+    maps = [m for t, m in flight.values("powerlines") if plans and t <= plans[0][0] and m.lines]
     if not maps or truth is None or estimate is None:
         return none
     point, cable = np.array(scenario.mission.perch_point), CableLine(scenario.world.cables[_target(scenario)])
-    ends = min(((to_array(m.start), to_array(m.end)) for m in maps[-1].lines), key=lambda ab: _distance(point, *ab))
+    ends = min(((np.array(line.start), np.array(line.end)) for line in maps[-1].lines), key=lambda ab: _distance(point, *ab))
     samples = np.linspace(*ends, 400)
     samples = samples[np.linalg.norm(samples - point, axis=1) < AROUND]
     if not len(samples):
         return none
-    moment = np.array([to_seconds(maps[-1].header.stamp)])
+    moment = np.array([seconds(maps[-1].stamp)])
     believed, true = estimate.at(moment), truth.at(moment)
     turn = so3.quat_to_matrix(true.q[0]) @ so3.quat_to_matrix(believed.q[0]).T
     seen = true.p[0] + (samples - believed.p[0]) @ turn.T
@@ -143,7 +146,7 @@ def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[tuple[s
     try:
         tasks = []
         for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):
-            mapping: dict[str, Any] = config.read_yaml(config.find("scenarios", case))
+            mapping: dict[str, Any] = scenario_mapping(case)
             if not grips:
                 mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
             tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))

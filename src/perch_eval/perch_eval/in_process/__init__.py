@@ -1,10 +1,11 @@
-"""The stack's algorithm cores stepped in one process, without DDS: the same flight, many times faster.
+"""Flights in one process, without ROS: the components that fly, moved by the schedule of every simulated flight.
 
-Each module mirrors one node's wiring and nothing of its algorithm; the order of events within a step is that of the
-lockstep (docs/architecture.md). `tests/system/test_campaign_engines.py` holds both against each other.
+`fly` flies a scenario; `arrange` gives the same flight for whoever wants to replace a component, to disturb what reaches it, or
+to act between two steps.
 """
 
-from perch_eval.in_process.engine import Sensing, fly
+from perch_eval.in_process.flights import Sensing, arrange, fly
+from perch_eval.in_process.loop import Loop
 from perch_eval.in_process.trace import FlightTrace
 
-__all__ = ["FlightTrace", "Sensing", "fly"]
+__all__ = ["FlightTrace", "Loop", "Sensing", "arrange", "fly"]

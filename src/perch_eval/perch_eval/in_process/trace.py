@@ -1,73 +1,70 @@
-"""What a flight leaves behind: plain arrays, no ROS."""
+"""What a flight leaves behind: the values of every channel but the cameras', and how it ended."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import Any
 
-import numpy as np
-from perch_msgs.msg import PowerlineArray
-
-from perch_control.mission import Target
+from perch_core.component import Component, Output, ports
 from perch_core.surface import PerchSurface
-from perch_eval.in_process.piloting import FlownTrajectory
-from perch_eval.in_process.stamps import seconds
-from perch_perception.ukf import Status, VioPose
-from perch_sim.contact_event import ContactEvent
-
-TRUTH, ESTIMATE = slice(0, 13), slice(13, 26)  # p (3), q (4), v in W (3), w in B (3)
+from perch_core.values import Contact, TrajectoryOrder, nanoseconds
+from perch_eval.flight import Flight, timed
 
 
-@dataclass
+def stamp_of(value: Any) -> int:
+    """A value's own stamp, as its message's header has it [ns]; of an order that of its start."""
+    return nanoseconds(value.trajectory.start_time) if isinstance(value, TrajectoryOrder) else value.stamp
+
+
 class FlightTrace:
-    """One flight; times in seconds, states as p, q (xyzw), v in W, w in B.
+    """One flight. `trace[channel]` is a list of (stamp [ns], value) in the order of emission; empty where there is none.
 
     Attributes:
         outcome: `perched`, or the lower-case name of the mission's result; `timeout` past the time limit.
         message: the mission's words.
         end_time: when the goal ended [s].
         wall_time: what it took [s].
-        stamps: of every step [ns].
-        states: truth and estimate of every step, 26 numbers each.
-        motors: armed and rotor speed commands of every step, 5 numbers each [rad/s].
-        references: time [s], p, q, v, w, wanted thrust [N], whenever `controller/reference` is published.
-        rotors: time [s], speeds (4) [rad/s], thrusts (4) [N], every 5th step.
-        contacts: what the vehicle touched.
-        trajectories: (time of publication [s], trajectory) in order.
-        commands: (time [s], code, reason) of the mission's commands.
-        targets: (time from which it counts [s], target).
-        maps: (time from which it counts [s], map of powerlines).
-        vio: poses in the order they counted.
         pad: the true pad at the end.
-        phases: (time [s], phase, message) of the mission.
-        estimator: (time [s], status) at 10 Hz.
-        covariances: (time [s], pose covariance (6, 6)) at 50 Hz.
+        phases: (time [s], phase, message) of the mission whenever they change.
+        log: (time [s], name of the component, level, text) of each line.
     """
 
-    pad: PerchSurface
-    outcome: str = "failed"
-    message: str = ""
-    end_time: float = float("nan")
-    wall_time: float = float("nan")
-    stamps: list[int] = field(default_factory=list)
-    states: list[tuple[float, ...]] = field(default_factory=list)
-    motors: list[tuple[float, ...]] = field(default_factory=list)
-    references: list[tuple[float, ...]] = field(default_factory=list)
-    rotors: list[tuple[float, ...]] = field(default_factory=list)
-    contacts: list[ContactEvent] = field(default_factory=list)
-    trajectories: list[tuple[float, FlownTrajectory]] = field(default_factory=list)
-    commands: list[tuple[float, int, str]] = field(default_factory=list)
-    targets: list[tuple[float, Target]] = field(default_factory=list)
-    maps: list[tuple[float, PowerlineArray]] = field(default_factory=list)
-    vio: list[tuple[float, VioPose]] = field(default_factory=list)
-    phases: list[tuple[float, str, str]] = field(default_factory=list)
-    estimator: list[tuple[float, Status]] = field(default_factory=list)
-    covariances: list[tuple[float, np.ndarray]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.outcome, self.message = "failed", ""
+        self.end_time = self.wall_time = float("nan")
+        self.pad: PerchSurface | None = None
+        self.phases: list[tuple[float, str, str]] = []
+        self.log: list[tuple[float, str, str, str]] = []
+        self._values: dict[str, list[Any]] = {}
+
+    def tap(self, component: Component[Any]) -> None:
+        """Keep what a component emits from now on, but for frames of cameras, log lines and what has an absolute name."""
+        for port in ports(type(component), Output):
+            channel = port.channel(component)
+            if port is not Component.log and not channel.startswith(("/", "camera_")) and channel != "vio/debug_image":
+                getattr(component, port.name).receivers.append(self._values.setdefault(channel, []).append)
 
     @property
-    def times(self) -> np.ndarray:
-        """Time of every step [s], shape (n,)."""
-        return seconds(np.array(self.stamps, dtype=np.int64))
+    def channels(self) -> list[str]:
+        """Those that have values."""
+        return sorted(channel for channel, values in self._values.items() if values)
 
-    def part(self, which: slice) -> np.ndarray:
-        """`TRUTH` or `ESTIMATE` of every step, shape (n, 13)."""
-        return np.array(self.states).reshape(-1, 26)[:, which]
+    def __getitem__(self, channel: str) -> list[tuple[int, Any]]:
+        return [(stamp_of(value), value) for value in self._values.get(channel, ())]
+
+    def values(self, channel: str) -> list[Any]:
+        """The values of a channel in the order of emission."""
+        return list(self._values.get(channel, ()))
+
+    def timeline(self) -> list[tuple[str, int, Any]]:
+        """(channel, stamp [ns], value) of everything, by stamp."""
+        return sorted(((channel, *pair) for channel in self.channels for pair in self[channel]), key=lambda entry: entry[1])
+
+    @property
+    def flight(self) -> Flight:
+        """As the figures are computed of, and as a recording is read."""
+        return Flight({channel: timed(self._values[channel]) for channel in self.channels})
+
+    @property
+    def contacts(self) -> list[Contact]:
+        """What the vehicle truly touched."""
+        return self.values("contact")

@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from perch_core.lines import Segment, scaled_clearance, segment_distance
-from perch_core.scenario import Cable, Scenario, Start, Waypoint
 from perch_core.vehicle import load_vehicle
 from perch_eval.inspection.measures import collisions, reference_states, segments
+from perch_sim.scenario import Cable, Scenario, Start, Waypoint
 
 RADIUS = 0.03           # of the cables [m]
 WAYPOINTS = 6

@@ -12,10 +12,10 @@ from perch_control.mission.waypoints import waypoint_lines
 from perch_control.nmpc.reference_rows import reference_row
 from perch_control.reference import FlatReference
 from perch_core.lines import Segment, scaled_clearance
-from perch_core.scenario import Scenario
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_planner.powerline.visibility import Visibility, visibility
+from perch_sim.scenario import Scenario
 
 SAMPLE = 0.01  # of the reference's states [s]
 

@@ -16,6 +16,7 @@ from perch_eval.flight import Flight
 from perch_eval.metrics import perch_window
 from perch_eval.replay.animation import write_animation
 from perch_eval.replay.scene import Scene, View
+from perch_eval.ros.recorded_flight import RecordedFlight
 
 BEFORE, AFTER = 1.0, 1.0  # shown around the perch [s]
 EXAMPLES = """examples:
@@ -62,7 +63,7 @@ def _show(args: argparse.Namespace) -> int:
     for name in ("fps", "speed"):
         if not 0.0 < getattr(args, name) < np.inf:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
-    flight, vehicle = Flight(args.flight, args.namespace), load_vehicle(args.vehicle)
+    flight, vehicle = RecordedFlight(args.flight, args.namespace), load_vehicle(args.vehicle)
     if flight.damage:
         print(f"warning: {args.flight} is cut off or damaged, and shown as far as it goes ({flight.damage})", file=sys.stderr)
     try:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
 from perch_core import so3
-from perch_core.ros.conversions import pose_arrays, to_array
+from perch_core.values import CameraImage
 from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight, States
 from perch_eval.metrics import tilt_degrees
@@ -28,7 +27,7 @@ class View:
         estimate, reference: estimated and wanted states, where recorded.
         pad: true pose of the pad p (3,), R (3, 3), where there is one.
         cables: end points of mapped wires, (n, 2, 3).
-        camera: (time [s], message) of the front camera's images.
+        camera: (time [s], image) of the front camera's images.
     """
 
     truth: States
@@ -36,7 +35,7 @@ class View:
     reference: States | None
     pad: tuple[np.ndarray, np.ndarray] | None
     cables: np.ndarray
-    camera: list[tuple[float, Any]]
+    camera: list[tuple[float, CameraImage]]
 
     @classmethod
     def of(cls, flight: Flight) -> View:
@@ -49,13 +48,12 @@ class View:
         if truth is None:
             raise LookupError("the recording holds no ground_truth/odometry")
         pad = None
-        if flight.messages("ground_truth/target"):
-            p, q = pose_arrays(flight.messages("ground_truth/target")[-1][1].pose)
-            pad = p, so3.quat_to_matrix(q)
-        lines = flight.messages("powerlines")
-        cables = np.array([[to_array(line.start), to_array(line.end)] for line in lines[-1][1].lines]) if lines else np.zeros((0, 2, 3))
+        if targets := flight.values("ground_truth/target"):
+            pad = np.array(targets[-1][1].p), so3.quat_to_matrix(np.array(targets[-1][1].q))
+        lines = flight.values("powerlines")
+        cables = np.array([[line.start, line.end] for line in lines[-1][1].lines]) if lines else np.zeros((0, 2, 3))
         return cls(truth, flight.states("odometry"), flight.reference(), pad, cables.reshape(-1, 2, 3),
-                   flight.messages("camera_front/image_raw/compressed"))
+                   flight.values("camera_front/image_raw/compressed"))
 
 
 class Scene:
@@ -147,7 +145,7 @@ class Scene:
         self._space.set_title(f"t = {time:.2f} s   {speed:.1f} m/s   tilt {tilt_degrees(now.q)[0]:.0f} deg", fontsize=10)
 
     def _show_image(self, time: float) -> None:
-        seen = [msg for t, msg in self._view.camera if t <= time]
+        seen = [image for t, image in self._view.camera if t <= time]
         if seen:
-            image = cv2.imdecode(np.frombuffer(bytes(seen[-1].data), np.uint8), cv2.IMREAD_GRAYSCALE)
-            self._shown.set_data(image)
+            pixels = seen[-1].pixels()
+            self._shown.set_data(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from perch_msgs.msg import PowerlineArray
-from visualization_msgs.msg import Marker
 
 from perch_core import so3
 from perch_core.catenary import Catenary
-from perch_core.ros.conversions import to_array
-from perch_core.ros.wire import OdometryReading
-from perch_core.scenario import Scenario
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.values import Marker, OdometryState, PowerlineMap, Shape
 from perch_core.vehicle import Vehicle
-from perch_eval.view.markers import arrow, box_edges, label, marker, polyline
+from perch_eval.view.markers import arrow, box_edges, label, marker, polyline, removed
+from perch_sim.scenario import Scenario
 
 ESTIMATE, TRUTH, PLANNED, FOUND = (1.0, 0.6, 0.1, 1.0), (0.3, 0.6, 0.9, 1.0), (0.2, 0.8, 0.3, 1.0), (0.95, 0.9, 0.2, 1.0)
 ROOM, SURFACE, PAD, GHOST = (0.6, 0.6, 0.6, 0.4), (0.55, 0.55, 0.55, 0.5), (0.95, 0.95, 0.95, 1.0), (0.3, 0.6, 0.9, 0.35)
@@ -53,8 +50,8 @@ def world_markers(scenario: Scenario) -> list[Marker]:
     if scenario.mode == "surface":
         surface = scenario.surface
         q = so3.quat_from_matrix(surface.R_WS)
-        out.append(marker(Marker.CUBE, "surface", 0, SURFACE, (*scenario.target.panel_size, 0.02), surface.p_WS - 0.02 * surface.normal, q))
-        out.append(marker(Marker.CUBE, "pad", 0, PAD, (*surface.size, 0.01), surface.p_WS - 0.005 * surface.normal, q))
+        out.append(marker(Shape.CUBE, "surface", 0, SURFACE, (*scenario.target.panel_size, 0.02), surface.p_WS - 0.02 * surface.normal, q))
+        out.append(marker(Shape.CUBE, "pad", 0, PAD, (*surface.size, 0.01), surface.p_WS - 0.005 * surface.normal, q))
     for k, cable in enumerate(world.cables):
         hanging = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag).sample(2 if cable.sag == 0.0 else 40)
         out.append(polyline("cables", k, CABLES[cable.colour], 2 * cable.radius, hanging))
@@ -62,18 +59,18 @@ def world_markers(scenario: Scenario) -> list[Marker]:
         points = [w.position for w in scenario.inspection.waypoints]
         out.append(polyline("waypoints", 0, PLANNED, 0.01, points))
         for k, p in enumerate(points):
-            out += [marker(Marker.SPHERE, "waypoints", 2 * k + 1, PLANNED, (0.08, 0.08, 0.08), p),
+            out += [marker(Shape.SPHERE, "waypoints", 2 * k + 1, PLANNED, (0.08, 0.08, 0.08), p),
                     label("waypoints", 2 * k + 2, WORD, 0.15, (p[0], p[1], p[2] + 0.15), str(k + 1))]
     return out
 
 
-def vehicle_markers(vehicle: Vehicle, state: OdometryReading, words: str) -> list[Marker]:
+def vehicle_markers(vehicle: Vehicle, state: OdometryState, words: str) -> list[Marker]:
     """The vehicle where the estimator has it: rotors (the front ones red), thrust axis, camera axis, words above it."""
     p, R = np.array(state.p_WB), so3.quat_to_matrix(np.array(state.q_WB))
     hubs = [p + R @ np.array([x, y, 0.0]) for x, y in vehicle.rotor_xy]
     out = [polyline("vehicle", 0, ESTIMATE, 0.02, [hubs[0], hubs[2], hubs[1], hubs[3]], pieces=True)]
     size = 2 * vehicle.propeller_radius or _ROTOR
-    out += [marker(Marker.CYLINDER, "vehicle", 1 + k, ROTORS[k], (size, size, 0.01), hub, state.q_WB)
+    out += [marker(Shape.CYLINDER, "vehicle", 1 + k, ROTORS[k], (size, size, 0.01), hub, state.q_WB)
             for k, hub in enumerate(hubs)]
     out.append(arrow("vehicle", 5, ESTIMATE, p, p + 0.3 * R[:, 2]))
     mount = vehicle.mounts.get("front")
@@ -84,25 +81,24 @@ def vehicle_markers(vehicle: Vehicle, state: OdometryReading, words: str) -> lis
     return out
 
 
-def truth_markers(vehicle: Vehicle, state: OdometryReading) -> list[Marker]:
+def truth_markers(vehicle: Vehicle, state: OdometryState) -> list[Marker]:
     """Where the vehicle really is: its ellipsoid."""
-    return [marker(Marker.SPHERE, "truth", 0, GHOST, 2 * np.array(vehicle.body_radii), state.p_WB, state.q_WB)]
+    return [marker(Shape.SPHERE, "truth", 0, GHOST, 2 * np.array(vehicle.body_radii), state.p_WB, state.q_WB)]
 
 
 def target_markers(p: np.ndarray, q: np.ndarray) -> list[Marker]:
     """The pad as localised, with its normal."""
     normal = so3.quat_to_matrix(q)[:, 2]
-    return [marker(Marker.CUBE, "target", 0, (*FOUND[:3], 0.5), (0.6, 0.6, 0.015), p, q), arrow("target", 1, FOUND, p, p + 0.3 * normal)]
+    return [marker(Shape.CUBE, "target", 0, (*FOUND[:3], 0.5), (0.6, 0.6, 0.015), p, q), arrow("target", 1, FOUND, p, p + 0.3 * normal)]
 
 
-def map_markers(lines: PowerlineArray, before: Collection[int]) -> list[Marker]:
+def map_markers(lines: PowerlineMap, before: Collection[int]) -> list[Marker]:
     """The cables as mapped, with their ids; those in `before` that the map no longer has are removed."""
     out = []
     for id in sorted(set(before) - {line.id for line in lines.lines}):
-        out += [polyline("map", 2 * id, FOUND, 0.0, ()), marker(Marker.SPHERE, "map", 2 * id + 1, FOUND, (0.0, 0.0, 0.0))]
-        out[-1].action = Marker.DELETE
+        out += [removed(Shape.LINE_STRIP, "map", 2 * id), removed(Shape.TEXT, "map", 2 * id + 1)]
     for line in lines.lines:
-        start, end = to_array(line.start), to_array(line.end)
+        start, end = np.array(line.start), np.array(line.end)
         out += [polyline("map", 2 * line.id, FOUND, 2 * max(line.radius, 0.01), (start, end)),
                 label("map", 2 * line.id + 1, FOUND, 0.12, (start + end) / 2 + (0.0, 0.0, 0.12), f"{line.id}")]
     return out
@@ -115,7 +111,7 @@ def plan_markers(trajectory: FlatTrajectory | SampledTrajectory, ends_in_contact
     else:
         points = trajectory.p[::max(1, round(PLAN_STEP / max(float(np.diff(trajectory.times).mean()), 1e-6)))]
     colour = CABLES["red"] if ends_in_contact else PLANNED
-    return [polyline("plan", 0, PLANNED, 0.015, points), marker(Marker.SPHERE, "plan", 1, colour, (0.06, 0.06, 0.06), points[-1])]
+    return [polyline("plan", 0, PLANNED, 0.015, points), marker(Shape.SPHERE, "plan", 1, colour, (0.06, 0.06, 0.06), points[-1])]
 
 
 def path_markers(estimate: Path, truth: Path) -> list[Marker]:

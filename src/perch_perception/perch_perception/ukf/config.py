@@ -11,7 +11,6 @@ from perch_core.config import choice, part, quantity
 class ImuNoise:
     """What the filter assumes of the IMU: noise of one sample, bias walks, ranges."""
 
-    rate: float = quantity(500.0, unit="Hz", above=0.0, doc="nominal sample rate")
     accel_noise: float = quantity(0.316, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
     gyro_noise: float = quantity(0.01, unit="rad/s", above=0.0, doc="1 sigma of one sample")
     accel_bias_walk: float = quantity(0.002, unit="m/s^2/sqrt(s)", above=0.0)
@@ -29,22 +28,27 @@ class ImuNoise:
 class ImuFaults:
     """How unusable stretches of IMU data are bridged."""
 
-    gap: float = quantity(0.006, unit="s", above=0.0, doc="longest step between samples that counts as complete")
+    gap: float = quantity(3.0, unit="-", above=1.0, doc="longest step between samples that counts as complete, in periods of the IMU")
     gap_accel: float = quantity(5.0, unit="m/s^2", above=0.0, doc="1 sigma of what a missing sample may have been")
     gap_gyro: float = quantity(2.0, unit="rad/s", above=0.0, doc="1 sigma of what a missing sample may have been")
     saturation: float = quantity(1.0, unit="-", above=0.0, high=5.0, doc="1 sigma of a saturated sample, share of its range")
 
 
 @dataclass(frozen=True)
-class VioNoise:
-    """What the filter assumes of VIO beyond the covariance that comes with each pose (`drift.py`)."""
+class RestConfig:
+    """How rest is recognised, and how still it is: on the ground, on a wall, on a wire, in any attitude."""
 
-    position: float = quantity(0.002, unit="m", above=0.0, doc="1 sigma, white from pose to pose")
-    attitude: float = quantity(0.002, unit="rad", above=0.0, doc="1 sigma, white from pose to pose")
-    correlation_time: float = quantity(30.0, unit="s", above=0.0, doc="of VIO's drift")
-    drift_position: float = quantity(0.002, unit="m/sqrt(s)", low=0.0, doc="least growth of the drift")
-    velocity_time: float = quantity(0.35, unit="s", low=0.0, doc="how long an error of VIO's velocity lasts: its window")
-    drift_attitude: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="least growth of the drift")
+    window: float = quantity(0.2, unit="s", above=0.02, high=2.0, doc="IMU over which rest is judged")
+    energy: float = quantity(1.8, unit="-", above=1.0, high=20.0, doc="largest energy of the IMU about rest, in that of its noise: 1 is rest")
+    velocity: float = quantity(0.002, unit="m/s", above=0.0, doc="1 sigma of the velocity at rest")
+
+
+@dataclass(frozen=True)
+class VioNoise:
+    """What is added to the covariance that comes with each measurement: some senders leave it at zero."""
+
+    position: float = quantity(0.002, unit="m", above=0.0, doc="1 sigma of each axis")
+    attitude: float = quantity(0.002, unit="rad", above=0.0, doc="1 sigma about each axis")
 
 
 @dataclass(frozen=True)
@@ -53,19 +57,17 @@ class UkfConfig:
 
     imu: ImuNoise = part(ImuNoise)
     faults: ImuFaults = part(ImuFaults)
+    rest: RestConfig = part(RestConfig)
     vio: VioNoise = part(VioNoise)
     alpha: float = quantity(1.0, above=0.0, high=1.0, doc="spread of the sigma points (Merwe); at 1 all weights are >= 0")
     beta: float = quantity(2.0, low=0.0, doc="prior knowledge of the distribution; 2 for a Gaussian")
     kappa: float = quantity(0.0, doc="secondary spread")
     gate_probability: float = quantity(0.999, above=0.0, high=0.999999, doc="chi2 gate of the innovation")
     gate_patience: int = quantity(15, low=1, doc="rejections in a row after which VIO is believed to have jumped")
-    use_velocity: bool = quantity(True, doc="follow VIO's velocity as well as its pose")
+    use_velocity: bool = quantity(True, doc="odometry: use its velocity as well, where it comes with a covariance")
     history: float = quantity(0.5, unit="s", above=0.0, high=5.0, doc="IMU kept for replay: oldest usable VIO stamp")
     future: float = quantity(0.05, unit="s", low=0.0, high=0.5, doc="VIO stamps this far ahead wait for the IMU; later ones are refused")
     coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose")
-    rest_time: float = quantity(0.2, unit="s", above=0.0, doc="IMU needed before the start")
-    rest_gyro: float = quantity(0.06, unit="rad/s", above=0.0, doc="largest mean rate that counts as rest")
-    rest_accel: float = quantity(0.4, unit="m/s^2", above=0.0, doc="largest deviation of the mean from gravity at rest")
     diverged_position: float = quantity(2.0, unit="m", above=0.0, doc="1 sigma beyond which the state is not to be used")
     diverged_attitude: float = quantity(0.6, unit="rad", above=0.0, doc="1 sigma beyond which the state is not to be used")
     covariance_stride: int = quantity(5, low=1, high=100, doc="IMU steps per update of the published covariance")

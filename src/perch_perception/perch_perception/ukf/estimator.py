@@ -1,24 +1,29 @@
 """The estimator: mean at every IMU step, unscented update at VIO's stamp, replay to now. [M:IV-B]
 
-Per IMU sample the nominal state moves by one integration step (a few us). A VIO pose is applied to the belief at
-its own stamp; the IMU steps since then are replayed through a full unscented transform. The design and its
-equations are in docs/estimation.md.
+Per IMU sample the nominal state moves by one integration step (a few us). A measurement (a pose and, where it is given, a velocity)
+is applied to the belief at its own stamp; the IMU steps since then are replayed through a full unscented transform. VIO's whole state
+takes the belief's place. The equations are in docs/estimation.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from perch_perception.ukf import drift, handover, kernels, start, tracklet
+from perch_core.values import ImuSample
+from perch_perception.ukf import kernels, start
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
-from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
+from perch_perception.ukf.rest import rested, stopped
+from perch_perception.ukf.stillness import still, window
 from perch_perception.ukf.unscented import Belief, CovarianceError, Innovation, UnscentedTransform
+
+_MOST_WAITING = 20  # poses ahead of the IMU that are kept
 
 
 class Estimator:
@@ -32,15 +37,14 @@ class Estimator:
         self.config = config
         self._transform = UnscentedTransform(config)
         self._imu = ImuBuffer(config.imu, config.faults, config.history)
-        self._gate = float(chi2.ppf(config.gate_probability, 6))
-        self._base: Belief | None = None  # at the stamp of the last applied pose
-        self._covariance: np.ndarray | None = None  # VIO's covariance at that pose
-        self._doubt = np.zeros((6, 6))  # in VIO's map beyond that covariance, after a jump
+        self._gates = {m: float(chi2.ppf(config.gate_probability, m)) for m in (6, 9)}
+        self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
+        self._heard = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
+        self._resting = False             # the base is one of rest
         self._live: Belief | None = None  # covariance up to a few steps ago
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
         self._lag = 0
-        self._rest: Iterator[None] | None = None  # of the work on a pose
         self._waiting: list[VioPose] = []
         self._refused_in_row = 0
         self._accepted = self._rejected = 0
@@ -62,23 +66,17 @@ class Estimator:
             self._lag += 1
             if self._lag >= self.config.covariance_stride:
                 self._refresh()
+                self._rest()
         if self._waiting and self._waiting[0].stamp <= self._imu.last.stamp:
             self.add_vio(self._waiting.pop(0))
         return outcome
 
-    def add_vio(self, pose: VioPose, at_once: bool = True) -> VioOutcome:
-        """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done.
-
-        Where not all is done at once two thirds are left to `go_on`, in parts, for who has to be on time.
-        """
-        while self.behind:
-            self.go_on()
+    def add_vio(self, pose: VioPose) -> VioOutcome:
+        """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done."""
         outcome = pose.problem() or self._timing(pose)
         if outcome is None:
             try:
                 outcome = self._apply(pose) if self._base is not None else self._begin(pose)
-                while self.behind and (at_once or self._live is None):
-                    self._go_on()
             except CovarianceError as error:
                 self._break(str(error))
                 return VioOutcome.GATED
@@ -86,22 +84,10 @@ class Estimator:
             self._rejected += 1
         elif outcome.used:
             self._accepted += 1
+            self._applied, self._resting = pose.stamp, False
         if outcome not in (VioOutcome.APPLIED, VioOutcome.WAITING):
             self._message = f"VIO pose at {pose.stamp} ns {outcome.value}"
         return outcome
-
-    @property
-    def behind(self) -> bool:
-        """Whether a VIO pose was accepted that the estimate does not show yet."""
-        return self._rest is not None
-
-    def go_on(self) -> None:
-        """Do the next part of what `add_vio` has left, if there is one."""
-        try:
-            if self.behind:
-                self._go_on()
-        except CovarianceError as error:
-            self._break(str(error))
 
     @property
     def estimate(self) -> Estimate | None:
@@ -122,7 +108,7 @@ class Estimator:
         return Estimate(
             stamp=last.stamp, p_WB=x[at.POSITION], v_WB=x[at.VELOCITY], q_WB=x[at.QUATERNION],
             w_WB_B=np.array(last.w_B) - x[at.GYRO_BIAS], gyro_bias=x[at.GYRO_BIAS], accel_bias=x[at.ACCEL_BIAS],
-            P=P[: at.VEHICLE_SIZE, : at.VEHICLE_SIZE])
+            P=P)
 
     @property
     def status(self) -> Status:
@@ -130,7 +116,7 @@ class Estimator:
         age, position, attitude = float("inf"), start.UNKNOWN_POSITION, start.UNKNOWN_YAW
         health = Health.DIVERGED if self._broken else Health.INITIALISING
         if self._base is not None:
-            age = (self._imu.last.stamp - self._base.stamp) * 1e-9
+            age = (self._imu.last.stamp - self._applied) * 1e-9
             diagonal = np.diag(self._live.P)
             position = float(np.sqrt(diagonal[at.D_POSITION].max()))
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
@@ -145,10 +131,7 @@ class Estimator:
         prior = self._transform.predict(belief, row, 2_000_000)
         pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), np.zeros(3), np.eye(3))
         pose.problem()
-        drift.increment(self.config.vio, pose.covariance, pose.covariance, 0.03, pose.velocity_covariance)
-        corrected = self._transform.correct(prior, self._innovate(prior, pose))
-        drift.follow(corrected, pose, self._doubt)
-        tracklet.join(prior, pose)
+        self._transform.correct(prior, self._innovate(prior, pose))
         kernels.advance(belief.x.copy(), *map(float, row[0, 1:7]), 0.002)
 
     def _timing(self, pose: VioPose) -> VioOutcome | None:
@@ -156,6 +139,7 @@ class Estimator:
         last = self._imu.last
         if last is None:
             return VioOutcome.NO_IMU
+        self._heard = max(self._heard, min(pose.stamp, last.stamp))
         if self._base is not None and pose.stamp <= self._base.stamp:
             return VioOutcome.DUPLICATE if pose.stamp == self._base.stamp else VioOutcome.OUT_OF_ORDER
         if pose.stamp > last.stamp:
@@ -163,6 +147,8 @@ class Estimator:
                 return VioOutcome.FUTURE
             if any(w.stamp == pose.stamp for w in self._waiting):
                 return VioOutcome.DUPLICATE
+            if len(self._waiting) >= _MOST_WAITING:
+                return VioOutcome.FUTURE
             self._waiting = sorted([*self._waiting, pose], key=lambda w: w.stamp)
             return VioOutcome.WAITING
         if pose.stamp < (self._anchors[0].stamp if self._anchors else self._imu.oldest):
@@ -170,69 +156,67 @@ class Estimator:
         return None
 
     def _begin(self, pose: VioPose) -> VioOutcome:
-        steps = self._imu.run(max(self._imu.oldest, pose.stamp - round(self.config.rest_time * 1e9)), pose.stamp)
-        self._doubt[:] = 0.0
-        belief = start.from_vio(self.config, pose, steps) if pose.inertial is None else handover.take_over(pose, self._doubt)
-        self._rest = self._settle(belief, pose)
+        steps = window(self.config.rest, self._imu, pose.stamp)
+        self._settle(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose))
         self._broken = False
         return VioOutcome.STARTED
 
     def _apply(self, pose: VioPose) -> VioOutcome:
-        noise = self.config.vio
         anchor = next(a for a in reversed(self._anchors) if a.stamp <= pose.stamp)
         prior = self._transform.predict(anchor, self._imu.run(anchor.stamp, pose.stamp), pose.stamp)
-        dt = (pose.stamp - self._base.stamp) * 1e-9
-        prior = drift.advance(prior, noise, drift.increment(noise, self._covariance, pose.covariance, dt, pose.velocity_covariance), dt)
-        self._doubt *= drift.kept(noise, dt) ** 2
-        innovation = self._innovate(prior, pose)
+        innovation, outcome = self._innovate(prior, pose), VioOutcome.APPLIED
         self._nis = innovation.nis
-        outcome = VioOutcome.APPLIED
-        if innovation.nis > self._gate:
+        if innovation.nis > self._gates[len(innovation.residual)]:
             self._refused_in_row += 1
             if self._refused_in_row < self.config.gate_patience:
                 return VioOutcome.GATED
-            prior = self._jumped(prior, innovation)
-            innovation, outcome = self._innovate(prior, pose), VioOutcome.JUMPED
-        if self.config.use_velocity and handover.knows_more(pose, prior):
-            self._rest = self._settle(handover.take_over(pose, self._doubt), pose)
-        else:
-            self._rest = self._follow(self._transform.correct(prior, innovation), pose)
+            prior, outcome = self._jumped(prior, innovation), VioOutcome.JUMPED
+            innovation = self._innovate(prior, pose)
+        self._settle(start.from_state(pose) if pose.inertial is not None else self._transform.correct(prior, innovation))
         return outcome
 
-    def _follow(self, belief: Belief, pose: VioPose) -> Iterator[None]:
-        belief = drift.follow(belief, pose, self._doubt)
-        yield
-        if self.config.use_velocity and pose.v_WB is not None and pose.velocity_covariance is not None:
-            belief = tracklet.join(belief, pose)
-        yield from self._settle(belief, pose)
-
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
-        return self._transform.innovate(prior, pose.p_WB, pose.q_WB, drift.white(self.config.vio))
+        R = pose.covariance + start.white(self.config.vio)
+        if self.config.use_velocity and pose.velocity_covariance is not None:
+            R = block_diag(R, pose.velocity_covariance)
+        return self._transform.innovate(prior, pose, R)
 
     def _jumped(self, prior: Belief, innovation: Innovation) -> Belief:
-        """Belief in which the state and VIO's map may each be off by the whole disagreement.
-
-        After so many refusals one of the two is wrong, and nothing tells which: both get the variance of the
-        residual, and the velocity what would have built it up meanwhile.
-        """
+        """Belief that may be off by the whole disagreement: position, attitude, and the velocity that would have built it up."""
         elapsed = max((prior.stamp - self._base.stamp) * 1e-9, 0.1)
         p, theta = (innovation.residual[:3] ** 2).sum(), (innovation.residual[3:6] ** 2).sum()
-        extra = np.repeat([p, p / elapsed**2, theta, 0.0, 0.0, p, theta], 3)
-        self._doubt += np.diag(extra[at.D_DRIFT])
+        extra = np.repeat([p, p / elapsed**2, theta, 0.0, 0.0], 3)
         return dataclasses.replace(prior, P=prior.P + np.diag(extra))
 
-    def _settle(self, belief: Belief, pose: VioPose) -> Iterator[None]:
-        """Make a belief at a pose's stamp the new base, and bring the live state from there up to now."""
-        self._base, self._covariance, self._refused_in_row = belief, pose.covariance, 0
-        self._anchors = [belief]
-        yield
+    def _settle(self, belief: Belief) -> None:
+        """Make a belief the new base, and bring the live state from there up to now."""
+        self._base, self._refused_in_row, self._anchors = belief, 0, [belief]
         now = self._imu.last.stamp
         self._live = self._transform.predict(belief, self._imu.run(belief.stamp, now), now)
         self._x, self._lag = self._live.x.copy(), 0
 
-    def _go_on(self) -> None:
-        if next(self._rest, self._rest) is self._rest:  # that was the last part
-            self._rest = None
+    def _rest(self) -> None:
+        """Without VIO: where the vehicle rests, say so of the middle of the window; a departure may just have begun.
+
+        VIO that speaks knows of the rest itself, or measures the pose in it.
+        """
+        now, config = self._imu.last.stamp, self.config
+        if self._base is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
+            return
+        if not still(config.rest, config.imu, window(config.rest, self._imu, now), self._base.x[at.GYRO_BIAS]):
+            self._resting = False
+            return
+        belief, middle = self._base, now - round(0.5e9 * config.rest.window)
+        try:
+            if not self._resting:
+                begin = max(belief.stamp, 2 * middle - now)
+                belief = stopped(self._transform.predict(belief, self._imu.run(belief.stamp, begin), begin), config)
+                if belief is None:
+                    return
+            self._resting = True
+            self._settle(rested(belief, self._imu.run(belief.stamp, middle), middle, config))
+        except CovarianceError as error:
+            self._break(str(error))
 
     def _refresh(self) -> None:
         """Bring the published covariance up to now, and keep a belief from which the kept IMU steps can be replayed."""
@@ -252,6 +236,6 @@ class Estimator:
 
     def _break(self, why: str) -> None:
         """Start again with the next VIO pose."""
-        self._base = self._live = self._covariance = None
-        self._anchors, self._rest = [], None
+        self._base = self._live = None
+        self._anchors = []
         self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"

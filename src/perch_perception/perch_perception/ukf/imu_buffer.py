@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import enum
-import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from collections import deque
 
 import numpy as np
 
+from perch_core.values import ImuSample
 from perch_perception.ukf.config import ImuFaults, ImuNoise
+
+_PERIODS = 9  # last intervals whose median is the period
+_ABSURD = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
+
+
+def is_sane(sample: ImuSample) -> bool:
+    """Whether a sample is finite and no greater than any sensor's range."""
+    (a, b, c), (x, y, z) = sample.w_B, sample.f_B
+    return a * a + b * b + c * c + x * x + y * y + z * z < _ABSURD
 
 
 class ImuOutcome(enum.Enum):
@@ -18,36 +27,28 @@ class ImuOutcome(enum.Enum):
     USED = "used"
     GAP = "used after a gap in the IMU data"
     SATURATED = "used with inflated noise: an axis is at its range"
-    NOT_FINITE = "replaced by the sample before: not finite"
+    NOT_FINITE = "refused: not finite, or beyond any sensor's range"
     NOT_NEWER = "refused: stamp is not newer than the sample before"
-    EMPTY = "refused: not finite and nothing to replace it with"
 
     @property
     def used(self) -> bool:
         """Whether time moved on with this sample."""
-        return self not in (ImuOutcome.NOT_NEWER, ImuOutcome.EMPTY)
-
-
-@dataclass(frozen=True)
-class ImuSample:
-    """One IMU sample in B: stamp [ns], angular velocity (3) [rad/s], specific force (3) [m/s^2]."""
-
-    stamp: int
-    w_B: tuple[float, float, float]
-    f_B: tuple[float, float, float]
+        return self not in (ImuOutcome.NOT_NEWER, ImuOutcome.NOT_FINITE)
 
 
 class ImuBuffer:
     """The steps between IMU samples over the last `history` seconds.
 
-    Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance).
+    Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance). The IMU's period is
+    measured: the median of the last intervals.
     """
 
     def __init__(self, imu: ImuNoise, faults: ImuFaults, history: float) -> None:
         self._imu, self._faults = imu, faults
         self._instant = imu.integration == "instant"
         self._variances = (imu.gyro_noise**2, imu.accel_noise**2)
-        self._keep = max(2, int(history * imu.rate))
+        self._keep = round(history * 1e9)
+        self._intervals: deque[int] = deque(maxlen=_PERIODS)
         self._ends: list[int] = []
         self._rows: list[tuple[float, ...]] = []
         self.last: ImuSample | None = None
@@ -60,29 +61,25 @@ class ImuBuffer:
         return self._ends[0] - round(self._rows[0][0] * 1e9)
 
     def add(self, sample: ImuSample) -> ImuOutcome:
-        """Take a sample; the step that leads to it is then `latest`."""
+        """Take a sample; the step that leads to it is then `latest`. A refused one leaves no trace: its stamp may be another writer's."""
         last, imu, faults = self.last, self._imu, self._faults
         w, f = sample.w_B, sample.f_B
+        if not is_sane(sample):
+            return ImuOutcome.NOT_FINITE
         if last is not None and sample.stamp <= last.stamp:
             return ImuOutcome.NOT_NEWER
         outcome = ImuOutcome.USED
-        if not math.isfinite(w[0] + w[1] + w[2] + f[0] + f[1] + f[2]):
-            if last is None:
-                return ImuOutcome.EMPTY
-            w, f, outcome = last.w_B, last.f_B, ImuOutcome.NOT_FINITE
-            sample = ImuSample(sample.stamp, w, f)
         self.last = sample
         if last is None:
             return outcome
-        dt = (sample.stamp - last.stamp) * 1e-9
+        interval = sample.stamp - last.stamp
+        dt = interval * 1e-9
         if self._instant:
             u, g = last.w_B, last.f_B
             w = (0.5 * (w[0] + u[0]), 0.5 * (w[1] + u[1]), 0.5 * (w[2] + u[2]))
             f = (0.5 * (f[0] + g[0]), 0.5 * (f[1] + g[1]), 0.5 * (f[2] + g[2]))
         gyro, accel = self._variances
-        if outcome is ImuOutcome.NOT_FINITE:
-            gyro, accel = gyro + faults.gap_gyro**2, accel + faults.gap_accel**2
-        elif dt > faults.gap:
+        if self._is_gap(interval):
             # the error persists over the gap: its variance must not average out over the one long step
             gyro, accel = gyro + faults.gap_gyro**2, accel + faults.gap_accel**2
             outcome = ImuOutcome.GAP
@@ -93,9 +90,16 @@ class ImuBuffer:
             accel, outcome = accel + (faults.saturation * imu.accel_range) ** 2, ImuOutcome.SATURATED
         self._ends.append(sample.stamp)
         self._rows.append((dt, *w, *f, gyro, accel))
-        if len(self._ends) > 2 * self._keep:
-            del self._ends[: -self._keep], self._rows[: -self._keep]
+        if sample.stamp - self._ends[0] >= 2 * self._keep:
+            old = max(bisect_right(self._ends, sample.stamp - self._keep), 1)
+            del self._ends[:old], self._rows[:old]
         return outcome
+
+    def _is_gap(self, interval: int) -> bool:
+        """Whether samples are missing in an interval [ns]; it counts for the period from now on."""
+        self._intervals.append(interval)
+        period = sorted(self._intervals)[len(self._intervals) // 2]
+        return interval > self._faults.gap * period
 
     @property
     def latest(self) -> tuple[float, ...]:

@@ -92,14 +92,28 @@ def cholesky(P, scale, L):
 
 
 @compiled
+def moved(x, sign, e, y):
+    """y (16,) = the nominal state x (16,) moved by the error sign * e (15,)."""
+    for i in range(6):
+        y[i] = x[i] + sign * e[i]
+        y[10 + i] = x[10 + i] + sign * e[9 + i]
+    r0, r1, r2 = sign * e[6], sign * e[7], sign * e[8]
+    angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
+    f = 0.5 - angle * angle / 48.0 if angle < 1e-5 else math.sin(0.5 * angle) / angle
+    c = math.cos(0.5 * angle)
+    e0, e1, e2 = f * r0, f * r1, f * r2
+    y[6] = x[9] * e0 + c * x[6] + x[7] * e2 - x[8] * e1
+    y[7] = x[9] * e1 + c * x[7] + x[8] * e0 - x[6] * e2
+    y[8] = x[9] * e2 + c * x[8] + x[6] * e1 - x[7] * e0
+    y[9] = x[9] * c - x[6] * e0 - x[7] * e1 - x[8] * e2
+
+
+@compiled
 def unscented_run(x, P, imu, scale, wm0, wc0, wi, x_out, P_out):
     """Full unscented transform of (x, P) through a run of IMU steps, without process noise.
 
-    With the drift last, the Cholesky factor's columns 15.. move no vehicle state: those 12 sigma points share
-    the centre's path, and only 31 of 43 are integrated.
-
     Args:
-        x, P: nominal state (22,) and covariance (21, 21).
+        x, P: nominal state (16,) and covariance (15, 15).
         imu: rows (dt, wx, wy, wz, ax, ay, az), shape (m, >= 7).
         scale: n + lambda; wm0, wc0: centre weights for mean and covariance; wi: weight of every other point.
         x_out, P_out: results, overwritten.
@@ -107,34 +121,21 @@ def unscented_run(x, P, imu, scale, wm0, wc0, wi, x_out, P_out):
     Returns:
         False where P is not positive definite (the results are then undefined).
     """
-    n, nv = 21, 15
+    n = 15
     L = np.zeros((n, n))
     if not cholesky(P, scale, L):
         return False
-    points = 2 * nv + 1
+    columns = L.T.copy()
+    points = 2 * n + 1
     Y = np.empty((points, 16))
     for s in range(points):
-        y = Y[s]
-        column = (s - 1) % nv
-        sign = 0.0 if s == 0 else (1.0 if s <= nv else -1.0)
-        for i in range(6):
-            y[i] = x[i] + sign * L[i, column]
-        for i in range(6):
-            y[10 + i] = x[10 + i] + sign * L[9 + i, column]
-        r0, r1, r2 = sign * L[6, column], sign * L[7, column], sign * L[8, column]
-        angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
-        f = 0.5 - angle * angle / 48.0 if angle < 1e-5 else math.sin(0.5 * angle) / angle
-        c = math.cos(0.5 * angle)
-        e0, e1, e2 = f * r0, f * r1, f * r2
-        y[6] = x[9] * e0 + c * x[6] + x[7] * e2 - x[8] * e1
-        y[7] = x[9] * e1 + c * x[7] + x[8] * e0 - x[6] * e2
-        y[8] = x[9] * e2 + c * x[8] + x[6] * e1 - x[7] * e0
-        y[9] = x[9] * c - x[6] * e0 - x[7] * e1 - x[8] * e2
+        sign = 0.0 if s == 0 else (1.0 if s <= n else -1.0)
+        moved(x, sign, columns[(s - 1) % n], Y[s])
         for k in range(imu.shape[0]):
-            advance(y, imu[k, 1], imu[k, 2], imu[k, 3], imu[k, 4], imu[k, 5], imu[k, 6], imu[k, 0])
+            advance(Y[s], imu[k, 1], imu[k, 2], imu[k, 3], imu[k, 4], imu[k, 5], imu[k, 6], imu[k, 0])
     # errors about the centre point's result; the centre's own error is zero
-    D = np.zeros((points, nv))
-    mean = np.zeros(nv)
+    D = np.zeros((points, n))
+    mean = np.zeros(n)
     for s in range(1, points):
         for i in range(6):
             D[s, i] = Y[s, i] - Y[0, i]
@@ -152,46 +153,17 @@ def unscented_run(x, P, imu, scale, wm0, wc0, wi, x_out, P_out):
         D[s, 6] = f * d0
         D[s, 7] = f * d1
         D[s, 8] = f * d2
-        for i in range(nv):
+        for i in range(n):
             mean[i] += wi * D[s, i]
-    # the 12 drift points sit on the centre: their deviation is -mean, like the centre's
-    centre = wc0 + wi * (2 * (n - nv))
-    for i in range(nv):
+    for i in range(n):
         for s in range(1, points):
             D[s, i] -= mean[i]
-    for i in range(nv):
+    for i in range(n):
         for j in range(i + 1):
-            total = centre * mean[i] * mean[j]
+            total = wc0 * mean[i] * mean[j]
             for s in range(1, points):
                 total += wi * D[s, i] * D[s, j]
             P_out[i, j] = total
             P_out[j, i] = total
-        for j in range(nv, n):  # only the columns below 15 have both a vehicle and a drift part
-            total = 0.0
-            for k in range(nv):
-                total += (D[1 + k, i] - D[1 + nv + k, i]) * L[j, k]
-            P_out[i, j] = wi * total
-            P_out[j, i] = wi * total
-    for i in range(nv, n):
-        for j in range(nv, n):
-            P_out[i, j] = P[i, j]
-    _put_mean(x, Y[0], mean, x_out)
+    moved(Y[0], 1.0, mean, x_out)
     return True
-
-
-@compiled
-def _put_mean(x, y, mean, x_out):
-    """x_out = y moved by `mean`, with the drift of x."""
-    for i in range(6):
-        x_out[i] = y[i] + mean[i]
-        x_out[10 + i] = y[10 + i] + mean[9 + i]
-    angle = math.sqrt(mean[6] ** 2 + mean[7] ** 2 + mean[8] ** 2)
-    f = 0.5 - angle * angle / 48.0 if angle < 1e-5 else math.sin(0.5 * angle) / angle
-    c = math.cos(0.5 * angle)
-    e0, e1, e2 = f * mean[6], f * mean[7], f * mean[8]
-    x_out[6] = y[9] * e0 + c * y[6] + y[7] * e2 - y[8] * e1
-    x_out[7] = y[9] * e1 + c * y[7] + y[8] * e0 - y[6] * e2
-    x_out[8] = y[9] * e2 + c * y[8] + y[6] * e1 - y[7] * e0
-    x_out[9] = y[9] * c - y[6] * e0 - y[7] * e1 - y[8] * e2
-    for i in range(16, 22):
-        x_out[i] = x[i]

@@ -24,7 +24,7 @@ class VioOutcome(enum.Enum):
     TOO_OLD = "refused: older than the IMU history"
     FUTURE = "refused: stamp lies too far in the future"
     NOT_FINITE = "refused: not finite"
-    BAD_COVARIANCE = "refused: covariance is not positive semi-definite"
+    BAD_COVARIANCE = "refused: covariance is not positive semi-definite, or senselessly large"
     NO_IMU = "refused: no IMU data yet"
 
     @property
@@ -44,7 +44,7 @@ class Health(enum.Enum):
 
 @dataclass(frozen=True)
 class Inertial:
-    """What VIO knows beside its pose and velocity, and what hangs together in all of it.
+    """What VIO knows beside its pose and velocity.
 
     Attributes:
         gyro_bias, accel_bias: [rad/s], [m/s^2], shape (3,).
@@ -65,9 +65,8 @@ class VioPose:
         p_WB: position [m], shape (3,).
         q_WB: attitude xyzw, shape (4,).
         covariance: of (position [m], rotation about W's axes [rad]), shape (6, 6).
-        v_WB: velocity in W [m/s], shape (3,), or None.
-        velocity_covariance: of the velocity in B, turned into W's axes, shape (3, 3), or None; what the attitude's error makes
-            of v_WB is not in it.
+        v_B: velocity in B [m/s], shape (3,), or None.
+        velocity_covariance: of the velocity in B, shape (3, 3), or None.
         inertial: VIO's biases and the covariance of its whole state, where it gives them; the velocity is given then.
     """
 
@@ -75,24 +74,29 @@ class VioPose:
     p_WB: np.ndarray
     q_WB: np.ndarray
     covariance: np.ndarray
-    v_WB: np.ndarray | None = None
+    v_B: np.ndarray | None = None
     velocity_covariance: np.ndarray | None = None
     inertial: Inertial | None = None
 
     def problem(self) -> VioOutcome | None:
         """Why the pose cannot be used, or None."""
         state = (self.inertial.gyro_bias, self.inertial.accel_bias, self.inertial.P) if self.inertial else ()
-        numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_WB, self.velocity_covariance, *state) if n is not None]
+        numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_B, self.velocity_covariance, *state) if n is not None]
         if not math.isfinite(sum(n.sum() for n in numbers)) or abs(math.hypot(*self.q_WB) - 1) > 1e-3:
             return VioOutcome.NOT_FINITE
         covariances = [C for C in (self.covariance, self.velocity_covariance, *state[2:]) if C is not None]
         return None if all(_is_covariance(np.ascontiguousarray(C)) for C in covariances) else VioOutcome.BAD_COVARIANCE
 
 
+_LARGEST = 1e8  # a variance beyond that says nothing, and its square would not be a number [m^2, rad^2, ...]
+
+
 @compiled
 def _is_covariance(C):
-    """Whether a matrix is symmetric and has no negative eigenvalue, up to rounding."""
+    """Whether a matrix is symmetric and has no negative eigenvalue, up to rounding, and no senseless one."""
     scale = np.abs(C).max()
+    if scale > _LARGEST:
+        return False
     if np.abs(C - C.T).max() > 1e-5 * scale + 1e-15:
         return False
     return np.linalg.eigvalsh(C)[0] >= -1e-9 * scale - 1e-15

@@ -1,11 +1,13 @@
-"""To and from the axes of nav_msgs/Odometry: a state's covariances, VIO's pose."""
+"""To and from the axes of nav_msgs/Odometry: a state's covariances, what VIO says."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from perch_core import so3
+from perch_core.errors import PerchError
 from perch_core.jit import compiled
+from perch_core.values import InertialState, OdometryState
 from perch_perception.ukf.measurement import Inertial, VioPose
 
 
@@ -42,22 +44,44 @@ def _covariances(R_WB, hat_v_B, P, gyro_noise):
     return pose_map @ P @ pose_map.T, twist
 
 
-def vio_pose(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, covariance: np.ndarray, v_WB: np.ndarray | None,
-             velocity_covariance_B: np.ndarray | None) -> VioPose:
-    """VIO's pose as the estimator takes it.
+def vio_state(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray, inertial: Inertial) -> VioPose:
+    """VIO's whole state as the estimator takes it.
 
     Args:
-        stamp, p_WB, q_WB, covariance, v_WB: as in `VioPose`.
-        velocity_covariance_B: of the velocity in B, shape (3, 3), or None.
+        stamp, p_WB, q_WB, inertial: as in `VioPose`.
+        v_WB: velocity in W [m/s], shape (3,).
     """
-    if velocity_covariance_B is None:
-        return VioPose(stamp, p_WB, q_WB, covariance, v_WB)
-    R_WB = so3.quat_to_matrix(q_WB)
-    return VioPose(stamp, p_WB, q_WB, covariance, v_WB, R_WB @ velocity_covariance_B @ R_WB.T)
-
-
-def vio_state(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray, inertial: Inertial) -> VioPose:
-    """VIO's whole state as the estimator takes it; arguments as in `VioPose`."""
     R_WB = so3.quat_to_matrix(q_WB)
     pose, twist = covariances(R_WB, v_WB, inertial.P)
-    return VioPose(stamp, p_WB, q_WB, pose, v_WB, R_WB @ twist[:3, :3] @ R_WB.T, inertial)
+    return VioPose(stamp, p_WB, q_WB, pose, R_WB.T @ v_WB, twist[:3, :3], inertial)
+
+
+def pose_of(odometry: OdometryState) -> VioPose:
+    """What a value of `vio/odometry` says.
+
+    Raises:
+        PerchError: an array is not of the shape that the value names.
+    """
+    p, q, v_B, _ = (_numbers(x, n) for x, n in ((odometry.p_WB, 3), (odometry.q_WB, 4), (odometry.v_B, 3), (odometry.w_B, 3)))
+    covariance, twist = _numbers(odometry.pose_covariance, 6, 6), _numbers(odometry.twist_covariance, 6, 6)
+    if twist[0, 0] < 0.0:  # there is no velocity
+        return VioPose(odometry.stamp, p, q, covariance)
+    # all zero: its covariance is not given
+    return VioPose(odometry.stamp, p, q, covariance, v_B, twist[:3, :3] if twist[0, 0] > 0.0 else None)
+
+
+def state_of(state: InertialState) -> VioPose:
+    """What a value of `vio/state` says.
+
+    Raises:
+        PerchError: an array is not of the shape that the value names.
+    """
+    inertial = Inertial(_numbers(state.gyro_bias, 3), _numbers(state.accel_bias, 3), _numbers(state.covariance, 15, 15))
+    return vio_state(state.stamp, _numbers(state.p_WB, 3), _numbers(state.q_WB, 4), _numbers(state.v_WB, 3), inertial)
+
+
+def _numbers(values: object, *shape: int) -> np.ndarray:
+    array = np.asarray(values, dtype=float)
+    if array.shape != shape:
+        raise PerchError(f"shape {array.shape} is not {shape}")
+    return array

@@ -1,4 +1,4 @@
-"""The unscented transforms of the UKF: prediction through IMU steps and the update with a VIO pose.
+"""The unscented transforms of the UKF: prediction through IMU steps and the update with a pose.
 
 Sigma points and weights are filterpy's (`MerweScaledSigmaPoints`) on the error vector; the points live on the
 manifold through `layout.plus`/`minus`. Prediction runs in `kernels.unscented_run`; without numba, in the vectorised
@@ -19,6 +19,7 @@ from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import kernels, update_kernels
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
+from perch_perception.ukf.measurement import VioPose
 
 # columns of a run of IMU steps
 DT, GYRO, ACCEL = 0, slice(1, 4), slice(4, 7)
@@ -34,8 +35,8 @@ class Belief:
 
     Attributes:
         stamp: time [ns].
-        x: nominal state, shape (22,), see `layout`.
-        P: error covariance, shape (21, 21).
+        x: nominal state, shape (16,), see `layout`.
+        P: error covariance, shape (15, 15).
     """
 
     stamp: int
@@ -48,9 +49,9 @@ class Innovation:
     """What a measurement said against the prediction.
 
     Attributes:
-        residual: measured minus predicted, shape (6,).
-        S: its covariance, shape (6, 6).
-        gain: Kalman gain, shape (21, 6).
+        residual: measured minus predicted, shape (m,).
+        S: its covariance, shape (m, m).
+        gain: Kalman gain, shape (15, m).
         nis: residual^T S^-1 residual.
     """
 
@@ -111,7 +112,7 @@ class UnscentedTransform:
         return at.plus(points[0], mean), (centred * self.points.Wc[:, None]).T @ centred
 
     def process_noise(self, run: np.ndarray) -> np.ndarray:
-        """Covariance that a run's IMU noise and bias walks add, shape (21, 21).
+        """Covariance that a run's IMU noise and bias walks add, shape (15, 15).
 
         White noise of each sample: attitude sum(s_g^2 dt^2), velocity sum(s_a^2 dt^2) =: q, which the double
         integral carries into the position as q T^2/3 and q T/2. Couplings of higher order in T (40 ms) are left out.
@@ -124,28 +125,31 @@ class UnscentedTransform:
         imu = self.config.imu
         update_kernels.add_process_noise(run, imu.gyro_bias_walk**2, imu.accel_bias_walk**2, P)
 
-    def innovate(self, belief: Belief, p_WB: np.ndarray, q_WB: np.ndarray, R: np.ndarray) -> Innovation:
-        """Innovation and gain for a VIO pose at the belief's time.
+    def innovate(self, belief: Belief, pose: VioPose, R: np.ndarray) -> Innovation:
+        """Innovation and gain for a pose, and with it a velocity, at the belief's time.
 
-        The prediction of a sigma point is p + drift_p and exp(drift_theta) R_WB: VIO's own map is off by the
-        drift. Attitude residuals are rotation vectors in W about the predicted attitude of the centre.
+        The prediction of a sigma point is p_WB, R_WB and, where the velocity is measured, R_WB^T v_WB. Attitude residuals are rotation
+        vectors in W about the attitude of the centre.
 
         Args:
             belief: predicted to the pose's stamp.
-            p_WB, q_WB: VIO's pose, shapes (3,), (4,).
-            R: white measurement noise, shape (6, 6).
+            pose: what is measured.
+            R: noise of (position, rotation about W's axes), shape (6, 6), or of these and the velocity in B, shape (9, 9).
 
         Raises:
             CovarianceError: the covariance is not positive definite.
         """
-        residual, S, gain = np.empty(6), np.empty((6, 6)), np.empty((at.ERROR_SIZE, 6))
+        m = len(R)
+        z = np.concatenate([pose.p_WB, pose.q_WB, pose.v_B if m == 9 else ()])
+        residual, S, gain = np.empty(m), np.empty((m, m)), np.empty((at.ERROR_SIZE, m))
         Wm, Wc = self.points.Wm, self.points.Wc
-        nis = update_kernels.innovate(belief.x, belief.P, p_WB, q_WB, R, self.scale, Wm[0], Wc[0], Wm[1], residual, S, gain)
+        nis = update_kernels.innovate(belief.x, belief.P, z, R, self.scale, Wm[0], Wc[0], Wm[1], residual, S, gain)
         if nis < 0.0:
             raise CovarianceError("covariance is not positive definite")
         return Innovation(residual, S, gain, nis)
 
-    def correct(self, belief: Belief, innovation: Innovation) -> Belief:
+    @staticmethod
+    def correct(belief: Belief, innovation: Innovation) -> Belief:
         """Belief after a measurement.
 
         After the injection the attitude error is counted from the new nominal attitude: its covariance turns by

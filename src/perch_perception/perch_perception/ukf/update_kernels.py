@@ -1,6 +1,6 @@
-"""The UKF's update with a VIO pose and the covariances around it, compiled: in numpy the calls cost a control period.
+"""The UKF's update with a measurement, compiled: in numpy the calls cost a control period.
 
-`kernels.py` holds the prediction, `unscented.py` and `drift.py` the equations. Indices follow `layout.py`.
+`kernels.py` holds the prediction, `unscented.py` the equations. Indices follow `layout.py`.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ import math
 import numpy as np
 
 from perch_core.jit import compiled
-from perch_core.vector3 import axpy, cross, norm, quaternion_product, turned
-from perch_perception.ukf.kernels import cholesky
-
-_UNIT = (0.0, 0.0, 0.0, 1.0)
+from perch_core.vector3 import axpy, cross, norm, quaternion_product
+from perch_perception.ukf.kernels import cholesky, moved
 
 
 @compiled
@@ -26,83 +24,74 @@ def _rotation_vector(q):
 
 
 @compiled
-def vios_attitude(x):
-    """Attitude that VIO would report at the nominal state x (22,): exp(drift) R_WB, xyzw."""
-    return quaternion_product(turned(_UNIT, (x[19], x[20], x[21])), (x[6], x[7], x[8], x[9]))
-
-
-@compiled
-def take_over_pose(x):
-    """Give the nominal state x (22,) the pose that VIO would report there and no drift; the turn in B, a rotation vector."""
-    q = vios_attitude(x)
-    turn = _rotation_vector(quaternion_product((-x[6], -x[7], -x[8], x[9]), q))
+def _seen(x, back, z):
+    """What a measurement of the nominal state x (16,) would be, z (6,) or (9,), with the attitude about the inverse of `back`."""
+    q = (x[6], x[7], x[8], x[9])
+    turn = _rotation_vector(quaternion_product(q, back))
     for i in range(3):
-        x[i] += x[16 + i]
-    for i in range(4):
-        x[6 + i] = q[i]
-    for i in range(16, 22):
-        x[i] = 0.0
-    return turn
+        z[i] = x[i]
+        z[3 + i] = turn[i]
+    if len(z) == 9:
+        v = _rotated_back(q, (x[3], x[4], x[5]))
+        for i in range(3):
+            z[6 + i] = v[i]
 
 
 @compiled
-def _vios_attitude_near(x, sign, e):
-    """As `vios_attitude`, of the nominal state moved by the error sign * e (21,)."""
-    q = turned((x[6], x[7], x[8], x[9]), (sign * e[6], sign * e[7], sign * e[8]))
-    return quaternion_product(turned(_UNIT, (x[19] + sign * e[18], x[20] + sign * e[19], x[21] + sign * e[20])), q)
+def _rotated_back(q, v):
+    """R^T v for a unit quaternion xyzw."""
+    u = (-q[0], -q[1], -q[2])
+    t = cross(u, v)
+    t = (2.0 * t[0], 2.0 * t[1], 2.0 * t[2])
+    return axpy(1.0, cross(u, t), axpy(q[3], t, v))
 
 
 @compiled
-def innovate(x, P, p, q, R, scale, wm0, wc0, wi, residual, S, gain):
+def innovate(x, P, measured, R, scale, wm0, wc0, wi, residual, S, gain):
     """`UnscentedTransform.innovate`.
 
     Args:
-        x, P: nominal state (22,) and covariance (21, 21).
-        p, q: VIO's pose, (3,), (4,).
-        R: white measurement noise, (6, 6).
+        x, P: nominal state (16,) and covariance (15, 15).
+        measured: position and attitude xyzw, (7,), and where R has nine rows the velocity in B, (10,).
+        R: measurement noise, (m, m).
         scale: n + lambda; wm0, wc0: centre weights for mean and covariance; wi: weight of every other point.
-        residual, S, gain: results (6,), (6, 6), (21, 6), overwritten.
+        residual, S, gain: results (m,), (m, m), (15, m), overwritten.
 
     Returns:
         Normalised innovation squared; -1 where P is not positive definite (the results are then undefined).
     """
-    n = 21
+    n, m = 15, len(R)
     L = np.zeros((n, n))
     if not cholesky(P, scale, L):
         return -1.0
     columns = L.T.copy()
-    Z = np.zeros((2 * n + 1, 6))
-    centre = vios_attitude(x)
-    back = (-centre[0], -centre[1], -centre[2], centre[3])
+    Z, y = np.zeros((2 * n + 1, m)), np.empty(16)
+    back = (-x[6], -x[7], -x[8], x[9])
     for s in range(2 * n + 1):
-        e = columns[(s - 1) % n]
-        sign = 0.0 if s == 0 else (1.0 if s <= n else -1.0)
-        turn = _rotation_vector(quaternion_product(_vios_attitude_near(x, sign, e), back))
-        for i in range(3):
-            Z[s, i] = x[i] + x[16 + i] + sign * (e[i] + e[15 + i])
-            Z[s, 3 + i] = turn[i]
-    measured = _rotation_vector(quaternion_product((q[0], q[1], q[2], q[3]), back))
-    for i in range(6):
+        moved(x, 0.0 if s == 0 else (1.0 if s <= n else -1.0), columns[(s - 1) % n], y)
+        _seen(y, back, Z[s])
+    turn = _rotation_vector(quaternion_product((measured[3], measured[4], measured[5], measured[6]), back))
+    for i in range(m):
         mean = wm0 * Z[0, i]
         for s in range(1, 2 * n + 1):
             mean += wi * Z[s, i]
-        residual[i] = (p[i] if i < 3 else measured[i - 3]) - mean
+        residual[i] = (turn[i - 3] if 3 <= i < 6 else measured[i] if i < 3 else measured[i + 1]) - mean
         for s in range(2 * n + 1):
             Z[s, i] -= mean
-    for i in range(6):
+    for i in range(m):
         for j in range(i + 1):
             total = wc0 * Z[0, i] * Z[0, j]
             for s in range(1, 2 * n + 1):
                 total += wi * Z[s, i] * Z[s, j]
             S[i, j] = total + R[i, j]
             S[j, i] = total + R[j, i]
-    for i in range(6):
+    for i in range(m):
         for j in range(n):
             total = 0.0
             for k in range(n):
                 total += (Z[1 + k, i] - Z[1 + n + k, i]) * columns[k, j]
             gain[j, i] = wi * total  # the cross covariance, for now
-    factor = np.zeros((6, 6))
+    factor = np.zeros((m, m))
     if not cholesky(S, 1.0, factor):
         return -1.0
     for j in range(n):
@@ -114,18 +103,18 @@ def innovate(x, P, p, q, R, scale, wm0, wc0, wi, residual, S, gain):
 
 @compiled
 def correct(x, P, gain, S, residual, x_out, P_out):
-    """`UnscentedTransform.correct`: the state (22,) and covariance (21, 21) after a measurement, into x_out and P_out."""
-    n = 21
-    step, spread = np.zeros(n), np.zeros((n, 6))
+    """`UnscentedTransform.correct`: the state (16,) and covariance (15, 15) after a measurement, into x_out and P_out."""
+    n, m = 15, len(residual)
+    step, spread = np.zeros(n), np.zeros((n, m))
     for i in range(n):
-        for k in range(6):
+        for k in range(m):
             step[i] += gain[i, k] * residual[k]
-            for m in range(6):
-                spread[i, k] += gain[i, m] * S[m, k]
+            for c in range(m):
+                spread[i, k] += gain[i, c] * S[c, k]
     for i in range(n):
         for j in range(i + 1):
             total = 0.0
-            for k in range(6):
+            for k in range(m):
                 total += spread[i, k] * gain[j, k]
             P_out[i, j] = P_out[j, i] = 0.5 * (P[i, j] + P[j, i]) - total
     phi = (step[6], step[7], step[8])
@@ -137,13 +126,7 @@ def correct(x, P, gain, S, residual, x_out, P_out):
         row = _right_jacobian(phi, (P_out[i, 6], P_out[i, 7], P_out[i, 8]))
         for j in range(3):
             P_out[i, 6 + j] = row[j]
-    for i in range(6):
-        x_out[i] = x[i] + step[i]
-        x_out[10 + i] = x[10 + i] + step[9 + i]
-        x_out[16 + i] = x[16 + i] + step[15 + i]
-    q = turned((x[6], x[7], x[8], x[9]), phi)
-    for i in range(4):
-        x_out[6 + i] = q[i]
+    moved(x, 1.0, step, x_out)
 
 
 @compiled
@@ -171,39 +154,8 @@ def _solve(L, y):
 
 
 @compiled
-def clipped(A, scale, low):
-    """s_i s_j B_ij, with B = A_ij / (s_i s_j) whose eigenvalues are raised to `low` where they are smaller; (n, n)."""
-    n = len(scale)
-    B = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            B[i, j] = A[i, j] / (scale[i] * scale[j])
-    values, vectors = np.linalg.eigh(B)
-    out = np.zeros((n, n))
-    for k in range(n):
-        value = max(values[k], low)
-        for i in range(n):
-            for j in range(n):
-                out[i, j] += value * vectors[i, k] * vectors[j, k]
-    for i in range(n):
-        for j in range(n):
-            out[i, j] *= scale[i] * scale[j]
-    return out
-
-
-@compiled
-def missing(C, P):
-    """Positive part of C - P, (n, n), in units of C's own sigmas."""
-    n = len(C)
-    scale = np.empty(n)
-    for i in range(n):
-        scale[i] = math.sqrt(max(C[i, i], 1e-12))
-    return clipped(C - P, scale, 0.0)
-
-
-@compiled
 def add_process_noise(run, gyro_walk2, accel_walk2, P):
-    """Add to P (21, 21) what a run's IMU noise and bias walks do, see `UnscentedTransform.process_noise`."""
+    """Add to P (15, 15) what a run's IMU noise and bias walks do, see `UnscentedTransform.process_noise`."""
     T, q, turn = 0.0, 0.0, 0.0
     for k in range(run.shape[0]):
         dt = run[k, 0]

@@ -58,8 +58,7 @@ def observe(camera: Camera, pixels: np.ndarray) -> Bearings:
     if isinstance(camera, EquidistantCamera):
         return Bearings(*lens.observe(camera, pixels))
     b = camera.unproject(pixels)
-    theta = np.arctan2(np.hypot(b[:, 0], b[:, 1]), b[:, 2])
-    return Bearings(b, np.column_stack([np.cos(theta) ** 2, np.tan(theta + 1e-9) / (theta + 1e-9)]))
+    return Bearings(b, camera.shape_at(np.arctan2(np.hypot(b[:, 0], b[:, 1]), b[:, 2])))
 
 
 @compiled

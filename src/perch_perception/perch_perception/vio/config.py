@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from perch_core.config import part, quantity
 
-from perch_perception.ukf.config import ImuFaults, ImuNoise
+from perch_perception.ukf.config import ImuFaults, ImuNoise, RestConfig
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,13 @@ class StartConfig:
 
     position_sigma: float = quantity(0.001, unit="m", above=0.0)
     yaw_sigma: float = quantity(0.001, unit="rad", above=0.0)
-    rest_time: float = quantity(0.25, unit="s", above=0.05, high=5.0, doc="IMU at rest needed for a start on the ground")
     motion_time: float = quantity(0.5, unit="s", above=0.2, high=3.0, doc="frames needed for a start in motion")
     motion_noise: float = quantity(2.0, unit="px", above=0.0, doc="1 sigma of a track about its point over the frames of a start in motion")
-    rest_gyro: float = quantity(0.05, unit="rad/s", above=0.0, doc="largest mean rate over 0.1 s at rest, bias included")
-    rest_accel: float = quantity(0.32, unit="m/s^2", above=0.0, doc="largest change of the mean force at rest")
     rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
     rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
     ground_sigma: float = quantity(0.005, unit="m", above=0.0, doc="1 sigma of the ground about its plane")
     ground_least_height: float = quantity(0.08, unit="m", above=0.0, doc="a camera standing lower sees no landmarks on the ground")
     unnoticed_velocity: float = quantity(0.02, unit="m/s", low=0.0, doc="1 sigma of a take-off that is not yet noticed")
-    rest_velocity: float = quantity(0.002, unit="m/s", above=0.0, doc="1 sigma of zero velocity on the ground")
 
 
 @dataclass(frozen=True)
@@ -100,6 +96,7 @@ class VioConfig:
 
     imu: ImuNoise = part(ImuNoise)
     faults: ImuFaults = part(ImuFaults)
+    rest: RestConfig = part(RestConfig)
     tracker: TrackerConfig = part(TrackerConfig)
     filter: FilterConfig = part(FilterConfig)
     calibration: CalibrationPriors = part(CalibrationPriors)

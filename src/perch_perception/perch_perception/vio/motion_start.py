@@ -15,7 +15,6 @@ from perch_core.covariance import largest_sigma
 from perch_core.vehicle import GRAVITY
 
 from perch_perception.ukf.imu_buffer import ImuBuffer
-from perch_perception.ukf.start import level
 from perch_perception.vio import start
 from perch_perception.vio.bearing import Bearings
 from perch_perception.vio.config import VioConfig
@@ -126,7 +125,7 @@ class MotionStart:
 
         Args:
             imu: samples over all frames.
-            pose: position and yaw at the newest frame, as far as they are known.
+            pose: position and heading at the newest frame, as far as they are known.
             gyro_bias: last known [rad/s], shape (3,).
         """
         frames = sorted(self._stamps)
@@ -165,7 +164,7 @@ class MotionStart:
             return None
         bias_tilt = self._config.imu.accel_bias_init / GRAVITY
         up_B = last.dR.T @ (-found.g / GRAVITY)
-        R_WB = start.with_yaw(level(up_B), pose.yaw)
+        R_WB = start.levelled(pose.R_WB, up_B)
         v_B0 = found.v + found.g * last.duration + last.dv
         return start.fresh(self._config, self._mount, stamp, R_WB, pose, R_WB @ (last.dR.T @ v_B0), gyro_bias.copy(),
                            float(np.hypot(tilt, bias_tilt)), float(np.hypot(speed, 0.1)), self._config.imu.gyro_bias_init)

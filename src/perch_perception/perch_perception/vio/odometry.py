@@ -10,10 +10,10 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-from perch_core import so3
 from perch_core.camera import Camera, CameraMount
-
-from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, ImuSample
+from perch_core.values import ImuSample
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
+from perch_perception.ukf.stillness import still, window
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, observe, residuals
@@ -45,8 +45,7 @@ class VisualInertialOdometry:
             yaw: of the body in W at the start [rad].
             floor: height in W of the level ground that it stands on [m]; None: unknown.
         """
-        self.config, self.mount = config, mount
-        self.tracker = Tracker(config.tracker, mount.camera)
+        self.config = config
         self.filter: Msckf | None = None
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, config.faults, 2.0 + config.start.motion_time)
@@ -54,15 +53,31 @@ class VisualInertialOdometry:
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposed, features) of frames at rest that the filter has not passed
         self._gyro_bias = np.zeros(3)
-        self._rest_accel: np.ndarray | None = None  # the force at rest, while the ground has not been left for good
-        self._resting = self._seen = False
-        self._moving = motion_start.MotionStart(config, mount)
+        self._resting = False
+        self._told = True     # it stands where it was told to start
+        self._sight: int | None = None  # when vision last changed the state; None: not since the last rest
         self._frame = 0
         self._last_image = -1           # stamp of the last frame used, on the board's clock
         self._last_exposed: int | None = None
         self._informed = 0              # when vision or rest last updated the filter
         self._bad_frames = 0
+        self._look_through(mount)
+
+    def _look_through(self, mount: CameraMount) -> None:
+        self.mount = mount
+        self.tracker = Tracker(self.config.tracker, mount.camera)
+        self._moving = motion_start.MotionStart(self.config, mount)
         _compile(mount.camera)
+
+    def use_camera(self, mount: CameraMount) -> None:
+        """Go on with another camera, or another calibration of it: a filter that flies starts again in motion."""
+        if self._resting:
+            self._know()
+            self.filter, self._resting = None, False  # nothing is lost: it still stands there
+        elif self.filter is not None:
+            self._forget_state()
+        self._views.clear()
+        self._look_through(mount)
 
     @property
     def time_offset(self) -> float:
@@ -121,25 +136,23 @@ class VisualInertialOdometry:
         if self._last_exposed is not None:
             steps = self._imu.run(self._last_exposed, exposed)
             turn = preintegrate(steps, state.gyro_bias if state else self._gyro_bias, np.zeros(3)).dR
+            if state is None:
+                self._known = replace(self._known, R_WB=self._known.R_WB @ turn)
         return self.tracker.track(image, R_BC.T @ turn.T @ R_BC)
 
     # -- before the start --------------------------------------------------------------------------------------------
 
     def _try_start(self, exposed: int, features: Features) -> VioResult:
         """Start at rest or, when the vehicle moves, from the frames of the last half second."""
-        s = self.config.start
-        steps = self._imu.run(max(self._imu.oldest, exposed - round(s.rest_time * 1e9)), exposed)
-        long_enough = len(steps) > 0 and steps[:, 0].sum() > 0.9 * s.rest_time
-        still = features.disparity < s.rest_disparity or not np.isfinite(features.disparity)
-        if self.restarts == 0 and long_enough and still and rest.looks_at_rest(s, steps, np.zeros(3), None):
+        steps = window(self.config.rest, self._imu, exposed)
+        if self._quiet(features) and still(self.config.rest, self.config.imu, steps):
             self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known))
-            self._rest_accel, self._resting, self._seen = steps[:, 4:7].mean(axis=0), False, False
             return self._hold(exposed, features)
         self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
         state = self._moving.solve(self._imu, self._known, self._gyro_bias)
         if state is not None:
             self._begin(state)
-            self._rest_accel = None
+            self._told, self._sight = False, exposed
             return self._result(FrameOutcome.TRACKING, features, FrameReport())
         outcome = FrameOutcome.LOST if self.restarts else FrameOutcome.INITIALISING
         return VioResult(outcome, None, len(features.ids), restarts=self.restarts, message=outcome.value)
@@ -151,25 +164,32 @@ class VisualInertialOdometry:
     # -- afterwards --------------------------------------------------------------------------------------------------
 
     def _step(self, exposed: int, features: Features) -> VioResult:
-        if self._rest_accel is not None and not self._seen:
-            if self._is_still(exposed, features):
-                return self._hold(exposed, features)
-            if self._resting and self._floor is not None and not self.filter.state.landmarks:
-                self._stand_on(features)
-            self._resting = False
+        if self._is_still(exposed, features):
+            return self._hold(exposed, features)
+        if self._resting and self._told and self._floor is not None and not self.filter.state.landmarks:
+            self._stand_on(features)
+        self._resting = False
         self.filter.propagate(self._imu.run(self.filter.state.stamp, exposed), exposed)
         report = self.filter.add_frame(self._frame, features.ids, observe(self.mount.camera, features.pixels))
-        self._seen = self._seen or report.used > 0  # in the air: from here on only vision counts
+        if report.used:
+            self._sight, self._told = exposed, False
         return self._judge(exposed, features, report)
 
     def _is_still(self, exposed: int, features: Features) -> bool:
-        """Whether the vehicle still (or again) stands where it was told to start."""
-        s = self.config.start
-        quiet = features.disparity < s.rest_disparity or len(features.ids) < self.config.loss.least_tracks
-        span = 0.1 if self._resting else s.rest_time  # leaving is believed at once, coming back is not
-        recent = self._imu.run(max(self._imu.oldest, exposed - round(span * 1e9)), exposed)
-        return (quiet and rest.looks_at_rest(s, recent, self.filter.state.gyro_bias, self._rest_accel)
-                and (self._resting or rest.can_stand(self.filter.state)))
+        """Whether the vehicle rests: the IMU says so, nothing moves in the image, and it is not known to move steadily.
+
+        While vision says where the vehicle is, nobody asks: a very quiet hover looks like rest.
+        """
+        state = self.filter.state
+        if self._sight is not None and exposed - self._sight < round(1e9 * self.config.loss.degraded_after):
+            return False
+        return (self._quiet(features) and still(self.config.rest, self.config.imu, window(self.config.rest, self._imu, exposed), state.gyro_bias)
+                and (self._resting or rest.can_stand(state)))
+
+    def _quiet(self, features: Features) -> bool:
+        """Nothing moves in the image, or there is nothing in it."""
+        return (features.disparity < self.config.start.rest_disparity or not np.isfinite(features.disparity)
+                or len(features.ids) < self.config.loss.least_tracks)
 
     def _hold(self, exposed: int, features: Features) -> VioResult:
         """Tell the filter that the vehicle stood still, up to a little before now.
@@ -178,15 +198,15 @@ class VisualInertialOdometry:
         remains true, and catches up with the IMU when the vehicle leaves.
         """
         state = self.filter.state
-        if not self._resting:
-            state.drop_clones(list(range(len(state.clones))))
-            state.add_clone(self._frame, np.zeros(3))  # what `rest.hold` holds on to
-            self._resting = True
         until = max(state.stamp, exposed - round(self.config.start.rest_lag * 1e9))
+        if not self._resting:
+            self.filter.propagate(self._imu.run(state.stamp, until), until)
+            rest.stop(self.filter)
+            self._resting, self._sight = True, None
+            self._views.clear()
         steps = self._imu.run(state.stamp, until)
         if len(steps):
-            self.filter.propagate(steps, until)
-            rest.hold(self.filter, self.config.start)
+            rest.hold(self.filter, steps, until)
         self._informed = exposed
         self._views.append((exposed, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
@@ -228,20 +248,27 @@ class VisualInertialOdometry:
         outcome = FrameOutcome.TRACKING
         if blind > loss.degraded_after:
             # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
-            leaving = self._rest_accel is not None and not self._seen and sigma[at.VELOCITY].max() < loss.leaving_velocity
+            leaving = self._sight is None and sigma[at.VELOCITY].max() < loss.leaving_velocity
             outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 
     def _lose(self, features: Features, why: str) -> VioResult:
-        """Keep what is known of position and yaw, and start again in motion."""
+        """Keep what is known of position and heading, and start again in motion."""
+        self._forget_state()
+        return VioResult(FrameOutcome.LOST, None, len(features.ids), restarts=self.restarts, message=f"lost: {why}")
+
+    def _forget_state(self) -> None:
+        self._know()
+        self._moving = motion_start.MotionStart(self.config, self.mount)
+        self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
+
+    def _know(self) -> None:
+        """Keep what a new start needs."""
         s = self.filter.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
-            self._known = KnownPose(s.p_WB.copy(), float(so3.yaw_of(s.R_WB)), self._estimate().pose_covariance[rows])
+            self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), self._estimate().pose_covariance[rows])
             self._gyro_bias = s.gyro_bias.copy()
-        self._moving = motion_start.MotionStart(self.config, self.mount)
-        self.filter, self.restarts = None, self.restarts + 1
-        return VioResult(FrameOutcome.LOST, None, len(features.ids), restarts=self.restarts, message=f"lost: {why}")
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
         s = self.filter.state

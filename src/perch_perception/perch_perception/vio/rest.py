@@ -1,7 +1,7 @@
-"""Standing still: how it is recognised, and what it tells the filter.
+"""The MSCKF at rest, as the UKF is (`perch_perception.ukf.rest`): pose constant, velocity zero, biases seen directly.
 
-On the ground before take-off the downward camera looks at a few square centimetres of floor from 2-5 cm. Nothing can
-be triangulated there, but nothing moves either: zero velocity, zero rate and an unchanged pose say more than any track.
+On the ground, on a wall and on a wire the downward camera looks at a few square centimetres from 2-5 cm, or into the dark. Nothing
+can be triangulated there, but nothing moves either. How rest is recognised: `perch_perception.ukf.stillness`.
 """
 
 from __future__ import annotations
@@ -11,29 +11,12 @@ from perch_core import so3
 from perch_core.vehicle import GRAVITY
 from scipy.stats import chi2
 
-from perch_perception.ukf.unscented import ACCEL, GYRO
+from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import state as at
-from perch_perception.vio.config import StartConfig
 from perch_perception.vio.msckf import Msckf
 
-_HOLD = 0.0002  # 1 sigma of "the pose has not changed": [m] and [rad]
 _STANDS = float(chi2.ppf(1.0 - 1e-6, 3))
-
-
-def looks_at_rest(config: StartConfig, steps: np.ndarray, gyro_bias: np.ndarray, accel: np.ndarray | None) -> bool:
-    """Whether IMU steps (m, 9) look like standing still.
-
-    Args:
-        config: thresholds.
-        steps: IMU steps of about 0.1 s or more.
-        gyro_bias: what the gyro reads at rest [rad/s], shape (3,).
-        accel: what the accelerometer read at rest before [m/s^2], shape (3,); None: only its length is known.
-    """
-    if len(steps) < 10:
-        return False
-    w, f = steps[:, GYRO].mean(axis=0) - gyro_bias, steps[:, ACCEL].mean(axis=0)
-    change = abs(np.linalg.norm(f) - GRAVITY) if accel is None else np.linalg.norm(f - accel)
-    return bool(np.linalg.norm(w) < config.rest_gyro and change < config.rest_accel)
+_BIASES = np.r_[9:15]
 
 
 def can_stand(state: at.State) -> bool:
@@ -42,19 +25,29 @@ def can_stand(state: at.State) -> bool:
     return bool(v @ np.linalg.solve(state.P[at.VELOCITY, at.VELOCITY], v) < _STANDS)
 
 
-def hold(filter: Msckf, config: StartConfig) -> None:
-    """Update with standing still now.
-
-    v = 0, and the pose is that of the window's oldest clone, made when the rest began. The latter is relative: it says
-    nothing of where in W that is. It tells the gyro's bias as well, since the filter has just integrated the gyro.
-    """
+def stop(filter: Msckf) -> None:
+    """The vehicle has come to rest at the state's stamp: what its velocity was wrong by, it was wrong by before."""
     s = filter.state
-    H = np.zeros((9, at.INERTIAL_SIZE + at.CLONE_SIZE))
-    H[0:3, at.VELOCITY] = np.eye(3)
-    H[3:6, at.THETA], H[3:6, 15:18] = np.eye(3), -np.eye(3)
-    H[6:9, at.POSITION], H[6:9, 18:21] = np.eye(3), -np.eye(3)
-    anchor = s.clones[0]
-    r = np.concatenate([-s.v_WB, so3.log(s.R_WB.T @ anchor.R_WB), anchor.p_WB - s.p_WB])
-    variance = np.repeat([config.rest_velocity**2, _HOLD**2, _HOLD**2], 3)
-    columns = np.concatenate([np.arange(at.INERTIAL_SIZE), s.clone_at(0) + np.arange(6)])
-    filter.apply(columns, H, r, variance)
+    s.drop_clones(list(range(len(s.clones))))
+    s.forces.clear()
+    filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, filter.config.rest.velocity**2)
+
+
+def hold(filter: Msckf, steps: np.ndarray, stamp: int) -> None:
+    """The vehicle has rested over IMU steps (m, 9), m > 0, up to their end `stamp` [ns].
+
+    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f.
+    """
+    s, imu = filter.state, filter.config.imu
+    T = float(steps[:, DT].sum())
+    s.v_WB = np.zeros(3)
+    s.P[at.VELOCITY, :] = s.P[:, at.VELOCITY] = 0.0
+    s.P[at.VELOCITY, at.VELOCITY] = filter.config.rest.velocity**2 * np.eye(3)
+    s.P[_BIASES, _BIASES] += np.repeat([imu.gyro_bias_walk**2 * T, imu.accel_bias_walk**2 * T], 3)
+    up_B = s.R_WB.T @ np.array([0.0, 0.0, GRAVITY])
+    H = np.zeros((6, at.INERTIAL_SIZE))
+    H[:3, at.GYRO_BIAS] = H[3:, at.ACCEL_BIAS] = np.eye(3)
+    H[3:, at.THETA] = so3.hat(up_B)
+    residual = np.concatenate([steps[:, GYRO].mean(axis=0) - s.gyro_bias, steps[:, ACCEL].mean(axis=0) - s.accel_bias - up_B])
+    filter.apply(np.arange(at.INERTIAL_SIZE), H, residual, np.repeat([imu.gyro_noise**2, imu.accel_noise**2], 3) / len(steps))
+    s.stamp = stamp

@@ -14,7 +14,7 @@ class FrameOutcome(enum.Enum):
     """What became of a frame."""
 
     INITIALISING = "waiting for a start at rest or in motion"
-    RESTING = "standing still on the ground"
+    RESTING = "standing still"
     LEAVING = "leaving the ground: nothing to see yet, the IMU alone is good enough"
     TRACKING = "tracked"
     BLIND = "integrating the IMU alone: nothing usable in the image"

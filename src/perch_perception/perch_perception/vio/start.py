@@ -1,4 +1,4 @@
-"""The filter's first state, on the ground: level by gravity, gyro bias from the mean, pose as told."""
+"""The filter's first state, at rest: tilt by gravity, gyro bias from the mean, position and heading as known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.vehicle import GRAVITY
 
-from perch_perception.ukf.start import level
 from perch_perception.ukf.unscented import ACCEL, GYRO
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
@@ -19,23 +18,33 @@ from perch_perception.vio.state import State
 
 @dataclass(frozen=True)
 class KnownPose:
-    """Position and yaw in W at the start, with covariance of (p, yaw), shape (4, 4)."""
+    """Position and attitude in W at a start: of the attitude only the heading counts, gravity says the rest.
+
+    Attributes:
+        p_WB: [m], shape (3,).
+        R_WB: shape (3, 3).
+        covariance: of (p, heading), shape (4, 4).
+    """
 
     p_WB: np.ndarray
-    yaw: float
+    R_WB: np.ndarray
     covariance: np.ndarray
 
 
 def told(config: VioConfig, p_WB: np.ndarray, yaw: float) -> KnownPose:
     """The pose at the start as somebody gives it: position [m], shape (3,), and yaw [rad]."""
     s = config.start
-    return KnownPose(np.array(p_WB, float), yaw, np.diag([s.position_sigma**2] * 3 + [s.yaw_sigma**2]))
+    return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag([s.position_sigma**2] * 3 + [s.yaw_sigma**2]))
 
 
-def with_yaw(q_WB: np.ndarray, yaw: float) -> np.ndarray:
-    """Attitude R_WB (3, 3) with the tilt of a quaternion xyzw (4,) and a given yaw [rad]."""
-    R = so3.quat_to_matrix(q_WB)
-    return so3.exp(np.array([0.0, 0.0, yaw - float(so3.yaw_of(R))])) @ R
+def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
+    """The attitude nearest to R_WB in which a direction in B, shape (3,), points up."""
+    up_W = R_WB @ (up_B / np.linalg.norm(up_B))
+    axis = np.array([up_W[1], -up_W[0], 0.0])  # up_W x e3
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        return R_WB if up_W[2] > 0.0 else so3.exp(np.array([np.pi, 0.0, 0.0])) @ R_WB
+    return so3.exp(axis * (np.arctan2(sine, up_W[2]) / sine)) @ R_WB
 
 
 def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, pose: KnownPose, v_WB: np.ndarray,
@@ -65,9 +74,9 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     Tilt and accelerometer bias cannot be told apart at rest: the update with the mean force leaves exactly that correlation.
     """
     gyro, accel = steps[:, GYRO].mean(axis=0), steps[:, ACCEL].mean(axis=0)
-    R_WB = with_yaw(level(accel), pose.yaw)
+    R_WB = levelled(pose.R_WB, accel)
     gyro_sigma = config.imu.gyro_noise / np.sqrt(len(steps))
-    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.1, config.start.rest_velocity, gyro_sigma)
+    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.1, config.rest.velocity, gyro_sigma)
     up_B = R_WB.T @ np.array([0.0, 0.0, GRAVITY])
     H = np.zeros((3, at.INERTIAL_SIZE))
     H[:, at.THETA], H[:, at.ACCEL_BIAS] = so3.hat(up_B), np.eye(3)

@@ -3,58 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from perch_core import so3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, THRUST, V, W
+from perch_core.values import Certificate
 from perch_core.vehicle import Vehicle
 from perch_planner.powerline.request import PerchPose
 
 ROUNDING = 1e-9  # relative to the limit: what floating point may add to a limit that is met exactly
 
 
-@dataclass(frozen=True)
-class Bound:
-    """The range of one quantity on the 1 ms trajectory against its limits; fields as in `perch_msgs/Certificate`."""
-
-    quantity: str
-    unit: str
-    lower_limit: float
-    upper_limit: float
-    minimum: float
-    maximum: float
-    time_of_minimum: float
-    time_of_maximum: float
-    method: str = "dense"
-
-    @property
-    def holds(self) -> bool:
-        """The limits hold."""
-        return self.margin >= -ROUNDING * max(1.0, abs(self.lower_limit) if np.isfinite(self.lower_limit) else 0.0)
-
-    @property
-    def margin(self) -> float:
-        """Distance from the nearer limit, negative where it is violated, in the quantity's unit."""
-        return min(self.minimum - self.lower_limit, self.upper_limit - self.maximum)
-
-    def __str__(self) -> str:
-        low = "" if np.isinf(self.lower_limit) else f", limit >= {self.lower_limit:g}"
-        high = "" if np.isinf(self.upper_limit) else f", limit <= {self.upper_limit:g}"
-        return (f"{self.quantity} {self.minimum:.4g} .. {self.maximum:.4g} {self.unit}{low}{high}: "
-                f"{'holds' if self.holds else 'VIOLATED'}")
-
-
-def _bound(quantity: str, unit: str, times: np.ndarray, values: np.ndarray, low: float = -np.inf, high: float = np.inf) -> Bound:
+def _certificate(quantity: str, unit: str, times: np.ndarray, values: np.ndarray, low: float = -np.inf, high: float = np.inf
+                 ) -> Certificate:
     low_at, high_at = (np.unravel_index(pick(values), values.shape)[0] for pick in (np.argmin, np.argmax))
-    return Bound(quantity, unit, low, high, float(values.min()), float(values.max()), float(times[low_at]), float(times[high_at]))
+    least, most = float(values.min()), float(values.max())
+    slack = ROUNDING * max(1.0, abs(low) if np.isfinite(low) else 0.0)
+    return Certificate(
+        quantity=quantity, unit=unit, lower_limit=float(low), upper_limit=float(high), minimum=least, maximum=most,
+        time_of_minimum=float(times[low_at]), time_of_maximum=float(times[high_at]), method="dense",
+        holds=bool(min(least - low, high - most) >= -slack))
 
 
 def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.ndarray, lines: Sequence[Segment],
-            height_min: float, thrust_max: float, radius_reduction: float = 0.0) -> tuple[Bound, ...]:
-    """Bounds of everything that must hold on the way.
+            height_min: float, thrust_max: float, radius_reduction: float = 0.0) -> tuple[Certificate, ...]:
+    """Certificates of everything that must hold on the way.
 
     Args:
         vehicle: limits and body.
@@ -73,16 +48,16 @@ def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.n
     for line in lines:
         slim = Segment(line.centre, line.direction, line.half_length, line.radius - radius_reduction, line.id)
         nearest = np.minimum(nearest, scaled_clearance(states[:, P], states[:, Q], slim, vehicle.body_radii))
-    bounds = [_bound("clearance", "-", times, nearest, 0.0)] if len(lines) else []
-    return (*bounds,
-            _bound("height", "m", times, states[:, 2], height_min),
-            _bound("thrust", "N", times, states[:, THRUST], vehicle.thrust_min, thrust_max),
-            _bound("thrust_rate", "N/s", times, np.abs(rates), -np.inf, vehicle.thrust_rate_max),
-            _bound("body_rate", "rad/s", times, np.linalg.norm(states[:, W], axis=1), -np.inf, vehicle.body_rate_max))
+    found = [_certificate("clearance", "-", times, nearest, 0.0)] if len(lines) else []
+    return (*found,
+            _certificate("height", "m", times, states[:, 2], height_min),
+            _certificate("thrust", "N", times, states[:, THRUST], vehicle.thrust_min, thrust_max),
+            _certificate("thrust_rate", "N/s", times, np.abs(rates), -np.inf, vehicle.thrust_rate_max),
+            _certificate("body_rate", "rad/s", times, np.linalg.norm(states[:, W], axis=1), -np.inf, vehicle.body_rate_max))
 
 
 def certify_end(times: np.ndarray, states: np.ndarray, perch: PerchPose, position: float, tilt_deg: float, speed: float
-                ) -> tuple[Bound, ...]:
+                ) -> tuple[Certificate, ...]:
     """Errors of the last state against the wanted pose.
 
     Args:
@@ -98,5 +73,5 @@ def certify_end(times: np.ndarray, states: np.ndarray, perch: PerchPose, positio
         ("end_tilt", "deg", float(np.degrees(so3.angle_between(b3_W, perch.s3_W))), tilt_deg),
         ("end_speed", "m/s", float(np.linalg.norm(last[V] - perch.v_W)), speed),
     )
-    return tuple(_bound(name, unit, times[-1:], np.array([error]), -np.inf, limit)
+    return tuple(_certificate(name, unit, times[-1:], np.array([error]), -np.inf, limit)
                  for name, unit, error, limit in errors if np.isfinite(limit))

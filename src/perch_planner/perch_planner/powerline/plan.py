@@ -8,7 +8,7 @@ import numpy as np
 
 from perch_core.rotor_model import P, Q, THRUST, V, W, RotorModel, accelerations
 from perch_core.trajectory import SampledTrajectory
-from perch_planner.powerline.certificate import Bound
+from perch_core.values import Certificate
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Manoeuvre:
     times: np.ndarray
     states: np.ndarray
     rates: np.ndarray
-    bounds: tuple[Bound, ...]
+    bounds: tuple[Certificate, ...]
     intervals: int
     solver: str
     iterations: int
@@ -58,7 +58,7 @@ class PowerlinePlan:
         return tuple(part for part in (self.perch, self.recovery) if part is not None)
 
     @property
-    def bounds(self) -> tuple[Bound, ...]:
+    def bounds(self) -> tuple[Certificate, ...]:
         """Every certificate; those of an appended recovery are named `recovery_*`."""
         if self.perch is None or self.recovery is None:
             return tuple(bound for part in self.parts for bound in part.bounds)

@@ -11,9 +11,10 @@ from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, STATES, THRUST
 from perch_core.so3 import quat_from_matrix
+from perch_core.values import Certificate
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import guess
-from perch_planner.powerline.certificate import Bound, certify, certify_end
+from perch_planner.powerline.certificate import certify, certify_end
 from perch_planner.powerline.flight import fly
 from perch_planner.powerline.nlp import Numbers, Solution, Structure
 from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
@@ -49,6 +50,7 @@ class _Task:
         guess: attempt and N -> states and inputs.
         accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
         solver: first choice.
+        deadline: time of all solves after which no further attempt is begun [s].
     """
 
     name: str
@@ -67,6 +69,7 @@ class _Task:
     guess: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
     accuracy: tuple[float, float, float]
     solver: str
+    deadline: float
 
 
 @dataclass
@@ -118,7 +121,8 @@ class PowerlinePlanner:
         approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
                      request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, approaching, 0.0, first_guess,
-                     (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
+                     (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver,
+                     request.deadline or s.deadline)
 
     def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
         s = self.settings
@@ -134,7 +138,7 @@ class PowerlinePlanner:
         pinned = np.array([1.0, 1.0, *[s.end_factor] * 4])  # upright and at rest, but not at one place
         return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
                      False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, reduction, first_guess,
-                     (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver)
+                     (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver, request.deadline or s.deadline)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
         """Margins that the start of a recovery leaves, and what to take off the wires' radii for it to begin free.
@@ -168,7 +172,7 @@ class PowerlinePlanner:
         margins, intervals, lines, solver_name = task.margins, s.intervals, task.lines, task.solver
         iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, "first"
         for attempt in range(ATTEMPTS):
-            if time > s.deadline:  # a refusal with its cause is worth more than being stopped
+            if time > task.deadline:  # a refusal with its cause is worth more than being stopped
                 break
             states, inputs = previous if previous is not None else task.guess(attempt, intervals)
             numbers = Numbers(
@@ -221,7 +225,7 @@ def _clearances(least: float, leaving: float, approaching: float, intervals: int
     return least + np.maximum(open_air, 0.0)
 
 
-def _tightened(margins: Margins, broken: list[Bound]) -> Margins:
+def _tightened(margins: Margins, broken: list[Certificate]) -> Margins:
     """Margins raised by half more than what is violated."""
     raised = {bound.quantity: getattr(margins, bound.quantity) + 1.5 * abs(bound.margin) + 1e-3
               for bound in broken if hasattr(margins, bound.quantity)}

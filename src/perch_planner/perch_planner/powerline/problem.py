@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import config
-from perch_core.config import choice, part, quantity, text
+from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, V, W, hover_state
@@ -24,6 +24,11 @@ Vector4 = tuple[float, float, float, float]
 ZERO = (0.0, 0.0, 0.0)
 
 
+def _check_direction(key: str, value: tuple[float, ...]) -> None:
+    if not np.linalg.norm(value) > 1e-6:
+        raise ConfigError("", key, f"{list(value)} has no direction")
+
+
 @dataclass(frozen=True, kw_only=True)
 class LineConfig:
     """A segment; its id is its place in the list."""
@@ -32,6 +37,9 @@ class LineConfig:
     direction: Vector3 = quantity(doc="need not be normalised")
     half_length: float = quantity(unit="m", above=0.0)
     radius: float = quantity(0.03, unit="m", above=0.0)
+
+    def __post_init__(self) -> None:
+        _check_direction("direction", self.direction)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +50,9 @@ class StartConfig:
     orientation: Vector4 = quantity((0.0, 0.0, 0.0, 1.0), doc="xyzw; normalised")
     velocity: Vector3 = quantity(ZERO, unit="m/s")
     body_rate: Vector3 = quantity(ZERO, unit="rad/s")
+
+    def __post_init__(self) -> None:
+        _check_direction("orientation", self.orientation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +70,8 @@ class PerchConfig:
         pitch = (self.point is not None, self.pitch_deg is not None)
         if pose + pitch not in ((True, True, False, False), (False, False, True, True)):
             raise ConfigError("", "position", "give position and orientation, or point and pitch_deg")
+        if self.orientation is not None:
+            _check_direction("orientation", self.orientation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +79,7 @@ class PowerlineProblem:
     """A problem file."""
 
     kind: str = choice(options=("powerline",))
-    name: str = text()
+    name: str = label()
     description: str = text("")
     vehicle: str = text("rpg")
     gravity: float = quantity(GRAVITY, unit="m/s^2", above=0.0, high=30.0)

@@ -88,6 +88,7 @@ class PowerlineRequest:
         recovery_only: plan a recovery from `start` alone.
         hover: where a recovery shall tend to [m], shape (3,); the start of the perch when None.
         solver: overrides the settings' first choice; empty: it stands.
+        deadline: wall-clock time after which no further attempt is begun [s]; 0: the settings'.
     """
 
     start: np.ndarray
@@ -99,6 +100,7 @@ class PowerlineRequest:
     recovery_only: bool = False
     hover: np.ndarray | None = None
     solver: str = ""
+    deadline: float = 0.0
 
     def target(self) -> Segment:
         """The line to perch on.

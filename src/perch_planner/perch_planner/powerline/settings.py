@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from perch_core.config import choice, part, quantity, text
 from perch_core.errors import ConfigError
 
+DEADLINE_MAX = 10.0
+"""No plan may take longer, whatever a request asks for [s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PerchWeights:
@@ -92,7 +95,7 @@ class PowerlineSettings:
     bearing_max_deg: float = quantity(120.0, unit="deg", above=0.0, high=180.0,
                                       doc="a perch point farther from the camera's heading counts as behind the vehicle")
     gripper_error_max: float = quantity(0.05, unit="m", above=0.0, doc="a given perch pose must bring the gripper this near to the line")
-    deadline: float = quantity(2.0, unit="s", above=0.0, high=60.0, doc="wall-clock limit of a plan")
+    deadline: float = quantity(2.0, unit="s", above=0.0, high=DEADLINE_MAX, doc="wall-clock limit of a plan")
     camera: str = text("front", doc="camera that keeps the line in view")
 
     def __post_init__(self) -> None:

@@ -109,7 +109,7 @@ def best_start(request: PowerlineRequest, plan: Callable[[PowerlineRequest], Pow
 
     Args:
         request: the perch, from the present start.
-        plan: plans a request or raises PlanningRefusal (`PowerlinePlanner.plan`, `PowerlineWorker.plan`).
+        plan: plans a request or raises PlanningRefusal (`PowerlinePlanner.plan`).
         vehicle: body and cameras.
         model: constants of the vehicle.
         height_min: [m].

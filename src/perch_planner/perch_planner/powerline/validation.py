@@ -10,7 +10,7 @@ from perch_core import so3
 from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance, segment_distance
 from perch_core.rotor_model import P, Q, THRUST, V, W
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 
@@ -100,7 +100,11 @@ def _perch(request: PowerlineRequest, target: Segment, vehicle: Vehicle, setting
     if perch.p_WB[2] < settings.height_min:
         _refuse("infeasible", "height [P:eq14e]", perch.p_WB[2] - settings.height_min,
                 f"perch height {perch.p_WB[2]:.3f} m is below height_min {settings.height_min:g} m")
-    grip = perch.p_WB - vehicle.perch_offset * perch.s3_W
+    far, reach = float(np.linalg.norm(perch.p_WB - request.start[P])), _reach(request, vehicle, settings)
+    if far > reach:
+        _refuse("infeasible", "duration", reach - far,
+                f"the perch is {far:.1f} m away; in {settings.duration[1]:g} s no more than {reach:.1f} m can be flown; start nearer")
+    grip = perch.p_WB - vehicle.wire_offset * perch.s3_W
     miss = float(target.distance(grip))
     q_WB = _attitude(perch.s3_W)
     for line in request.lines:
@@ -111,6 +115,13 @@ def _perch(request: PowerlineRequest, target: Segment, vehicle: Vehicle, setting
     if miss > settings.gripper_error_max:
         _refuse("bad_input", "gripper", settings.gripper_error_max - miss,
                 f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {settings.gripper_error_max:g} m)")
+
+
+def _reach(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> float:
+    """Distance that nothing flies beyond in the longest duration: all thrust and gravity in one direction [m]."""
+    duration = settings.duration[1]
+    most = 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY
+    return float(np.linalg.norm(request.start[V])) * duration + 0.5 * most * duration**2
 
 
 def _attitude(s3_W: np.ndarray) -> np.ndarray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core.catenary import Catenary
-from perch_core.scenario import Cable, Scenario
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
 from perch_sim.rendering.scene import CableCurve, Scene
+from perch_sim.scenario import Cable, Scenario
 
 CABLE_COLOURS = {"red": (190.0, 35.0, 35.0), "grey": (88.0, 88.0, 92.0)}  # rgb under full light
 CABLE_SPACING = 0.25  # between the points of a cable's polyline [m]

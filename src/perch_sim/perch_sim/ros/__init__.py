@@ -1,1 +1,1 @@
-"""ROS code of the vehicle that is more than a node's thin shell: its publishers, and the lockstep among processes."""
+"""The lockstep over ROS: the vehicle's node, which owns the schedule, and the node of every participant."""

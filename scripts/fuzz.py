@@ -1,0 +1,48 @@
+#!/usr/bin/env python3
+"""Hunt for inputs that crash, hang, or are taken for sense though they make none. What is found is kept, and is a test from then on."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+from perch_setup import ROOT, enter, quiet_on_interrupt
+
+EXAMPLES = """examples:
+  python3 scripts/fuzz.py files                          a minute of mutated vehicles, scenarios, boards, campaigns, problems, parameter files
+  python3 scripts/fuzz.py files --minutes 20 --seed 7
+  python3 scripts/fuzz.py messages --minutes 20          values into every port of every component
+  python3 scripts/fuzz.py services --cases /tmp/found    requests to the planners, the mission, the controller
+
+exit code: 0 nothing found, 1 something found, 2 wrong arguments"""
+
+
+def main() -> int:
+    """Hunt inputs of one kind; the kinds are the modules of perch_eval.fuzz."""
+    kinds = sorted(path.stem for path in (ROOT / "src" / "perch_eval" / "perch_eval" / "fuzz").glob("*.py") if "\ndef run(" in path.read_text())
+    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=kinds, help="of inputs")
+    parser.add_argument("--minutes", type=float, default=1.0, help="of hunting (default: %(default)g)")
+    parser.add_argument("--seed", type=int, default=1, help="of the changes (default: %(default)s)")
+    parser.add_argument("--cases", type=Path, default=ROOT / "tests" / "fuzz" / "cases", metavar="DIR", help="where inputs that are found are kept (default: tests/fuzz/cases)")
+    arguments = parser.parse_args()
+    if not 0.0 < arguments.minutes <= 1e5:
+        parser.error(f"--minutes {arguments.minutes} is outside (0, 100000]")
+    enter()
+    with quiet_on_interrupt():
+        from perch_eval.fuzz.report import Report
+
+        hunt = importlib.import_module(f"perch_eval.fuzz.{arguments.kind}")
+    report = Report(arguments.kind, arguments.minutes, arguments.cases)
+    try:
+        hunt.run(arguments.minutes, arguments.seed, report)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+    print(f"{report.line().strip()}; {len(report.problems)} problems")
+    return 1 if report.problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

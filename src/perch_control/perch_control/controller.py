@@ -1,0 +1,275 @@
+"""The controller: odometry in, rotor speeds out, one command per sample; trajectories, commands, services."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from functools import lru_cache
+from math import isnan
+
+from perch_core.component import Component, Diagnostics, Input, Output, Service, Wake
+from perch_core.errors import ConfigError, PerchError
+from perch_core.values import (
+    NANOSECONDS, Ask, AtEnd, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample, LawChosen,
+    MotorCommand, OdometryState, PowerlineMap, TrajectoryOrder, nanoseconds, seconds)
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import load_vehicle
+from perch_control.assembly import Assembly, LawNotReady
+from perch_control.dry_run import dry_run
+from perch_control.modes import Command, State, StepResult
+from perch_control.parameters import ControllerParameters
+from perch_control.stamp_guard import Stamp, StampGuard
+
+STATUS_PERIOD = 20_000_000        # of controller/status [ns]
+DIAGNOSTICS_PERIOD = NANOSECONDS
+DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
+FRAMES = ("imu_link", "base_link", "")  # whose axes are those of B
+STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
+GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
+_ABSURD = 1e8                     # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
+_WORDS = 200                      # characters of a reason that are passed on
+
+
+class Controller(Component[ControllerParameters]):
+    """Answers every odometry sample with a motor command; what is not as planned leads to a hover, a recovery or a descent.
+
+    Silence: where odometry stops and the IMU goes on, IMU samples are answered by a descent without position; where both stop, the
+    watchdog goes on with it.
+
+    Attributes:
+        flight: the flight controller; a new one where time has begun anew.
+    """
+
+    config_type = ControllerParameters
+    changeable = tuple(field.name for field in fields(ControllerParameters) if field.name != "vehicle")
+
+    imu = Input(ImuSample, "imu/data_raw")
+    odometry = Input(OdometryState, "odometry")
+    trajectory = Input(TrajectoryOrder, "trajectory")
+    recovery = Input(TrajectoryOrder, "recovery")
+    command = Input(ControllerCommand, "controller/command")
+    powerlines = Input(PowerlineMap, "powerlines")
+    estimator = Input(EstimatorHealth, "estimator/status")
+    motor_command = Output(MotorCommand, "motor_command")
+    status = Output(ControllerStatus, "controller/status")
+    reference = Output(ControlReference, "controller/reference")
+    set_controller = Service(ChooseLaw, LawChosen, "set_controller")
+    abort = Service(Ask, Done, "abort")
+    watchdog = Wake(0.02)
+
+    def __init__(self, config: ControllerParameters) -> None:
+        """
+        Raises:
+            ConfigError: there is no such vehicle or law.
+        """
+        super().__init__(config)
+        self._assembly = Assembly(config, load_vehicle(config.vehicle))
+        self._stamps = StampGuard()
+        self._spoken: int | None = None   # the host's time at which an input was last known to have come [ns]
+        self._spoke, self._gone = False, False
+        self._begin()
+
+    def _begin(self) -> None:
+        """A flight, and what is counted in it."""
+        self.flight = self._assembly.flight
+        self._answered: int | None = None  # newest stamp when odometry was last answered [ns]
+        self._first: int | None = None     # stamp of the first answer [ns]
+        self._statuses = self._references = self._diagnoses = self._steps = 0
+        self._silent = False               # a silence is being answered
+
+    def warm_up(self) -> None:
+        """Load the compiled code, and build the laws that take long."""
+        _rehearse(self.config)
+        if self.config.controller.standby:
+            self._assembly.prepare_slow_laws(self.work, self.warn)
+
+    def reconfigure(self, config: ControllerParameters) -> None:
+        """New gains and limits count from the next step."""
+        if config.vehicle != self.config.vehicle:
+            raise ConfigError("", "vehicle", "is fixed after the start")
+        self._assembly.change(config)
+        self.config = config
+
+    # -- sensors -----------------------------------------------------------------------------------------------------
+
+    def on_imu(self, sample: ImuSample) -> None:
+        """Known to the flight; answered where odometry has stopped."""
+        if sample.frame not in FRAMES:
+            self.warn(f"imu/data_raw: frame {sample.frame!r} is none of imu_link, base_link: ignored", every=1.0)
+            return
+        (a, b, c), (x, y, z) = sample.w_B, sample.f_B
+        if not a * a + b * b + c * c + x * x + y * y + z * z < _ABSURD:
+            self.warn("imu/data_raw: not finite, or beyond any sensor's range: ignored", every=1.0)
+            return
+        if not self._believed(sample.stamp, "imu/data_raw"):
+            return
+        flight, stamp = self.flight, sample.stamp
+        flight.imu(seconds(stamp), sample.w_B, sample.f_B)
+        if self._answered is None or flight.state in (State.DISARMED, State.FAILED, State.ATTACHED):
+            return
+        if stamp > self._answered and (self._silent or stamp - self._answered >= nanoseconds(self.config.blind_after)):
+            self._answer_silence(stamp, "odometry has stopped: the IMU is answered")
+
+    def on_odometry(self, state: OdometryState) -> None:
+        """Answer with a motor command, whatever the sample is worth."""
+        if state.frame != "map":
+            self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", every=1.0)
+            return
+        if not self._believed(state.stamp, "odometry"):
+            return
+        self._answered, self._silent = self._stamps.newest, False
+        self._answer(state.stamp, self.flight.step(seconds(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B)))
+
+    def _believed(self, stamp: int, channel: str) -> bool:
+        """Whether a stamp is of the present; a time that has evidently begun anew is a new flight."""
+        flying = self.flight.maneuvers.flying
+        verdict = self._stamps.judge(stamp, may_restart=not flying or self._gone)
+        if verdict is Stamp.REFUSED:
+            newest = seconds(self._stamps.newest)
+            self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not of the present ({newest:.3f} s): ignored", every=1.0)
+            return False
+        if verdict is Stamp.ANEW:
+            self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s: starting anew, disarmed")
+            self._assembly.restart()
+            self._begin()
+        elif verdict is Stamp.AHEAD:
+            self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s")
+            self.flight.maneuvers.descend("time has jumped ahead")
+        self._spoke = True
+        return True
+
+    # -- silence -----------------------------------------------------------------------------------------------------
+
+    def on_watchdog(self, now: int) -> None:
+        """Where nothing comes any more in flight, go on with the descent without position."""
+        if self._spoke or self._spoken is None or now < self._spoken:
+            self._spoke, self._spoken, self._gone = False, now, False
+            return
+        silent = now - self._spoken
+        self._gone = silent >= GONE
+        if self.flight.maneuvers.flying and silent >= nanoseconds(self.config.blind_after):
+            self._answer_silence(self._stamps.newest + silent, "neither odometry nor IMU: descending by the clock")
+
+    def _answer_silence(self, stamp: int, why: str) -> None:
+        if not self._silent:
+            self._silent = True
+            self.warn(why)
+        self._answer(stamp, self.flight.step_blind(seconds(stamp)))
+
+    # -- orders ------------------------------------------------------------------------------------------------------
+
+    def on_trajectory(self, order: TrajectoryOrder) -> None:
+        """Fly it from its start on, or say why not."""
+        try:
+            self.flight.follow(self._assembly.order(order))
+        except PerchError as error:
+            self.flight.maneuvers.message = f"trajectory {order.id} refused: {error}"
+            self.warn(self.flight.maneuvers.message)
+
+    def on_recovery(self, order: TrajectoryOrder) -> None:
+        """Keep a way out of the trajectory with the same id."""
+        try:
+            if isinstance(order.trajectory, FlatTrajectory):
+                raise PerchError("a way out must carry states")
+            way_out = order._replace(at_end=AtEnd.HOLD, contact_time=0.0, recovery_start=0.0)
+            self.flight.keep_ready(self._assembly.order(way_out))
+        except PerchError as error:
+            self.warn(f"way out of trajectory {order.id} refused: {error}")
+
+    def on_command(self, command: ControllerCommand) -> None:
+        """Carry it out, or say why not. One that was given before this controller began, or long ago, is not meant for now."""
+        newest = self._stamps.newest
+        if newest is not None and 0 < command.stamp < newest - STALE:
+            self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
+            return
+        try:
+            self.flight.command(Command(command.command), command.reason[:_WORDS])
+        except ValueError as error:  # CommandRefused, or no such command
+            self.flight.maneuvers.message = str(error)
+            self.warn(f"command: {error}")
+
+    def on_powerlines(self, lines: PowerlineMap) -> None:
+        """Show the map to the laws that look at it."""
+        if not self.config.nmpc.lines.any:
+            return
+        try:
+            self._assembly.see([line.segment for line in lines.lines])
+        except PerchError as error:
+            self.warn(f"powerlines: {error}: ignored", every=1.0)
+
+    def on_estimator(self, health: EstimatorHealth) -> None:
+        """An estimator that is not well ends what is flown."""
+        newest = self._stamps.newest
+        if not 0 <= health.state <= 3 or isnan(health.vio_age) or (newest is not None and abs(newest - health.stamp) > STALE):
+            self.warn(f"estimator/status: state {health.state} at {seconds(health.stamp):.3f} s: ignored", every=1.0)
+            return
+        self.flight.supervisor.estimator(health.state, float(health.vio_age), health.message[:_WORDS])
+
+    # -- services ----------------------------------------------------------------------------------------------------
+
+    def on_set_controller(self, request: ChooseLaw, reply) -> None:
+        """Fly another law from the next step on."""
+        try:
+            self._assembly.choose(request.type, request.adaptive)
+        except LawNotReady as error:
+            reply(LawChosen(False, 2, str(error)))
+        except ConfigError as error:
+            reply(LawChosen(False, 1, str(error)))
+        else:
+            reply(LawChosen(True, 0, f"{self.flight.law_name} flies"))
+
+    def on_abort(self, request: Ask, reply) -> None:
+        """End in a hover."""
+        reply(Done(True, self.flight.abort()))
+
+    # -- outputs -----------------------------------------------------------------------------------------------------
+
+    def _answer(self, stamp: int, result: StepResult) -> None:
+        """The motor command first; what people and the mission want to know at its own times, on one grid from the first answer on."""
+        self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
+        self._steps += 1
+        if result.event:
+            self.info(result.event)
+        now = max(stamp, self._stamps.newest)  # stamps of odometry may stand still
+        if self._first is None:
+            self._first = now
+        since = now - self._first
+        if since >= self._statuses * STATUS_PERIOD:
+            self._statuses = since // STATUS_PERIOD + 1
+            self._emit_status(now)
+        period = nanoseconds(self.config.controller.reference_period)
+        if since >= self._references * period:
+            self._references = since // period + 1
+            if result.setpoint is not None and self.reference.wanted:
+                self._emit_reference(stamp, result)
+        if since >= self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE:
+            self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
+            self._diagnose(now)
+
+    def _emit_status(self, stamp: int) -> None:
+        flight, maneuvers = self.flight, self.flight.maneuvers
+        running = maneuvers.order
+        self.status(ControllerStatus(
+            stamp=stamp, state=int(flight.state), controller=flight.law_name, trajectory_id=maneuvers.trajectory_id,
+            trajectory_time=float(flight.trajectory_time), trajectory_duration=float(running.source.duration) if running else 0.0,
+            position_error=float(flight.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
+            thrust_margin=float(flight.margin), message=maneuvers.message))
+
+    def _emit_reference(self, stamp: int, result: StepResult) -> None:
+        x = result.setpoint
+        self.reference(ControlReference(
+            stamp, self.flight.maneuvers.trajectory_id, p=x.p, q=result.q_C, v=x.v, a=x.a, w=result.w_C, dw=result.dw_C,
+            thrust=float(result.wrench[0]), moment=tuple(result.wrench[1:4])))
+
+    def _diagnose(self, stamp: int) -> None:
+        flight = self.flight
+        values = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
+                  "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio}
+        level = 2 if flight.state is State.FAILED else 1 if flight.health.weak or flight.state in (State.RECOVERING, State.LANDING) else 0
+        self.diagnostics(Diagnostics(stamp, values, level, flight.maneuvers.message))
+
+
+@lru_cache(maxsize=4)
+def _rehearse(params: ControllerParameters) -> None:
+    """`dry_run`, once in a process: it loads what all controllers share."""
+    vehicle = load_vehicle(params.vehicle)
+    dry_run(vehicle, params.gain_set(vehicle.name), params.flight, params.l1)

@@ -1,0 +1,69 @@
+"""Off the surface or the wire that carries the vehicle, to a hover from which the next goal flies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from perch_core.trajectory import StateSample
+from perch_control.mission.machine import MissionMachine
+from perch_control.mission.moves import LEAD, Moves
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import (
+    Command, ControllerState, Inputs, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
+
+_THRUST = 0.5  # of each rotor, soon after its start [N]
+
+
+class Departure(MissionMachine):
+    """From a wire the planner's recovery [P:V-B], planned from the vehicle at rest; from a surface, or where there is no plan, the
+    controller's recovery along the surface's normal. Either starts the motors, which opens what holds the vehicle.
+    """
+
+    def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
+        super().__init__(settings, ids, moves)
+        self.phases = {Phase.ARMING: self._leaving, Phase.RECOVERING: self._recovering}
+
+    def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
+        """There is none."""
+
+    def _leaving(self, inputs: Inputs, outputs: Outputs) -> None:
+        if inputs.plan is not None:
+            self._fly(inputs, outputs, inputs.plan)
+        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING) and self._asked:
+            self._missed(inputs, "departing")
+        elif inputs.controller is ControllerState.TRACKING and self._asked:
+            pass
+        elif inputs.controller is not ControllerState.ATTACHED:
+            self._end(outputs, Result.REFUSED, f"not perched: the controller is {inputs.controller.name.lower()}")
+        elif self._elapsed(inputs) > self.settings.phase_timeout:
+            why = inputs.controller_message if inputs.estimator_ready else "the estimator is not ready"
+            self._end(outputs, Result.TIMEOUT, f"no departure within {self.settings.phase_timeout:g} s: {why}")
+        elif inputs.estimator_ready and not self._asked:
+            self._asked = True
+            if self._moves.wire is None:
+                outputs.commands.append((Command.ARM, "departing"))
+            else:
+                outputs.query = self._way_out(inputs)
+
+    def _way_out(self, inputs: Inputs) -> PlanQuery:
+        """From the vehicle as it hangs there."""
+        zero, x, latency = np.zeros(3), inputs.state, self.settings.powerline_latency
+        start = inputs.time + self.settings.lead(latency)
+        still = StateSample(p=x.p_WB, q=x.q_WB, v=zero, w=zero, a=zero, dw=zero, rotor_thrust=np.full(4, _THRUST))
+        return PlanQuery(start, x.p_WB, zero, zero, zero, 0.0, self._moves.wire, self._goal, latency, state=still, recovery=True)
+
+    def _fly(self, inputs: Inputs, outputs: Outputs, plan: PlanAnswer) -> None:
+        """A vehicle at rest may begin its plan at any time: at once."""
+        if not plan.success:
+            self.message = f"no plan to leave the wire: {plan.message}"
+            outputs.commands.append((Command.ARM, "departing"))
+            return
+        start = inputs.time + LEAD
+        outputs.perch = replace(plan, trajectory=replace(plan.trajectory, start_time=start), start_time=start)
+        outputs.trajectory_id = self._new_id()
+
+    def _recovered(self, inputs: Inputs, outputs: Outputs) -> None:
+        self._end(outputs, Result.PERCHED, "departed; hovering")

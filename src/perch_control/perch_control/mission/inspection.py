@@ -1,0 +1,48 @@
+"""An inspection of a powerline along the mission's waypoints; the controller's line terms keep the line in view. [P:VI-A]"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from perch_core.values import PerchGoal
+from perch_control.mission.moves import LEAD, Moves
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Result, Target
+from perch_control.mission.waypoints import waypoint_lines
+from perch_control.mission.wire import LineMission
+
+
+class InspectionMission(LineMission):
+    """See the line, fly the waypoints, end in a hover."""
+
+    def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
+        super().__init__(settings, ids, moves)
+        self.phases[Phase.INSPECTING] = self._inspecting
+        self._inspected = 0.0  # when the last waypoint is due [s]
+
+    @classmethod
+    def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
+        """Waypoints are needed as well."""
+        if len(settings.places) < 2:
+            return f"inspection: the parameter mission.waypoints holds {len(settings.places)} waypoints, needs at least 2"
+        return super().problem(goal, settings)
+
+    def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
+        """From the present hover along the waypoints; the controller's line terms keep the line in view and all lines away."""
+        places = [self._moves.hover, *self.settings.places]
+        outputs.reference = waypoint_lines(places, self.settings.inspection_speed, inputs.time + LEAD)
+        outputs.trajectory_id = self._flown_id = self._new_id()
+        self._inspected = inputs.time + LEAD + outputs.reference.duration
+        self._enter(Phase.INSPECTING, inputs.time, f"inspecting, {outputs.reference.duration:.1f} s")
+
+    def _inspecting(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._lost(inputs, outputs):
+            return
+        if inputs.trajectory_id == self._flown_id and inputs.controller is ControllerState.HOVERING:
+            if inputs.time < self._inspected:
+                self._missed(inputs, f"inspection given up: {inputs.controller_message}")
+            else:
+                self._end(outputs, Result.PERCHED, f"inspected along {len(self.settings.places)} waypoints")
+        elif inputs.time > self._inspected + self.settings.arming_timeout:
+            outputs.commands.append((Command.HOVER, "the inspection does not end"))
+            self._missed(inputs, f"the inspection does not end: {inputs.controller_message}")

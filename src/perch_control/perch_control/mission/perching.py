@@ -1,0 +1,120 @@
+"""A perch: plan, fly, verify, and rest with the motors off. [M:II, Fig. 2]"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+
+import numpy as np
+
+from perch_control.mission.machine import MissionMachine
+from perch_control.mission.moves import Moves
+from perch_control.mission.running_perch import RunningPerch
+from perch_control.mission.running_plan import RunningPlan
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target
+
+
+class PerchingMission(MissionMachine):
+    """What perches on surfaces and on wires share."""
+
+    def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
+        super().__init__(settings, ids, moves)
+        self._running: RunningPerch | RunningPlan | None = None
+        self.phases |= {Phase.PLANNING: self._planning, Phase.TRACKING: self._tracking, Phase.VERIFYING: self._verifying,
+                        Phase.PERCHED: self._perched}
+
+    # -- what a kind says --------------------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def latency(self) -> float:
+        """From the request of a plan from a hover to its use [s]."""
+
+    @abstractmethod
+    def running(self, plan: PlanAnswer, target: Target) -> RunningPerch | RunningPlan:
+        """A plan in flight."""
+
+    @abstractmethod
+    def better(self, inputs: Inputs, outputs: Outputs) -> None:
+        """On the way: follow the target as it is seen better, and ask for what may be needed."""
+
+    def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
+        """Near the contact: whether it is still awaited."""
+        return inputs.time <= self._running.end + self.settings.contact_time + 0.2
+
+    def not_held(self, outputs: Outputs) -> None:
+        """No contact was felt: what is done about it."""
+
+    def holds(self, inputs: Inputs) -> bool:
+        """A contact came late, or an abort did: what was given up holds the vehicle all the same."""
+        return (self._running is not None and -self.settings.contact_early < inputs.time - self._running.end < 1.0
+                and self._adhesion.tells(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
+
+    # -- phases ------------------------------------------------------------------------------------------------------
+
+    def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
+        """Ask for a plan from the hover."""
+        self._target = target
+        zero = np.zeros(3)
+        p, yaw = self._moves.hover
+        start = inputs.time + self.settings.lead(self.latency)
+        outputs.query = PlanQuery(start, p, zero, zero, zero, yaw, target, self._goal, self.latency)
+        self._enter(Phase.PLANNING, inputs.time, "planning")
+
+    def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._lost(inputs, outputs):
+            return
+        if inputs.plan is None:
+            if self._elapsed(inputs) > self.settings.phase_timeout:
+                self._end(outputs, Result.TIMEOUT, f"the planner has not answered within {self.settings.phase_timeout:g} s; hovering")
+            return
+        if not inputs.plan.success:
+            self._end(outputs, Result.REFUSED, f"planner refused: {inputs.plan.message}")
+            return
+        self._fly(self.running(inputs.plan, self._target), outputs)
+        self._enter(Phase.TRACKING, inputs.time, f"perching, {inputs.plan.duration:.2f} s")
+
+    def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
+        end = self._running.end
+        self.time_to_contact = end - inputs.time
+        if inputs.trajectory_id == self._flown_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
+            self._missed(inputs, f"perch given up: {inputs.controller_message}")
+            return
+        self.better(inputs, outputs)
+        if inputs.time > end - self.settings.contact_early:
+            self._adhesion.reset()
+            self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
+
+    def _verifying(self, inputs: Inputs, outputs: Outputs) -> None:
+        self.time_to_contact = self._running.end - inputs.time
+        if self._adhesion.attached(inputs.state, self._running.target):
+            self._contact_time = inputs.time
+            self._adhesion.reset()
+            outputs.commands.append((Command.ATTACHED, "the surface carries the vehicle"))
+            self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
+        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
+            self._missed(inputs, f"no adhesion: {inputs.controller_message}")
+        elif not self.waiting(inputs, outputs):
+            self.not_held(outputs)
+            self._missed(inputs, "no adhesion")
+
+    def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
+        if self._adhesion.free_fall():
+            outputs.commands.append((Command.ARM, "came off the surface"))
+            outputs.commands.append((Command.HOVER, "came off the surface"))
+            self._missed(inputs, "came off the surface after the motors stopped")
+        elif self._elapsed(inputs) > self.settings.rest_time:
+            result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
+            self._moves.wire = self._running.target if self._running.target.lines else None
+            self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
+
+    # -- plans in flight ---------------------------------------------------------------------------------------------
+
+    def _fly(self, running: RunningPerch | RunningPlan, outputs: Outputs) -> None:
+        self._running, self._flown_id = running, self._new_id()
+        outputs.perch, outputs.trajectory_id = running.plan, self._flown_id
+
+    def _fly_better(self, better: RunningPerch | RunningPlan, outputs: Outputs) -> None:
+        self._fly(better, outputs)
+        self.message = f"re-planned, {better.plan.duration:.2f} s"

@@ -1,0 +1,86 @@
+"""A perch on a mapped powerline, upside down or not. [P]"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perch_core.values import PerchGoal, PowerlineMap
+from perch_control.mission.line_target import mapped_target
+from perch_control.mission.machine import MissionMachine
+from perch_control.mission.moves import Look
+from perch_control.mission.perching import PerchingMission
+from perch_control.mission.running_plan import RunningPlan
+from perch_control.mission.settings import MissionSettings
+from perch_control.mission.values import Inputs, Outputs, PlanAnswer, Target
+
+
+class LineMission(MissionMachine):
+    """What is done at a mapped powerline: the lines are looked at from several places first."""
+
+    unseen = "no lines mapped"
+
+    @classmethod
+    def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
+        """A point and a tilt are needed."""
+        if not np.isfinite(goal.perch_point).all():
+            return "perch_point is not finite"
+        if not 0.0 <= goal.perch_pitch <= math.pi + 1e-6:
+            return f"perch_pitch {goal.perch_pitch:g} rad is outside [0, pi]"
+        return ""
+
+    def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
+        """The place on the mapped line that the goal means."""
+        return None if lines is None else mapped_target(lines, self._goal, p_WB)
+
+    def pattern(self) -> list[Look]:
+        """Lines have to be seen from different places: up and down, nearer (the error of a distance grows with its square), and back."""
+        reach, near = self.settings.mapping_reach, self.settings.mapping_approach
+        return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
+
+
+class PowerlineMission(LineMission, PerchingMission):
+    """Map the lines, plan a perch with its recovery, fly it with ways out kept ready."""
+
+    @property
+    def legs(self) -> int:
+        """The first moves of the pattern are flown before any plan."""
+        return self.settings.mapping_legs
+
+    def reach(self, offset: np.ndarray, p: np.ndarray, target: Target | None) -> np.ndarray:
+        """Towards the lines no nearer to the target than `mapping_standoff`."""
+        if not offset[0] > 0.0:
+            return offset
+        room = 0.0 if target is None else float(np.linalg.norm(target.p_WS - p)) - self.settings.mapping_standoff
+        return np.array([min(offset[0], max(room, 0.0)), *offset[1:]])
+
+    @property
+    def latency(self) -> float:
+        """Of a plan from a hover [s]."""
+        return self.settings.powerline_latency
+
+    def running(self, plan: PlanAnswer, target: Target) -> RunningPlan:
+        """A plan in flight."""
+        return RunningPlan(plan, target, self.settings)
+
+    def better(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Follow the map as it gets better, and keep a way out ready."""
+        if inputs.plan is not None:
+            outputs.way_out, better = self._running.answered(inputs.plan, inputs.time)
+            outputs.trajectory_id = self._flown_id
+            if better is not None:
+                self._fly_better(better, outputs)
+        target = self._usable_now(inputs)
+        moved = self._running.moved(inputs.time, target, self._goal)
+        if moved is not None and outputs.perch is None and outputs.way_out is None:
+            self._running = moved
+            outputs.perch, outputs.trajectory_id = moved.plan, self._flown_id
+        outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
+
+    def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
+        """The plan goes on into its recovery by itself; until then ways out are still asked for."""
+        if inputs.time <= self._running.end + self.settings.contact_time:
+            self.better(inputs, outputs)
+            return True
+        return super().waiting(inputs, outputs)

@@ -1,0 +1,36 @@
+"""The period of a stream, measured from its stamps."""
+
+from __future__ import annotations
+
+NOMINAL_PERIOD = 0.002  # of odometry and IMU, until they show another [s]
+_SAMPLES = 25           # differences of which the median is taken
+_SAME = 0.1             # a median that differs by less is the same period
+_SHORTEST, _LONGEST = 0.0005, 0.05
+
+
+class MeasuredPeriod:
+    """Period of a stream of samples: the nominal one until the median of 25 differences is another by a tenth.
+
+    Attributes:
+        value: [s].
+    """
+
+    def __init__(self, nominal: float = NOMINAL_PERIOD) -> None:
+        self.value = nominal
+        self._last: float | None = None
+        self._differences: list[float] = []
+
+    def update(self, time: float) -> bool:
+        """Take the stamp of a sample [s]; returns whether `value` has changed."""
+        last, self._last = self._last, time
+        if last is None or time <= last:
+            return False
+        self._differences.append(time - last)
+        if len(self._differences) < _SAMPLES:
+            return False
+        median = sorted(self._differences)[_SAMPLES // 2]
+        self._differences.clear()
+        if abs(median - self.value) <= _SAME * self.value or not _SHORTEST <= median <= _LONGEST:
+            return False
+        self.value = median
+        return True

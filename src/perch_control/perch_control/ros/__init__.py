@@ -1,1 +1,0 @@
-"""ROS parts that more than one file of the nodes needs."""

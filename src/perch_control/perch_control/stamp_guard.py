@@ -1,0 +1,50 @@
+"""Which stamps belong to the present: those of IMU and odometry together, so that one wrong sender cannot move the time."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+_JUMP = 1_000_000_000    # further away from the newest stamp than this, a stamp is not of the present [ns] ...
+_CONFIRM = 50_000_000    # ... unless nothing but such stamps has come for so long by themselves [ns]
+
+
+class Stamp(Enum):
+    """Verdict on a stamp."""
+
+    PRESENT = "of the present"
+    REFUSED = "not of the present"
+    AHEAD = "time has jumped ahead"
+    ANEW = "time has begun anew"
+
+
+class StampGuard:
+    """Owns the newest stamp of several streams of the same clock.
+
+    Attributes:
+        newest: the newest stamp that was believed [ns]; None: none yet.
+    """
+
+    def __init__(self) -> None:
+        self.newest: int | None = None
+        self._first = self._last = -1  # of stamps that are away from the newest, with nothing else between them
+
+    def judge(self, stamp: int, may_restart: bool = True) -> Stamp:
+        """Take a stamp [ns], of any of the streams.
+
+        Args:
+            stamp: in the order of arrival; a little older than the newest is of the present, too.
+            may_restart: time may begin anew; otherwise stamps of the past are refused however many there are.
+        """
+        newest = self.newest
+        if newest is None or -_JUMP <= stamp - newest <= _JUMP:
+            self._first = -1
+            if newest is None or stamp > newest:
+                self.newest = stamp
+            return Stamp.PRESENT
+        if self._first < 0 or not 0 <= stamp - self._last <= _JUMP:
+            self._first = stamp
+        self._last = stamp
+        if stamp - self._first < _CONFIRM or (stamp < newest and not may_restart):
+            return Stamp.REFUSED
+        self.newest, self._first = stamp, -1
+        return Stamp.AHEAD if stamp > newest else Stamp.ANEW

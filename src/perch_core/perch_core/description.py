@@ -1,0 +1,89 @@
+"""What the vehicle looks like and where its frames are: `robot_description`, `/tf_static` and `/tf`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+from perch_core.component import Component, Input, Output, Wake
+from perch_core.config import quantity, text
+from perch_core.urdf import BASE, fixed_frames, urdf
+from perch_core.values import NANOSECONDS, OdometryState, StampedTransform, TargetPose, Transform
+from perch_core.vehicle import load_vehicle
+
+MAP, ODOM, TARGET = "map", "odom", "perch_target"
+_ORIGIN, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescriptionParameters:
+    """Parameters of the node `description`."""
+
+    vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
+    rate: float = quantity(50.0, unit="Hz", above=0.0, high=500.0, doc="transforms of base_link per second of the odometry's stamps")
+
+
+class Description(Component[DescriptionParameters]):
+    """Tells the vehicle's shape and fixed frames once, and where it and its target are as they are estimated.
+
+    `map` and `odom` coincide: the estimate in `odometry` is of one frame, which nothing corrects afterwards.
+    """
+
+    config_type = DescriptionParameters
+
+    odometry = Input(OdometryState, "odometry", lazy=True)
+    target = Input(TargetPose, "target/pose", lazy=True)
+    start = Wake(0.1)
+    robot_description = Output(str, "robot_description")
+    static = Output(Transform, "/tf_static")
+    frames = Output(StampedTransform, "/tf")
+
+    def __init__(self, config: DescriptionParameters) -> None:
+        super().__init__(config)
+        self._vehicle = load_vehicle(config.vehicle)
+        self._period = round(NANOSECONDS / config.rate)
+        self._next = -1
+        self._target: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+        self._told = False
+
+    def on_start(self, now: int) -> None:
+        """Tell once what does not change, as soon as there is somebody to tell it to."""
+        if self._told:
+            return
+        self._told = True
+        self.robot_description(urdf(self._vehicle))
+        self.static(Transform(MAP, ODOM, _ORIGIN, _UPRIGHT))
+        for frame in fixed_frames(self._vehicle):
+            self.static(frame)
+
+    def on_odometry(self, state: OdometryState) -> None:
+        """The body in `odom`, at most so often."""
+        if self._next - self._period <= state.stamp < self._next:
+            return
+        if state.frame not in (MAP, ODOM):
+            self.warn(f"odometry in frame {state.frame!r} is not used: neither {MAP} nor {ODOM}", every=1.0)
+            return
+        q = _unit(state.q_WB)
+        if q is None or not all(map(isfinite, state.p_WB)):
+            self.warn("odometry without a pose (not finite, or a quaternion of another norm than 1) is not used", every=1.0)
+            return
+        late = self._next >= 0 and state.stamp < self._next + self._period
+        self._next = (self._next if late else state.stamp) + self._period
+        self.frames(StampedTransform(state.stamp, ODOM, BASE, tuple(state.p_WB), q))
+
+    def on_target(self, pose: TargetPose) -> None:
+        """The target, whenever it is believed to be elsewhere."""
+        p, q = tuple(map(float, pose.p_WS)), _unit(tuple(map(float, pose.q_WS)))
+        if q is None or not all(map(isfinite, p)):
+            self.warn("target/pose without a pose (not finite, or a quaternion of another norm than 1) is not used", every=1.0)
+            return
+        if (p, q) != self._target:
+            self._target = p, q
+            self.frames(StampedTransform(pose.stamp, MAP, TARGET, p, q))
+
+
+def _unit(q: Sequence[float]) -> tuple[float, ...] | None:
+    """A quaternion whose norm is 1 but for rounding, or None."""
+    squares = sum(x * x for x in q)
+    return tuple(q) if abs(squares - 1.0) < 2e-3 else None

@@ -1,0 +1,7 @@
+"""Node `description`: `ros2 run perch_core description`."""
+
+from perch_core.description import Description
+from perch_core.ros.node import node
+
+NODE = node("description", Description)
+create, main = NODE.create, NODE.main

@@ -1,0 +1,290 @@
+"""Jobs in a process that can be killed: one that hangs costs its limit, never the process that asked. No ROS.
+
+This is the caller's side; `isolated_process` is the other one: a supervisor that has loaded everything, and its child that works.
+The child stays from job to job; after one that was stopped or crashed, the supervisor forks the next from its own memory.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field
+from math import inf
+from multiprocessing.connection import Connection, Pipe, wait
+from typing import Any
+
+from perch_core.component import Job, JobFailed, JobStopped
+
+MEMORY = 4 << 30
+"""Address space of a job's process [byte]; with numpy, CasADi and compiled kernels 0.4 GiB of it are used before any work."""
+START_TIMEOUT = 120.0
+"""[s]; a first start on a machine compiles."""
+COMMAND = (sys.executable, "-m", "perch_core.isolated_process")
+WAITING_MAX = 64
+"""Jobs that wait; more are refused."""
+_GRACE = 1.0  # [s] past a job's limit, within which the supervisor must have stopped it
+_HEADER = struct.Struct("<d")  # of a job on the pipe: its limit [s]; what follows is pickled (function, arguments)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What the supervisor is sent first; `path` is the caller's `sys.path`."""
+
+    path: tuple[str, ...]
+    memory: int
+
+
+@dataclass
+class _Task:
+    """A job under way: what is sent, when it must have ended on the monotonic clock [s], and what the caller holds."""
+
+    name: str
+    payload: bytes
+    limit: float
+    end: float
+    future: Future[Any] = field(default_factory=Future)
+
+
+class IsolatedRunner:
+    """Runs jobs one after the other in another process, each within its limit.
+
+    Building one returns at once; a limit counts from `submit`, so that jobs which come before `wait_ready` are likely to be stopped.
+    `close` ends all processes, and so does the end of the caller. Ctrl-C in the caller's terminal does not reach them.
+    """
+
+    def __init__(self, preload: Callable[[], Any] | None = None, memory: int = MEMORY, command: tuple[str, ...] = COMMAND) -> None:
+        """
+        Args:
+            preload: of a module, picklable; called once in the supervisor, so that every child has what it loads.
+            memory: address space of a job's process [byte].
+            command: starts the supervisor; the number of its end of the pipe and this process's id are appended.
+        """
+        self._preload = pickle.dumps(preload)
+        self._setup = Setup(tuple(sys.path), memory)
+        self._command = command
+        self._tasks: deque[_Task] = deque()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pipe: Connection | None = None
+        self._lock = threading.Lock()  # around `_closing` and `_process`
+        self._closing = False
+        self._started, self._ready, self._problem = threading.Event(), False, ""
+        self._wake, self._woken = socket.socketpair()
+        self._wake.setblocking(False)
+        # The supervisor ends with the thread that starts it, which is this one.
+        self._thread = threading.Thread(target=self._serve, name="isolated jobs", daemon=True)
+        self._thread.start()
+
+    def wait_ready(self, timeout: float = START_TIMEOUT) -> bool:
+        """Wait until the supervisor has loaded everything.
+
+        Raises:
+            JobFailed: it could not; the message says why.
+        """
+        if not self._started.wait(timeout):
+            return False
+        if self._problem:
+            raise JobFailed(self._problem)
+        return self._ready
+
+    @property
+    def pid(self) -> int:
+        """Process id of the supervisor, which leads a process group of its own; 0: there is none."""
+        process = self._process
+        return 0 if process is None else process.pid
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Have a job done; returns at once.
+
+        Args:
+            job: its `then` is the host's matter.
+
+        Returns:
+            Completed by another thread, with what the function returned or the error that ended it: its own, if it is a
+            `PerchError`, `JobStopped` or `JobFailed`.
+        """
+        now = time.monotonic()
+        limit = inf if job.limit is None else float(job.limit)
+        name = getattr(job.function, "__qualname__", type(job.function).__name__)
+        try:
+            task = _Task(name, pickle.dumps((job.function, job.arguments)), limit, now + limit)
+        except Exception as error:  # what pickle raises depends on what it is given
+            failed: Future[Any] = Future()
+            failed.set_exception(JobFailed(f"{name}: cannot be sent to another process: {error}"))
+            return failed
+        with self._lock:
+            if self._closing or len(self._tasks) >= WAITING_MAX:
+                why = "the runner is closed" if self._closing else f"{WAITING_MAX} others are waiting"
+                task.future.set_exception(JobFailed(f"{name}: {why}"))
+                return task.future
+            self._tasks.append(task)
+            self._call()
+        return task.future
+
+    def close(self) -> None:
+        """End the processes, in the middle of a job, too; jobs that have not ended fail."""
+        with self._lock:
+            if not self._closing:
+                self._closing = True
+                self._call()
+                self._kill()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout=5.0)
+
+    def _call(self) -> None:
+        """Have the runner's thread look for what there is to do."""
+        with suppress(BlockingIOError):  # it has been called often enough
+            self._wake.send(b".")
+
+    # -- the runner's thread -------------------------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        self._start()
+        while not self._closing:
+            if self._ready and self._tasks:
+                self._do(self._tasks.popleft())
+                continue
+            soonest = min((task.end for task in self._waiting()), default=inf)
+            pipes = [self._woken] if self._pipe is None else [self._woken, self._pipe]
+            heard = wait(pipes, None if soonest == inf else max(0.0, soonest - time.monotonic()))
+            if self._woken in heard:
+                self._woken.recv(4096)
+            if self._pipe in heard:
+                self._hear()
+            if self._pipe is None and self._tasks and not self._closing:
+                self._start()  # the last start failed: once more for this job
+            for task in [task for task in self._waiting() if task.end <= time.monotonic()]:
+                with self._lock:
+                    self._tasks.remove(task)
+                _fail(task, self._late(task))
+        self._end()
+        for task in self._tasks:
+            _fail(task, JobFailed(f"{task.name}: the runner was closed"))
+        for end in (self._wake, self._woken):
+            end.close()
+
+    def _waiting(self) -> list[_Task]:
+        """The jobs that wait; others may come meanwhile."""
+        with self._lock:
+            return list(self._tasks)
+
+    def _start(self) -> None:
+        """Start a supervisor, and send it what it needs."""
+        mine, theirs = Pipe()
+        self._ready, self._problem = False, ""
+        self._started.clear()
+        with self._lock:
+            if self._closing:
+                return
+            command = [*self._command, str(theirs.fileno()), str(os.getpid())]
+            # BLAS on one thread: so do all nodes, and a process with threads cannot be forked.
+            environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), process_group=0, env=environment)
+        theirs.close()
+        self._pipe = mine
+        with suppress(OSError):  # it ended already: `_hear` finds out
+            mine.send(self._setup)
+            mine.send_bytes(self._preload)
+
+    def _hear(self) -> None:
+        """The supervisor says that it is ready, or why not; or it has ended: another is started, if this one was of use."""
+        try:
+            answer = self._pipe.recv_bytes().decode()
+        except (EOFError, OSError):
+            answer, worked = "it ended", self._ready
+            self._end()
+            if worked:
+                self._start()
+                return
+        if answer == "ready":
+            self._ready = True
+        else:
+            self._problem = f"the process for isolated jobs did not start: {answer}"
+            self._end()
+            while self._tasks:
+                _fail(self._tasks.popleft(), JobFailed(self._problem))
+        self._started.set()
+
+    def _do(self, task: _Task) -> None:
+        """Have one job done, and complete its future."""
+        left = task.end - time.monotonic()
+        if left <= 0.0:
+            _fail(task, self._late(task))
+            return
+        if not task.future.running() and not task.future.set_running_or_notify_cancel():
+            return
+        try:
+            self._pipe.send_bytes(_HEADER.pack(left) + task.payload)
+            if not self._pipe.poll(None if left == inf else left + _GRACE):
+                raise TimeoutError
+            kind, answer = _opened(self._pipe.recv_bytes())
+        except TimeoutError:
+            self._restart()
+            kind, answer = b"T", "its process did not answer"
+        except EOFError:
+            self._restart()
+            kind, answer = b"F", "its process ended"
+        except OSError:  # the supervisor ended before it took the job
+            self._restart()
+            self._tasks.appendleft(task)
+            return
+        if kind == b"A":
+            task.future.set_result(answer)
+        elif kind == b"E":
+            task.future.set_exception(answer)
+        elif kind == b"T":
+            task.future.set_exception(JobStopped(f"{task.name}: stopped after {task.limit:g} s"))
+        else:
+            task.future.set_exception(JobFailed(f"{task.name}: {answer}"))
+
+    def _late(self, task: _Task) -> JobStopped:
+        waited = "other jobs were being done" if self._ready else "the process for it was not ready"
+        return JobStopped(f"{task.name}: not begun within {task.limit:g} s: {waited}")
+
+    def _restart(self) -> None:
+        self._end()
+        if not self._closing:
+            self._start()
+
+    def _kill(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)  # its own group: supervisor, child and what they started
+
+    def _end(self) -> None:
+        """End the supervisor and what it started."""
+        with self._lock:
+            self._ready = False
+            if self._process is not None:
+                if self._process.poll() is None:
+                    self._kill()
+                self._process.wait()
+        if self._pipe is not None:
+            self._pipe.close()
+            self._pipe = None
+
+
+def _opened(answer: bytes) -> tuple[bytes, Any]:
+    """Kind and content of an answer: A what was returned, E what was raised, T stopped, F failed, in words."""
+    kind, content = answer[:1], answer[1:]
+    if kind in (b"T", b"F"):
+        return kind, content.decode()
+    try:
+        return kind, pickle.loads(content)
+    except Exception as error:  # what pickle raises depends on what it is given
+        return b"F", f"its answer cannot be read: {error}"
+
+
+def _fail(task: _Task, error: Exception) -> None:
+    if task.future.running() or task.future.set_running_or_notify_cancel():
+        task.future.set_exception(error)

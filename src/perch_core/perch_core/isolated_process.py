@@ -1,0 +1,153 @@
+"""The process of isolated jobs: a supervisor that keeps everything loaded, and a child that works and may be killed.
+
+When the child does not answer in time, the supervisor kills it and forks the next from its own memory, which takes
+milliseconds where a new Python with its libraries takes seconds. Run by `isolated.IsolatedRunner`, never by hand.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import pickle
+import resource
+import select
+import signal
+import sys
+from multiprocessing.connection import Connection, Pipe
+
+from perch_core.errors import PerchError
+from perch_core.isolated import _HEADER, Setup
+from perch_core.processes import end_with_parent
+
+OUT_OF_MEMORY = 42
+"""Exit status of a child that ran out of memory so far that it could not say so."""
+
+
+def _answer(payload: bytes, memory: int) -> bytes:
+    """Do a job; its answer as `isolated._opened` takes it."""
+    try:
+        function, arguments = pickle.loads(payload)
+        result = function(*arguments)
+    except PerchError as error:
+        return b"E" + pickle.dumps(error)
+    except MemoryError:
+        return b"F" + _too_much(memory).encode()
+    except (Exception, SystemExit) as error:  # the caller must get an answer whatever happens here
+        return b"F" + f"{type(error).__name__}: {error}".encode(errors="replace")
+    try:
+        return b"A" + pickle.dumps(result)
+    except MemoryError:
+        return b"F" + _too_much(memory).encode()
+    except Exception as error:  # what pickle raises depends on what it is given
+        return b"F" + f"what it returned cannot be sent: {error}".encode(errors="replace")
+
+
+def _too_much(memory: int) -> str:
+    return f"out of memory: the limit of its process is {memory / 2**30:.3g} GiB"
+
+
+def _child(pipe: Connection, supervisor: int, memory: int) -> None:
+    """Do jobs until the pipe closes."""
+    end_with_parent(signal.SIGKILL)
+    if os.getppid() != supervisor:
+        os._exit(0)
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    while True:
+        try:
+            pipe.send_bytes(_answer(pipe.recv_bytes(), memory))
+        except (EOFError, OSError):
+            os._exit(0)
+        except MemoryError:
+            os._exit(OUT_OF_MEMORY)
+
+
+def _fork(upstream: Connection, memory: int) -> tuple[int, Connection]:
+    mine, theirs = Pipe()
+    supervisor, pid = os.getpid(), os.fork()
+    if pid == 0:
+        mine.close(), upstream.close()
+        _child(theirs, supervisor, memory)
+    theirs.close()
+    return pid, mine
+
+
+def _ended(status: int, memory: int) -> str:
+    """Why a child has ended, in words."""
+    if os.WIFSIGNALED(status):
+        name = signal.Signals(os.WTERMSIG(status)).name
+        return f"its process crashed ({name}); the limit of its memory is {memory / 2**30:.3g} GiB"
+    if os.WEXITSTATUS(status) == OUT_OF_MEMORY:
+        return _too_much(memory)
+    return f"its process ended itself (exit status {os.WEXITSTATUS(status)})"
+
+
+def supervise(upstream: Connection) -> None:
+    """Have the jobs that come down a pipe done until it closes: `Setup`, then the preload, then jobs."""
+    setup: Setup = upstream.recv()
+    sys.path[:] = setup.path
+    try:
+        preload = pickle.loads(upstream.recv_bytes())
+        if preload is not None:
+            preload()
+    except Exception as error:  # reported to the caller, who raises it
+        upstream.send_bytes(f"{type(error).__name__}: {error}".encode())
+        return
+    gc.collect()
+    gc.freeze()  # what is loaded stays shared with the children
+    pid, child = _fork(upstream, setup.memory)
+    upstream.send_bytes(b"ready")
+    while True:
+        try:
+            job = upstream.recv_bytes()
+        except EOFError:
+            os.kill(pid, signal.SIGKILL)
+            return
+        answer = None
+        while answer is None:
+            answer, ended = _do(job, child, upstream, pid, setup.memory)
+            if ended:
+                child.close()
+                if upstream.closed:
+                    return
+                pid, child = _fork(upstream, setup.memory)
+        upstream.send_bytes(answer)
+
+
+def _do(job: bytes, child: Connection, upstream: Connection, pid: int, memory: int) -> tuple[bytes | None, bool]:
+    """Have a child do a job.
+
+    Returns:
+        Its answer, None where the child ended before it took the job; and whether it has ended. Where the caller has gone
+        away, `upstream` is closed.
+    """
+    limit, = _HEADER.unpack_from(job)
+    try:
+        child.send_bytes(job[_HEADER.size:])
+        ready, _, _ = select.select([child, upstream], [], [], None if limit == math.inf else limit)
+        if child in ready:
+            return child.recv_bytes(), False
+    except EOFError:
+        return b"F" + _ended(os.waitpid(pid, 0)[1], memory).encode(), True
+    except OSError:  # it was ended from outside between two jobs
+        os.waitpid(pid, 0)
+        return None, True
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    if upstream in ready:
+        upstream.close()
+    return b"T", True
+
+
+def main() -> None:
+    """Serve the pipe whose number is the last but one argument of the command line; the last is the caller's process id."""
+    end_with_parent(signal.SIGKILL)
+    if os.getppid() != int(sys.argv[-1]):
+        return
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
+    supervise(Connection(int(sys.argv[-2])))
+
+
+if __name__ == "__main__":
+    main()

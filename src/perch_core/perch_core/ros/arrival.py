@@ -1,0 +1,93 @@
+"""The arrival host: a message comes in, the component works, its outputs are published. What `ros2 run` starts, and what flies.
+
+It needs nothing but the topics: no simulator, no fixed rate, any clock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from perch_core.component import Client, Component, Input, Service, Wake, ports
+from perch_core.ros.component_node import ComponentNode
+from perch_core.ros.deadlines import Deadlines
+from perch_core.ros.intake import Intake
+from perch_core.ros.priority import priority
+from perch_core.ros.wiring import Wiring, foreign_writers
+from rclpy.clock import Clock, ClockType
+
+LOOK = 1.0  # between two looks for writers that are not heard [s]
+
+
+class ArrivalNode(ComponentNode):
+    """One component, fed by its topics as they arrive."""
+
+    def __init__(self, name: str, component: type[Component], wiring: Wiring, deadline: str = "", **kwargs: Any) -> None:
+        """
+        Args:
+            name, component, wiring, kwargs: as in `ComponentNode`.
+            deadline: output that answers an input of the same stamp within a period: late answers are counted.
+        """
+        super().__init__(name, component, wiring, **kwargs)
+        self._intake = Intake(self)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._deadlines: Deadlines | None = None
+        if deadline:
+            self._deadlines = Deadlines()
+            getattr(self.component, deadline).receivers.append(lambda value: self._deadlines.answered(value.stamp, time.monotonic_ns()))
+
+    def connect(self) -> None:
+        """Take the inputs, offer the services. All nodes of the process are there by now."""
+        for port in ports(type(self.component), Input):
+            self._intake.add(port)
+        for port in ports(type(self.component), Wake):
+            self._wake(port)
+        self.connect_clients(self._deliver_answer)
+        self.serve()
+        if self._intake.private:
+            self.create_timer(LOOK, self._look_for_strangers, clock=self._steady)
+
+    def _wake(self, port: Wake) -> None:
+        handler = partial(self.guarded, port.name, port.handler(self.component))
+
+        def wake() -> None:
+            self.wiring.enter(self._intake.take_lazy)
+            self.wiring.enter(handler, self.get_clock().now().nanoseconds)
+
+        self.create_timer(port.period, wake, clock=self._steady)
+
+    def _look_for_strangers(self) -> None:
+        """Topics of neighbours are handed on in the process: whoever else publishes them is not heard, and is named once."""
+        for topic in sorted(self._intake.private):
+            writer = self.wiring.writer(topic)
+            for stranger in foreign_writers(self, topic, {writer}):
+                self.warn_once(f"{topic}: {stranger} publishes it, too, and is ignored: {writer} does in this process")
+
+    # -- requests ----------------------------------------------------------------------------------------------------
+
+    def request(self, port: Service, request: Any, reply: Callable[[Any], None]) -> None:
+        """As it comes."""
+        self.wiring.enter(self.guarded, port.name, port.handler(self.component), request, reply)
+
+    def goal(self, port: Any, goal: Any) -> None:
+        """As it comes."""
+        self.wiring.enter(self.guarded, port.name, self.begin_goal, port, goal)
+
+    def _deliver_answer(self, port: Client, answer: Any) -> None:
+        self.wiring.enter(self.guarded, port.name, port.handler(self.component), answer)
+
+    # -- people ------------------------------------------------------------------------------------------------------
+
+    def host_figures(self) -> dict[str, Any]:
+        """Late answers."""
+        return self._deadlines.report() if self._deadlines is not None else {}
+
+    def hurry(self) -> None:
+        """Ask for real-time scheduling: every input has a deadline."""
+        if self._deadlines is None:
+            return
+        self.wiring.paced = priority.nodes > 1
+        if problem := priority.ask():
+            self.get_logger().warning(problem)

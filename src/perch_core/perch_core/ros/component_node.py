@@ -1,0 +1,298 @@
+"""The ROS side of one component that both ROS hosts share: parameters, outputs, services, actions, clients, jobs, log, diagnostics."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"  # one core per node, and the same sums in every flight; before numpy is imported
+
+from perch_core.component import Action, Client, Component, Diagnostics, Emitter, Job, LogLine, Output, Service, Unavailable, ports
+from perch_core.errors import ConfigError, PerchError
+from perch_core.ros import topics
+from perch_core.ros.deadlines import durations_us
+from perch_core.ros.goal_server import GoalServer, ServedGoal
+from perch_core.ros.jobs import Jobs
+from perch_core.ros.late_service import LateService
+from perch_core.ros.messages.diagnostics import diagnostics_message
+from perch_core.ros.parameters import Parameters
+from perch_core.ros.wiring import Publication, Wiring
+from rclpy.action import GoalResponse
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+LOUD = ("log", "diagnostics")  # outputs that are no topics of their own
+FEW = 300                      # calls whose durations are kept
+MOST_SAID = 100                # kinds of lines whose times are kept
+LONGEST = 300                  # characters of a line that is no error of this program
+_NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
+
+
+class ComponentNode(Node):
+    """A component and its topics. Subclasses bring its inputs to it."""
+
+    def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
+        """
+        Args:
+            name: of the node.
+            component: what it does.
+            wiring: the nodes of this process.
+            kwargs: of `rclpy.node.Node`: `cli_args`, `parameter_overrides`, `namespace`, `context`.
+
+        Raises:
+            ConfigError: a parameter is refused.
+        """
+        self._unwatched: set[Subscription] = set()
+        super().__init__(name, **kwargs)
+        self.wiring = wiring
+        self._durations: dict[str, deque[float]] = {}
+        self._said: dict[str, float] = {}
+        self._warned: set[str] = set()
+        self._failures = 0
+        self._goals: dict[str, ServedGoal] = {}
+        self._jobs: Jobs | None = None
+        try:
+            self._typed = Parameters(self, component.config_type, component.changeable, self._reconfigure)
+            self.component = component(self._typed.value)
+        except ConfigError:
+            self.destroy_node()
+            raise
+        if hasattr(self.component, "resolve"):
+            self.component.resolve = self.resolve_topic_name
+        self._jobs = Jobs(lambda work, *arguments: wiring.from_thread(self.guarded, "job", work, *arguments), self.component.preload())
+        self.component.work = self._work
+        self.component.log.receivers.append(self._log)
+        self._diagnostics = self.create_publisher(topics.message_type("/diagnostics"), "/diagnostics", topics.topic("/diagnostics").qos.publish)
+        self.component.diagnostics.receivers.append(self._publish_diagnostics)
+        self._publish_outputs()
+        self.component.warm_up()
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Those that the executor watches."""
+        return (subscription for subscription in super().subscriptions if subscription not in self._unwatched)
+
+    def create_unwatched(self, message: type, channel: str, profile: QoSProfile) -> Subscription:
+        """A subscription whose messages, serialised, wait to be taken; the executor is not woken by them."""
+        subscription = self.create_subscription(message, channel, lambda _: None, profile, raw=True)
+        self._unwatched.add(subscription)
+        return subscription
+
+    # -- outputs -----------------------------------------------------------------------------------------------------
+
+    def _publish_outputs(self) -> None:
+        for port in ports(type(self.component), Output):
+            if port.name in LOUD:
+                continue
+            channel = port.channel(self.component)
+            try:
+                row = topics.topic(channel)
+            except PerchError as error:
+                self.get_logger().warning(f"{error}: not published")
+                continue
+            publisher = self.create_publisher(row.message, channel, row.qos.publish)
+            publication = Publication(publisher, row.pack or row.to_message, row.latched, row.pack is not None, row.observed)
+            emitter = getattr(self.component, port.name)
+            self.wiring.writes(publisher.topic_name, self.get_fully_qualified_name())
+            emitter.receivers.append(self._emitted(publisher.topic_name, publication))
+            emitter.asked = self._asked(emitter, publisher.topic_name, publication)
+
+    def _emitted(self, topic: str, publication: Publication) -> Callable[[Any], None]:
+        wiring = self.wiring
+        return lambda value: wiring.emit(topic, publication, value)
+
+    def _asked(self, emitter: Emitter, topic: str, publication: Publication) -> Callable[[], bool]:
+        """Who takes values beside this host, a neighbour, or somebody outside."""
+        return lambda: len(emitter.receivers) > 1 or self.wiring.read_here(topic) or publication.heard()
+
+    # -- requests ----------------------------------------------------------------------------------------------------
+
+    def serve(self) -> None:
+        """Offer the component's services and actions, when requests can be handled."""
+        self._jobs.wait_ready()
+        for port in ports(type(self.component), Service):
+            self._serve(port)
+        for port in ports(type(self.component), Action):
+            self._take_goals(port)
+
+    def _serve(self, port: Service) -> None:
+        channel = port.channel(self.component)
+        row = topics.service(channel)
+
+        def take(request: Any, answer: Callable[[Any], None]) -> None:
+            try:
+                value = row.request_value(request)
+            except Exception as error:
+                self.refused(channel, error)
+                answer(self._bad_request(row, str(error)))
+                return
+            self.request(port, value, lambda reply: answer(row.answer_message(reply)))
+
+        LateService(self, row.type, channel, take)
+
+    @staticmethod
+    def _bad_request(row: topics.ServiceRow, why: str) -> Any:
+        response = row.type.Response(success=False, message=why)
+        if hasattr(response, "error_code"):
+            response.error_code = 1  # BAD_INPUT everywhere
+        return response
+
+    def _take_goals(self, port: Action) -> None:
+        channel = port.channel(self.component)
+        row = topics.action(channel)
+
+        def accept(_: Any) -> GoalResponse:
+            present = self._goals.get(port.name)
+            if present is not None and not present.finished:
+                self.get_logger().warning(f"{channel}: goal rejected: another one is under way")
+                return GoalResponse.REJECT
+            return GoalResponse.ACCEPT
+
+        def begin(handle: Any) -> None:
+            goal = self._goals[port.name] = ServedGoal(server, handle, row)
+            self.goal(port, goal)
+
+        server = GoalServer(self, row.type, channel, begin, accept)
+
+    def begin_goal(self, port: Action, goal: ServedGoal) -> None:
+        """Hand a goal to the component; one that it rejects ends at once."""
+        why = port.handler(self.component)(goal)
+        if why:
+            self.get_logger().warning(f"{port.name}: goal rejected: {why}")
+            goal.reject(why)
+
+    def request(self, port: Service, request: Any, reply: Callable[[Any], None]) -> None:
+        """Bring a request to the component."""
+        raise NotImplementedError
+
+    def goal(self, port: Action, goal: ServedGoal) -> None:
+        """Bring a goal to the component."""
+        raise NotImplementedError
+
+    def connect_clients(self, deliver: Callable[[Client, Any], None]) -> None:
+        """Make the component's clients; `deliver(port, answer)` takes each answer on the executor's thread."""
+        for port in ports(type(self.component), Client):
+            row = topics.service(port.channel(self.component))
+            client = self.create_client(row.type, port.channel(self.component))
+            setattr(self.component, port.name, self._asker(port, row, client, deliver))
+
+    def _asker(self, port: Client, row: topics.ServiceRow, client: Any, deliver: Callable[[Client, Any], None]) -> Callable[[Any, int], None]:
+        def ask(request: Any, due: int) -> None:
+            if not client.service_is_ready():
+                deliver(port, Unavailable(f"service {client.srv_name} is not there"))
+                return
+            future = client.call_async(row.request_message(request))
+            future.add_done_callback(lambda done: deliver(port, _answer(row, done)))
+
+        return ask
+
+    # -- jobs --------------------------------------------------------------------------------------------------------
+
+    def _work(self, job: Job) -> None:
+        self._jobs.submit(job)
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """As in `rclpy.node.Node`; refusals name the parameter and what is allowed."""
+        try:
+            return super().set_parameters_atomically(self._typed.checked(parameter_list))
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+
+    def _reconfigure(self, config: Any) -> None:
+        self.component.reconfigure(config)
+
+    # -- people ------------------------------------------------------------------------------------------------------
+
+    def _log(self, line: LogLine) -> None:
+        if len(line.text) > LONGEST and line.level != "error":  # what somebody sent may be quoted in it
+            line = LogLine(line.level, f"{line.text[:LONGEST]}...", line.every)
+        if line.every:
+            now, kind = time.monotonic(), _NUMBERS.sub("", line.text)
+            if now - self._said.get(kind, -1e9) < line.every:
+                return
+            if len(self._said) > MOST_SAID:
+                self._said.clear()
+            self._said[kind] = now
+        logger = self.get_logger()
+        if line.level == "error":  # rclpy refuses one call site with two severities
+            logger.error(line.text)
+        elif line.level == "warning":
+            logger.warning(line.text)
+        elif line.level == "info":
+            logger.info(line.text)
+        else:
+            logger.debug(line.text)
+
+    def warn_once(self, text: str) -> None:
+        """Warn, once of each text."""
+        if text not in self._warned:
+            self._warned.add(text)
+            self.get_logger().warning(text)
+
+    def _publish_diagnostics(self, diagnostics: Diagnostics) -> None:
+        values = dict(diagnostics.values) | self.host_figures()
+        for name, durations in self._durations.items():
+            values |= durations_us(name, durations)
+        level = diagnostics.level
+        if self._failures:
+            values["failures"], level = self._failures, 2
+        shown = Diagnostics(diagnostics.stamp, values, level, diagnostics.message)
+        self._diagnostics.publish(diagnostics_message(shown, self.get_fully_qualified_name()))
+
+    def host_figures(self) -> dict[str, Any]:
+        """What the host adds to the diagnostics."""
+        return {}
+
+    def guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
+        """Call the component; what it cannot take is said and dropped, and never ends the node."""
+        try:
+            self.timed(what, work, *arguments)
+        except Exception as error:
+            self.refused(what, error)
+
+    def refused(self, what: str, error: Exception) -> None:
+        """Say that something was refused; what nobody has foreseen is a defect. Called while the exception is handled."""
+        if isinstance(error, PerchError):
+            self._log(LogLine("warning", f"{what} refused: {error}", every=1.0))
+            return
+        self._failures += 1
+        self._log(LogLine("error", f"{what}: a defect of this node, its value is dropped:\n{traceback.format_exc()}", every=1.0))
+
+    def timed(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
+        """Do something, and keep how long it takes."""
+        begin = time.perf_counter()
+        try:
+            work(*arguments)
+        finally:
+            durations = self._durations.get(what)
+            if durations is None:
+                durations = self._durations[what] = deque(maxlen=FEW)
+            durations.append(time.perf_counter() - begin)
+
+    def close(self) -> None:
+        """Free what the component and its jobs hold."""
+        if self._jobs is not None:
+            self._jobs.close()
+        self.component.close()
+
+
+def _answer(row: topics.ServiceRow, future: Any) -> Any:
+    """The value of a finished call."""
+    response = future.result()
+    if response is None:
+        return Unavailable(f"{row.channel} failed: {future.exception()}")
+    try:
+        return row.answer_value(response)
+    except PerchError as error:
+        return Unavailable(f"{row.channel} answered nonsense: {error}")

@@ -1,0 +1,79 @@
+"""An action server whose goals end when the component says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+
+class GoalServer(ActionServer):
+    """Starts a goal with a callback and ends it with `finish`, without a coroutine in between.
+
+    rclpy 7.1 polls a coroutine that waits for a future on every turn of its executor: one waiting goal keeps one core busy.
+    """
+
+    def __init__(self, node: Node, action: Any, name: str, begin: Callable[[ServerGoalHandle], None],
+                 accept: Callable[[Any], GoalResponse]) -> None:
+        """
+        Args:
+            node: the node.
+            action: type of the action.
+            name: its name.
+            begin: called with the handle of each accepted goal, which is executing by then.
+            accept: says whether a goal is accepted.
+        """
+        self._begin = begin
+        super().__init__(node, action, name, self._refuse_to_wait, goal_callback=accept,
+                         cancel_callback=lambda _: CancelResponse.ACCEPT)
+
+    def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
+        """Start the goal; rclpy calls this when it is accepted."""
+        self._begin(goal_handle)
+
+    def finish(self, goal_handle: ServerGoalHandle, result: Any) -> None:
+        """Send the result of a goal whose end state is set."""
+        super().notify_execute(goal_handle, lambda _: result)
+
+    @staticmethod
+    def _refuse_to_wait(_: ServerGoalHandle) -> None:
+        raise AssertionError("goals of a GoalServer end with finish()")
+
+
+class ServedGoal:
+    """A goal as the component has it: `perch_core.component.Goal`."""
+
+    def __init__(self, server: GoalServer, handle: ServerGoalHandle, row: Any) -> None:
+        self._server, self._handle, self._row = server, handle, row
+        self.value = row.goal_value(handle.request)
+        self.finished = False
+
+    @property
+    def cancel_requested(self) -> bool:
+        """Whoever sent it wants it to end."""
+        return self._handle.is_cancel_requested
+
+    def feedback(self, value: Any) -> None:
+        """Tell whoever sent it how it goes."""
+        self._handle.publish_feedback(self._row.feedback_message(value))
+
+    def finish(self, ending: str, result: Any) -> None:
+        """End it: "succeeded", "cancelled" (only where that was asked for) or "aborted"."""
+        self._end(ending, self._row.result_message(result))
+
+    def reject(self, why: str) -> None:
+        """End it before it has begun."""
+        self._end("aborted", self._row.type.Result(message=why))
+
+    def _end(self, ending: str, result: Any) -> None:
+        self.finished = True
+        if ending == "succeeded":
+            self._handle.succeed()
+        elif ending == "cancelled" and self._handle.is_cancel_requested:
+            self._handle.canceled()
+        else:
+            self._handle.abort()
+        self._server.finish(self._handle, result)

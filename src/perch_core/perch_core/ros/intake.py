@@ -1,0 +1,101 @@
+"""From topics to the inputs of a component, as messages arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from perch_core.component import Input
+from perch_core.errors import PerchError
+from perch_core.ros import qos, topics
+from perch_core.ros.component_node import ComponentNode
+from perch_core.values import CameraImage, Serialized
+from rclpy.clock import Clock, ClockType
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+
+TAKE = 0.02  # lazy inputs are taken this often where nothing else asks for them [s]
+COMPRESSED = "/compressed"
+SHARED = ("/tf", "/tf_static")  # topics with many writers, inside this process and outside
+
+
+class Intake:
+    """Subscriptions of one node. Lazy inputs wait in the middleware and are taken before the next value that is not lazy.
+
+    Attributes:
+        private: topics that a neighbour publishes, resolved; they are handed on in the process, and nobody else is heard.
+    """
+
+    def __init__(self, node: ComponentNode) -> None:
+        self._node, self._wiring = node, node.wiring
+        self._lazy: list[tuple[Subscription, Callable[[bytes], None]]] = []
+        self.private: set[str] = set()
+
+    def add(self, port: Input) -> None:
+        """Take an input from its topic."""
+        node, channel = self._node, port.channel(self._node.component)
+        try:
+            row = topics.topic(channel)
+        except PerchError as error:
+            node.get_logger().warning(f"{error}: not subscribed")
+            return
+        resolved = node.resolve_topic_name(channel)
+        handler = partial(node.guarded, port.name, port.handler(node.component))
+        if self._wiring.writer(resolved) is not None and resolved not in SHARED:
+            self.private.add(resolved)
+            self._wiring.add_reader(resolved, self._local(port, row, channel, resolved, handler))
+            return
+        profile = row.qos.subscribe
+        if port.value is Serialized:
+            receive, raw, profile = partial(self._receive_raw, row, resolved, handler), True, qos.kept(row.qos)
+        elif row.unpack is not None:
+            receive, raw = partial(self._receive, channel, row.unpack, handler), True
+        else:
+            receive, raw = partial(self._receive, channel, row.to_value, handler), False
+        if port.lazy:
+            if not self._lazy:
+                node.create_timer(TAKE, lambda: self._wiring.enter(self.take_lazy), clock=Clock(clock_type=ClockType.STEADY_TIME))
+            subscription = node.create_unwatched(row.message, channel, profile)
+            self._lazy.append((subscription, receive if raw else partial(self._decode, row, receive)))
+        else:
+            node.create_subscription(row.message, channel, partial(self._arrived, receive), profile, raw=raw)
+        if port.value is CameraImage and channel.endswith("image_raw"):
+            packed = topics.topic(channel + COMPRESSED)
+            receive = partial(self._receive, channel + COMPRESSED, packed.to_value, handler)
+            node.create_subscription(packed.message, channel + COMPRESSED, partial(self._arrived, receive), packed.qos.subscribe)
+
+    def take_lazy(self) -> None:
+        """Take what waits in the middleware."""
+        for subscription, receive in self._lazy:
+            with subscription.handle:
+                while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                    receive(taken[0])
+
+    @staticmethod
+    def _local(port: Input, row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+        if port.value is not Serialized:
+            return handler
+        return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))
+
+    def _arrived(self, receive: Callable[[Any], None], msg: Any) -> None:
+        """A message that wakes the node: what waits goes first."""
+        self._wiring.enter(self.take_lazy)
+        self._wiring.enter(receive, msg)
+
+    @staticmethod
+    def _decode(row: topics.Topic, receive: Callable[[Any], None], data: bytes) -> None:
+        receive(deserialize_message(data, row.message))
+
+    def _receive(self, channel: str, to_value: Callable[[Any], Any], handler: Callable[[Any], None], msg: Any) -> None:
+        try:
+            value = to_value(msg)
+        except Exception as error:
+            self._node.refused(channel, error)
+            return
+        for one in value if isinstance(value, list) else (value,):
+            handler(one)
+
+    @staticmethod
+    def _receive_raw(row: topics.Topic, topic: str, handler: Callable[[Any], None], data: bytes) -> None:
+        handler(Serialized(topic, topics.stamp_of(row.message, data), data, row.message))

@@ -1,0 +1,68 @@
+"""Parts that messages share: stamps, vectors, poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+from std_msgs.msg import Header
+
+from perch_core.values import NANOSECONDS
+
+
+def to_stamp(time: int | float) -> Time:
+    """Stamp of a time in nanoseconds (int) or in seconds (float)."""
+    ns = time if isinstance(time, int) else round(time * NANOSECONDS)
+    return Time(sec=int(ns // NANOSECONDS), nanosec=int(ns % NANOSECONDS))
+
+
+def stamp_value(stamp: Time) -> int:
+    """Stamp in whole nanoseconds."""
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def header(stamp: int, frame: str) -> Header:
+    """Header with a stamp [ns]."""
+    return Header(stamp=to_stamp(stamp), frame_id=frame)
+
+
+def floats(v: Vector3 | Point) -> tuple[float, float, float]:
+    """Vector or point as 3 floats."""
+    return (v.x, v.y, v.z)
+
+
+def quaternion_floats(q: Quaternion) -> tuple[float, float, float, float]:
+    """Quaternion as 4 floats, xyzw."""
+    return (q.x, q.y, q.z, q.w)
+
+
+def to_vector(v: Sequence[float]) -> Vector3:
+    """3 numbers as a vector."""
+    return Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))
+
+
+def to_point(p: Sequence[float]) -> Point:
+    """3 numbers as a point."""
+    return Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))
+
+
+def to_quaternion(q: Sequence[float]) -> Quaternion:
+    """4 numbers, xyzw, as a quaternion."""
+    return Quaternion(x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
+
+
+def to_pose(p: Sequence[float], q: Sequence[float]) -> Pose:
+    """Position and quaternion xyzw as a pose."""
+    return Pose(position=to_point(p), orientation=to_quaternion(q))
+
+
+def flat(matrix: np.ndarray) -> np.ndarray:
+    """A matrix row by row, float64, as messages carry it."""
+    return np.ascontiguousarray(matrix, dtype=float).ravel()
+
+
+def square(values: Sequence[float], n: int) -> np.ndarray:
+    """`n` * `n` numbers, row by row, as a matrix."""
+    return np.array(values, dtype=float).reshape(n, n)

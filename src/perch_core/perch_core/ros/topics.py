@@ -1,0 +1,214 @@
+"""Every channel of the graph, once: its message, its QoS, and how a message becomes a value and back.
+
+Adding a topic is adding a row. Ports name channels (`perch_core.component`); hosts look them up here.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from perch_core.component import Diagnostics
+from perch_core.errors import PerchError
+from perch_core.ros import qos
+from perch_core.ros.messages import fast, flight, markers, mission, perching, planning, sensing, states
+from perch_core.ros.messages.basic import stamp_value, to_stamp
+from perch_core.ros.messages.diagnostics import diagnostics_message, diagnostics_value
+from perch_core.ros.qos import Qos
+from perch_core.values import NANOSECONDS
+from perch_msgs.action import Perch
+from perch_msgs.msg import (
+    Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RotorState,
+    TargetDetection, Trajectory, VioState)
+from perch_msgs.srv import PlanPerch, PlanPowerline, SetController
+from rclpy.qos import DurabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+Convert = Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row.
+
+    Attributes:
+        channel: relative name of the topic; `*` stands for a camera's name.
+        message: type of its messages.
+        qos: of publishers and subscribers.
+        to_message: value to message.
+        to_value: message to value, or to a list of them; raises PerchError where it cannot be one.
+        observed: nobody who flies waits for it.
+        pack, unpack: value to serialised message and back without rclpy's objects, for topics of 500 Hz.
+        """
+
+    channel: str
+    message: type
+    qos: Qos
+    to_message: Convert
+    to_value: Convert
+    pack: Callable[[Any], bytes] | None = None
+    unpack: Callable[[bytes], Any] | None = None
+    observed: bool = False
+
+    @property
+    def latched(self) -> bool:
+        """Whether who comes late gets messages that were published before."""
+        return self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+
+TOPICS = (
+    Topic("imu/data_raw", Imu, qos.SENSOR, sensing.imu_message, sensing.imu_value,
+          fast.pack_imu, fast.unpack_imu),
+    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value),
+    Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value),
+    Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value),
+    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value),
+    Topic("vio/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
+          fast.pack_odometry, fast.unpack_odometry),
+    Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
+    Topic("odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
+          fast.pack_odometry, fast.unpack_odometry),
+    Topic("estimator/status", EstimatorStatus, qos.STATE, states.health_message, states.health_value),
+    Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value),
+    Topic("target/detections", TargetDetection, qos.STATE, perching.sighting_message, perching.sighting_value),
+    Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value),
+    Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value),
+    Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value),
+    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value),
+    Topic("controller/status", ControllerStatus, qos.STATE, flight.status_message, flight.status_value),
+    Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
+    Topic("motor_command", MotorCommand, qos.SENSOR, flight.motor_message, flight.motor_value,
+          fast.pack_motor, fast.unpack_motor),
+    Topic("rotor_state", RotorState, qos.SENSOR, states.rotors_message, states.rotors_value, observed=True),
+    Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
+    Topic("ground_truth/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
+          fast.pack_odometry, fast.unpack_odometry, observed=True),
+    Topic("ground_truth/target", PoseStamped, qos.LATCHED, states.pose_message, states.pose_value),
+    Topic("/clock", Clock, qos.CLOCK, lambda stamp: Clock(clock=to_stamp(stamp)), lambda msg: stamp_value(msg.clock), observed=True),
+    Topic("/diagnostics", DiagnosticArray, qos.STATE, diagnostics_message, diagnostics_value),
+    Topic("markers", MarkerArray, qos.STATE, markers.markers_message, markers.markers_value),
+    Topic("robot_description", String, qos.LATCHED, lambda text: String(data=text), lambda msg: msg.data),
+)
+
+
+@dataclass(frozen=True)
+class ServiceRow:
+    """A service: its type; server: request to value, answer to message; client: request to message, answer to value."""
+
+    channel: str
+    type: Any
+    request_value: Convert
+    answer_message: Convert
+    request_message: Convert | None = None
+    answer_value: Convert | None = None
+
+
+SERVICES = (
+    ServiceRow("plan_perch", PlanPerch, planning.perch_request_value, planning.perch_plan_message, planning.perch_request_message,
+               planning.perch_plan_value),
+    ServiceRow("plan_powerline", PlanPowerline, planning.powerline_request_value, planning.powerline_plan_message,
+               planning.powerline_request_message, planning.powerline_plan_value),
+    ServiceRow("set_controller", SetController, flight.choose_law_value, flight.law_chosen_message),
+    ServiceRow("abort", Trigger, flight.ask_value, flight.done_message),
+    ServiceRow("depart", Trigger, flight.ask_value, flight.done_message),
+)
+
+
+@dataclass(frozen=True)
+class ActionRow:
+    """An action: its type, goal to value, feedback and result to messages."""
+
+    channel: str
+    type: Any
+    goal_value: Convert
+    feedback_message: Convert
+    result_message: Convert
+
+
+ACTIONS = (ActionRow("perch", Perch, mission.goal_value, mission.feedback_message, mission.result_message),)
+
+
+def _rows() -> tuple[Topic, ...]:
+    """All rows; those of TF where its messages are there."""
+    if importlib.util.find_spec("tf2_msgs") is None:
+        return TOPICS
+    from perch_core.ros.messages import transforms
+
+    return (*TOPICS, *transforms.topics())
+
+
+@lru_cache(maxsize=None)
+def topic(channel: str) -> Topic:
+    """The row of a channel.
+
+    Raises:
+        PerchError: there is none.
+    """
+    parts = channel.split("/")
+    for row in _rows():
+        wanted = row.channel.split("/")
+        if len(wanted) == len(parts) and all(w == p or (w.endswith("*") and p.startswith(w[:-1])) for w, p in zip(wanted, parts)):
+            return row
+    raise PerchError(f"no topic {channel!r} in perch_core.ros.topics")
+
+
+def service(channel: str) -> ServiceRow:
+    """The row of a service."""
+    return next(row for row in SERVICES if row.channel == channel)
+
+
+def action(channel: str) -> ActionRow:
+    """The row of an action."""
+    return next(row for row in ACTIONS if row.channel == channel)
+
+
+def message_type(channel: str) -> type:
+    """Type of a channel's messages."""
+    return topic(channel).message
+
+
+def encode(channel: str, value: Any) -> bytes:
+    """A value as a serialised message of its channel."""
+    row = topic(channel)
+    return row.pack(value) if row.pack is not None else serialize_message(row.to_message(value))
+
+
+def decode(channel: str, data: bytes) -> Any:
+    """The value of a serialised message; of one with several (`/tf`), the first.
+
+    Raises:
+        PerchError: the message cannot be a value.
+    """
+    row = topic(channel)
+    value = row.unpack(data) if row.unpack is not None else row.to_value(deserialize_message(data, row.message))
+    if isinstance(value, list):
+        if not value:
+            raise PerchError(f"{channel}: the message is empty")
+        return value[0]
+    return value
+
+
+_BEGIN = struct.Struct("<iI")  # of a stamp, after four bytes of encapsulation
+
+
+def stamp_of(message: type, data: bytes) -> int:
+    """Stamp of a serialised message that begins with a header, or is a clock [ns]; 0 for others."""
+    if message is Clock or "header" in message.get_fields_and_field_types():
+        sec, nanosec = _BEGIN.unpack_from(data, 4)
+        return sec * NANOSECONDS + nanosec
+    return 0
+
+
+__all__ = ["ACTIONS", "SERVICES", "TOPICS", "Diagnostics", "Topic", "action", "decode", "encode", "message_type", "service", "stamp_of", "topic"]

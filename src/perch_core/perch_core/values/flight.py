@@ -1,0 +1,120 @@
+"""What is flown: trajectories, commands, motor commands, and the controller's answers. Stamps are whole nanoseconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import IntEnum
+from typing import NamedTuple
+
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.values.stamps import nanoseconds, seconds
+
+Floats = tuple[float, ...]
+
+
+class AtEnd(IntEnum):
+    """What to do at the end of a trajectory; the values of perch_msgs/Trajectory."""
+
+    HOLD = 0
+    CONTACT = 1
+    LAND = 2
+    RECOVER = 3
+
+
+class TrajectoryOrder(NamedTuple):
+    """A trajectory to fly (channel `trajectory`) or to keep ready (channel `recovery`); fields as in perch_msgs/Trajectory.
+
+    Attributes:
+        id: given by whoever orders it.
+        trajectory: its `start_time` is that of a stamp, whole nanoseconds.
+        at_end: what to do at its end.
+        contact_time: how long a contact is awaited after the end [s].
+        recovery_start: time at which an appended recovery begins, negative: none [s].
+    """
+
+    id: int
+    trajectory: FlatTrajectory | SampledTrajectory
+    at_end: AtEnd = AtEnd.HOLD
+    contact_time: float = 0.0
+    recovery_start: float = -1.0
+
+    @classmethod
+    def of(cls, id: int, trajectory: FlatTrajectory | SampledTrajectory, at_end: AtEnd = AtEnd.HOLD, contact_time: float = 0.0,
+           recovery_start: float = -1.0) -> TrajectoryOrder:
+        """An order whose start is rounded to the nanosecond that a message can carry."""
+        start = seconds(nanoseconds(trajectory.start_time))
+        if start != trajectory.start_time:
+            trajectory = replace(trajectory, start_time=start)
+        return cls(id, trajectory, at_end, contact_time, recovery_start)
+
+
+class ControllerCommand(NamedTuple):
+    """What the controller shall do apart from trajectories; `command` and fields as in perch_msgs/ControllerCommand."""
+
+    stamp: int
+    command: int
+    reason: str
+
+
+class MotorCommand(NamedTuple):
+    """Rotor speeds [rad/s], 4 floats, for the step with this stamp [ns]; not armed: motors off."""
+
+    stamp: int
+    armed: bool
+    rotor_speed: Floats
+
+
+class ControllerStatus(NamedTuple):
+    """State of the controller and its supervisor; fields as in perch_msgs/ControllerStatus."""
+
+    stamp: int
+    state: int
+    controller: str
+    trajectory_id: int
+    trajectory_time: float
+    trajectory_duration: float
+    position_error: float
+    odometry_age: float
+    thrust_margin: float
+    message: str
+
+
+class ControlReference(NamedTuple):
+    """What the controller wanted at a step; fields as in perch_msgs/ControlReference, vectors as tuples of floats."""
+
+    stamp: int
+    trajectory_id: int
+    p: Floats
+    q: Floats
+    v: Floats
+    a: Floats
+    w: Floats
+    dw: Floats
+    thrust: float
+    moment: Floats
+
+
+class ChooseLaw(NamedTuple):
+    """Request of `set_controller`: the law, with or without L1."""
+
+    type: str
+    adaptive: bool
+
+
+class LawChosen(NamedTuple):
+    """Answer of `set_controller`; `error_code` as in perch_msgs/srv/SetController."""
+
+    success: bool
+    error_code: int
+    message: str
+
+
+class Ask(NamedTuple):
+    """A request without content (std_srvs/Trigger)."""
+
+
+class Done(NamedTuple):
+    """The answer to it."""
+
+    success: bool
+    message: str

@@ -1,0 +1,135 @@
+"""YAML into plain values, within declared limits: no file can crash its reader, keep it busy, or mean something else than it shows.
+
+A file is scanned as libyaml's events before anything is built of it, so that depth and size cost nothing; aliases count as
+what they stand for. Words are those of YAML 1.2 (`true`, `1e-3`; not `on`, not `1:30`), of which JSON is a part.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from yaml.events import AliasEvent, MappingStartEvent, NodeEvent, ScalarEvent, SequenceStartEvent
+
+from perch_core.errors import ConfigError
+
+BYTES = 1 << 20
+DEPTH = 20
+NODES = 20_000
+ENTRIES = 2_000  # of a list or a mapping
+WHOLE = 2**63 - 1  # the largest whole number
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # libyaml's, where there is one, is ten times as fast
+    yaml_implicit_resolvers: dict[str, list[Any]] = {}
+
+
+def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
+    if len(node.value) > 20 or abs(int(node.value)) > WHOLE:
+        raise yaml.constructor.ConstructorError(None, None, "a whole number beyond 64 bits", node.start_mark)
+    return int(node.value)
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9]+", list("-+0123456789")),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", list("-+.0123456789")),
+    ("merge", "<<", ["<"]),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_pattern})\Z"), _first)
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
+
+
+def read_yaml(path: Path | str) -> Any:
+    """What a file holds, see `parse_yaml`.
+
+    Raises:
+        ConfigError: it cannot be read, or is refused.
+    """
+    try:
+        with open(path, "rb") as file:
+            content = file.read(BYTES + 1)
+    except OSError as error:
+        raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from None
+    if len(content) > BYTES:
+        raise ConfigError(str(path), "", f"has more than {BYTES} bytes")
+    try:
+        return parse_yaml(content.decode("utf-8"), str(path))
+    except UnicodeDecodeError:
+        raise ConfigError(str(path), "", "is not text in UTF-8") from None
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """Mappings, lists, text, numbers, booleans and None.
+
+    Args:
+        text: YAML or JSON.
+        source: file or option, for messages.
+
+    Raises:
+        ConfigError: not YAML, a key twice, a tag, or beyond the limits.
+    """
+    try:
+        _scan(text, source)
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ConfigError(source, "", f"is not valid YAML: {error}") from None
+
+
+class _Open:
+    """A list or mapping whose end has not come."""
+
+    def __init__(self, event: NodeEvent, before: int) -> None:
+        self.anchor, self.before, self.height, self.entries = event.anchor, before, 1, 0
+        self.keys: set[str] | None = set() if isinstance(event, MappingStartEvent) else None
+
+
+def _scan(text: str, source: str) -> None:
+    """Refuse what must not be built."""
+    nodes = 0
+    path: list[_Open] = []
+    anchors: dict[str, tuple[int, int]] = {}  # name -> values, levels
+    for event in yaml.parse(text, _Loader):
+        def refuse(problem: str) -> None:
+            raise ConfigError(source, f"line {event.start_mark.line + 1}", problem)
+
+        if isinstance(event, NodeEvent):
+            weight, height = 1, 0
+            if isinstance(event, AliasEvent):
+                if event.anchor not in anchors:
+                    refuse(f"alias {event.anchor!r} has no anchor before it")
+                weight, height = anchors[event.anchor]
+            elif event.tag is not None:
+                refuse(f"tag {event.tag!r}: tags are not used")
+            elif isinstance(event, ScalarEvent) and event.anchor is not None:
+                anchors[event.anchor] = 1, 0
+            nodes += weight
+            if nodes > NODES:
+                refuse(f"more than {NODES} values")
+            if len(path) + height > DEPTH:
+                refuse(f"more than {DEPTH} levels")
+            if path:
+                inside = path[-1]
+                if inside.keys is not None and inside.entries % 2 == 0:
+                    if not isinstance(event, ScalarEvent):
+                        refuse("a key that is no word")
+                    if event.value in inside.keys:
+                        refuse(f"key {event.value!r} stands here twice")
+                    inside.keys.add(event.value)
+                inside.entries += 1
+                inside.height = max(inside.height, 1 + height)
+                if inside.entries > ENTRIES:
+                    refuse(f"more than {ENTRIES} entries")
+            if isinstance(event, (MappingStartEvent, SequenceStartEvent)):
+                path.append(_Open(event, nodes - 1))
+                if len(path) > DEPTH:
+                    refuse(f"more than {DEPTH} levels")
+        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            done = path.pop()
+            if done.anchor is not None:
+                anchors[done.anchor] = nodes - done.before, done.height
+            if path:
+                path[-1].height = max(path[-1].height, 1 + done.height)

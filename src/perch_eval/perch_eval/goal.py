@@ -1,0 +1,31 @@
+"""What a scenario asks of the mission, and how a flight may end."""
+
+from __future__ import annotations
+
+import math
+
+from perch_core.values import PerchGoal
+from perch_sim.scenario import Scenario
+
+MODES = {"surface": 0, "powerline": 1, "inspection": 2}
+OUTCOMES = dict(enumerate(
+    ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed", "perched_already")))
+"""Error code of the Perch action's result -> outcome."""
+SUCCESSES = ("perched", "inspected")
+"""Outcomes of a flight that did what was asked."""
+
+
+def goal_of(scenario: Scenario) -> PerchGoal:
+    """The goal that a scenario's mission part describes."""
+    mission = scenario.mission
+    points = {"powerline": mission.perch_point, "inspection": scenario.inspection.watched}
+    return PerchGoal(
+        mode=MODES[scenario.mode], takeoff_height=mission.takeoff_height, search_timeout=mission.search_timeout,
+        perch_point=tuple(points.get(scenario.mode, (0.0, 0.0, 0.0))), perch_pitch=math.radians(mission.perch_pitch_deg),
+        perception_aware=mission.perception_aware, replan=mission.replan, attempts=mission.attempts)
+
+
+def outcome_of(error_code: int, scenario: Scenario) -> str:
+    """The outcome of a goal that ended with a result's error code."""
+    outcome = OUTCOMES.get(error_code, "failed")
+    return "inspected" if outcome == "perched" and scenario.mode == "inspection" else outcome

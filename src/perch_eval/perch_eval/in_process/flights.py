@@ -1,0 +1,142 @@
+"""Which components fly a scenario, and the flight from the goal to its end."""
+
+from __future__ import annotations
+
+import gc
+import time as clock
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from perch_core.component import Component
+from perch_core.errors import PerchError
+from perch_core.values import NANOSECONDS, seconds
+from perch_eval.goal import goal_of, outcome_of
+from perch_eval.in_process.loop import Loop
+from perch_eval.in_process.modelled_sight import modelled_localizer
+from perch_eval.in_process.parameters import NodeParameters
+from perch_eval.in_process.stand_ins import MappedWorld
+from perch_eval.in_process.trace import FlightTrace
+from perch_perception.target_localizer import TargetLocalizerConfig
+from perch_sim.drawing import DrawnOnDemand
+from perch_sim.lockstep import Task, flight_tasks
+from perch_sim.parameters import VehicleParameters
+from perch_sim.scenario import Scenario
+from perch_sim.simulated_vehicle import SimulatedVehicle
+
+PATIENCE = 15 * NANOSECONDS  # for a cancelled flight to come to its end [ns]
+PLANNERS = {"surface": "perching_planner", "powerline": "powerline_planner"}
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Which cameras' images are rendered and looked at; who looks through the others is replaced by an error model."""
+
+    vio: str = "model"
+    target: str = "model"
+
+    def __post_init__(self) -> None:
+        for name in ("vio", "target"):
+            if getattr(self, name) not in ("model", "rendered"):
+                raise PerchError(f"sensing.{name}: {getattr(self, name)!r} is not one of model, rendered")
+
+
+def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, replace: Mapping[str, Component[Any]] | None = None,
+            without: Collection[str] = (), pilot: Component[Any] | None = None) -> Loop:
+    """The flight of a scenario before its first step.
+
+    Args:
+        scenario: what is flown.
+        seed: of everything that is random; the same seed gives the same flight to the last bit.
+        sensing: which cameras are rendered.
+        replace: name -> component in the place of the scenario's.
+        without: names of components that do not take part.
+        pilot: leads the flight in the place of the mission: it works at every step before the controller.
+
+    Raises:
+        ConfigError: the scenario or a node's parameter is refused.
+        PerchError: something that has no error model.
+    """
+    parameters, replace = NodeParameters(scenario, seed), replace or {}
+    surface = scenario.mode == "surface"
+    finder = "target_localizer" if surface else "powerline_mapper"
+    left_out = {*without, *(("mission",) if pilot is not None else ())}
+    names = [name for name in ("vio" if sensing.vio == "rendered" else "vio_model", "estimator", finder, "controller", "mission")
+             if name not in left_out]
+    front = "target_localizer" in names or sensing.target == "rendered"  # its frames start work, whether or not they are drawn
+    cameras = {(True, True): "all", (True, False): "down", (False, True): "front", (False, False): "none"}[sensing.vio == "rendered", front]
+    vehicle = SimulatedVehicle(VehicleParameters(seed=seed, cameras=cameras), scenario, DrawnOnDemand)
+    components = {}
+    for name in names:
+        if name in replace:
+            components[name] = replace[name]
+        elif name == "target_localizer" and sensing.target == "model":
+            components[name] = modelled_localizer(parameters.of(name, TargetLocalizerConfig), vehicle, seed)
+        elif name == "powerline_mapper" and sensing.target == "model":
+            components[name] = MappedWorld.of(scenario, seed)
+        else:
+            components[name] = parameters.component(name)
+    planner = PLANNERS.get(scenario.mode)
+    servers = {} if planner is None or planner in without else {planner: replace.get(planner) or parameters.component(planner)}
+    tasks = flight_tasks(scenario.latency)
+    if pilot is not None:
+        components["pilot"] = pilot
+        tasks = {"estimator": tasks["estimator"], "pilot": Task(), **tasks}
+    return Loop(vehicle, components, tasks, servers)
+
+
+def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: float = 0.0) -> FlightTrace:
+    """Fly a scenario once.
+
+    Args:
+        scenario: what is flown.
+        seed: of everything that is random; the same seed gives the same flight to the last bit.
+        sensing: which cameras are rendered.
+        linger: flown on after the goal's end [s].
+
+    Raises:
+        ConfigError: the scenario or a node's parameter is refused.
+        PerchError: something that has no error model.
+    """
+    return perch(arrange(scenario, seed, sensing), scenario, linger)
+
+
+@contextmanager
+def _without_collector() -> Iterator[None]:
+    """A trace keeps what it is given: looking through that for garbage again and again takes a tenth of a flight's time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
+    """Fly an arrangement from the scenario's goal to its end; arguments as those of `fly`."""
+    began = clock.perf_counter()
+    goal = loop.send("mission", goal_of(scenario))
+    limit = round(scenario.time_limit * NANOSECONDS)
+    stamp = 0
+    with _without_collector():
+        while goal.result is None and stamp < limit + PATIENCE:
+            stamp = loop.step()
+            goal.cancel_requested = stamp > limit
+        trace, result, late = loop.trace, goal.result, goal.cancel_requested
+        trace.end_time = seconds(stamp)
+        goal.cancel_requested = False
+        end = stamp + round(linger * NANOSECONDS)
+        while stamp < end:
+            stamp = loop.step()
+    trace.pad = loop.vehicle.simulation.pad
+    if result is None:
+        trace.outcome, trace.message = "timeout", f"no end within {trace.end_time:.1f} s"
+    else:
+        trace.outcome, trace.message = outcome_of(result.error_code, scenario), result.message
+        if trace.outcome == "cancelled" and late:
+            trace.outcome = "timeout"
+    trace.wall_time = clock.perf_counter() - began
+    loop.close()
+    return trace

@@ -1,0 +1,121 @@
+"""Sightings of the pad without images: corners with the measured error of the tag pipeline.
+
+The error model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
+calibration errors included), shaken by the error that `perch_perception.tags` makes on rendered images (0.06 px
+at 1.7 m, 0.18 px at 3 m), and solved with the nominal camera by the code that flies. What it does not model:
+blur, contrast and light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.camera import CameraMount
+from perch_core.surface import PerchSurface
+from perch_core.tag_board import TagBoard, load_board
+from perch_core.values import NANOSECONDS
+from perch_perception.pose_buffer import BodyState
+from perch_perception.tags import (
+    CalibrationSigma, Localization, LocalizationRefusal, LocalizerConfig, average_board, solve_board)
+from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
+from perch_sim import seeding
+from perch_sim.calibration import true_mounts
+from perch_sim.simulated_vehicle import SimulatedVehicle
+from perch_sim.state_history import StateHistory, TrueState
+
+MEMORY = 200            # true states kept: 0.4 s
+READABLE_SIDE = 12.5    # a tag whose shortest side is smaller is not found [px]: 0.16 m at 3.5 m
+_SIDE, _SIGMA = 25.9, 0.06                              # shortest side of a tag [px] and its corners' error there [px]
+_GROWTH = np.log(0.18 / 0.06) / np.log(3.0 / 1.7)       # exponent with which that grows as the side shrinks
+_LARGEST = 0.6                                          # [px]
+
+
+def corner_sigma(side: np.ndarray) -> np.ndarray:
+    """1 sigma of a measured corner along each image axis, for the tag's shortest side [px]."""
+    return np.clip(_SIGMA * (_SIDE / np.maximum(side, 1.0)) ** _GROWTH, 0.05, _LARGEST)
+
+
+def modelled_localizer(config: TargetLocalizerConfig, vehicle: SimulatedVehicle, seed: int) -> TargetLocalizer:
+    """The target localiser with its sightings made from the truth."""
+    simulation, board, truth = vehicle.simulation, load_board(config.board), StateHistory(MEMORY)
+    mount = simulation.vehicle.mounts[config.camera]
+    true = true_mounts(simulation.scenario, {config.camera: mount}, seed)[config.camera]
+    truth.append(simulation.state)  # an exposure may have its middle before the first step ends
+    vehicle.truth.receivers.append(lambda _: truth.append(simulation.state))
+    return TargetLocalizer(config, ModelledSight(
+        board, mount, true, config.localizer, seeding.stream(seed, "tag_corners"), truth, lambda: simulation.pad,
+        averaging=config.mode == "average", calibration=config.calibration))
+
+
+class ModelledSight:
+    """Sightings of the board made from the truth, in the place of `BoardLocalizer`."""
+
+    def __init__(self, board: TagBoard, mount: CameraMount, true: CameraMount, settings: LocalizerConfig, rng: np.random.Generator,
+                 truth: StateHistory, pad: Callable[[], PerchSurface], averaging: bool = False,
+                 calibration: CalibrationSigma = CalibrationSigma()) -> None:
+        """
+        Args:
+            board: geometry of the tags.
+            mount: the camera as calibrated.
+            true: the camera as it is.
+            settings: of the localiser whose place it takes.
+            rng: of the corners' errors.
+            truth: the vehicle's last states.
+            pad: gives the true pad as it is now.
+            averaging: compute the paper's average too.
+            calibration: how well the lens is known.
+        """
+        self._truth, self._pad = truth, pad
+        self._board, self._mount, self._true, self._settings, self._rng = board, mount, true, settings, rng
+        self._averaging, self._lens_sigma = averaging, calibration.lens
+        self._last = self._searched = -np.inf
+        self._R_CS: np.ndarray | None = None
+
+    def process(self, image: Any, exposed: float, body: BodyState | None) -> Localization:
+        """What the localiser would say of an image, which is not looked at; arguments as those of `Localizer.process`."""
+        settings = self._settings
+        tracking = exposed - self._last <= settings.lost_after
+        if not tracking:
+            self._R_CS = None
+            if exposed - self._searched < 1.0 / settings.search_rate - 1e-3:
+                return Localization(None, message="waiting for the next search")
+            self._searched = exposed
+        pixels, ids, side = self._visible(self._truth.at(self._middle(exposed)), self._pad())
+        if not ids:
+            return Localization(None, message="no tag of the board found")
+        sigma = np.repeat(corner_sigma(side)[:, None], 4, axis=1)
+        measured = pixels + sigma[..., None] * self._rng.standard_normal(pixels.shape)
+        rays = self._mount.camera.unproject(measured.reshape(-1, 2)).reshape(-1, 4, 3)
+        corners_S = self._board.corners_S[[self._board.ids.index(i) for i in ids]]
+        try:
+            pose = solve_board(self._mount.camera, corners_S, rays, sigma, ids, self._R_CS, lens_sigma=self._lens_sigma)
+        except LocalizationRefusal as refusal:
+            return Localization(None, message=str(refusal))
+        if not settings.min_range <= np.linalg.norm(pose.p_CS) <= settings.max_range:
+            return Localization(None, message="not a board of this size")
+        self._last, self._R_CS = exposed, pose.R_CS
+        complete = len(ids) == len(self._board.ids)
+        average = average_board(self._mount.camera, corners_S, rays, ids) if self._averaging and complete else None
+        return Localization(pose, average, complete)
+
+    def _middle(self, exposed: float) -> int:
+        """True middle of the exposure [ns] that the calibrated stamp offset puts at `exposed` [s]."""
+        stamp = round((exposed + self._mount.stamp_offset) * NANOSECONDS)
+        return stamp - round(self._true.stamp_offset * NANOSECONDS)
+
+    def _visible(self, state: TrueState, pad: PerchSurface) -> tuple[np.ndarray, tuple[int, ...], np.ndarray]:
+        """True pixels (n, 4, 2), numbers and shortest sides (n,) of the tags that can be read."""
+        p_WC, R_WC = self._true.pose(state.p_WB, so3.quat_to_matrix(state.q_WB))
+        if (p_WC - pad.p_WS) @ pad.normal <= 0.05:
+            return np.zeros((0, 4, 2)), (), np.zeros(0)
+        corners_W = pad.p_WS + self._board.corners_S @ pad.R_WS.T
+        pixels, valid = self._true.camera.project(((corners_W - p_WC) @ R_WC).reshape(-1, 3))
+        inside = (valid & self._true.camera.contains(pixels, margin=1.0)).reshape(-1, 4).all(axis=1)
+        pixels = pixels.reshape(-1, 4, 2)
+        side = np.linalg.norm(np.roll(pixels, -1, axis=1) - pixels, axis=2).min(axis=1)
+        keep = inside & (side >= READABLE_SIDE)
+        return pixels[keep], tuple(np.array(self._board.ids)[keep].tolist()), side[keep]

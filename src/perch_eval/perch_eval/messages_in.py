@@ -1,0 +1,98 @@
+"""Ports for components that take messages as they are on the wire, and what they need of ROS to make something of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+from perch_core.component import Component, Input
+from perch_core.values import CameraImage, Serialized
+from perch_eval.mcap_log import Schema
+
+CAMERAS = ("down", "front")
+STAMPLESS = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
+"""Channels whose messages have no header, or the stamp of a start that lies ahead: the newest stamp of the others counts."""
+
+C = TypeVar("C")
+T = TypeVar("T", bound=type[Component[Any]])
+
+
+class Codec(Protocol):
+    """Messages and values, by channel; `perch_eval.ros.codec.MessageCodec` is the one."""
+
+    def schema(self, message: Any) -> Schema:
+        """Name and definition of a message class."""
+
+    def message(self, channel: str) -> Any:
+        """Message class of a channel."""
+
+    def encode(self, channel: str, value: Any) -> bytes:
+        """A value as a serialised message."""
+
+    def decode(self, channel: str, data: bytes) -> Any:
+        """The value of a serialised message.
+
+        Raises:
+            PerchError: the message cannot be a value.
+        """
+
+
+class Wire(Input[Serialized]):
+    """All messages of a channel, for `on_message(channel, message)`."""
+
+    def handler(self, component: Component[Any]) -> Callable[[Serialized], None]:
+        """Bound to the channel."""
+        return partial(component.on_message, self.channel(component))
+
+
+class Images(Input[CameraImage]):
+    """The images of a camera, for `on_image(camera, image)`."""
+
+    def __init__(self, camera: str) -> None:
+        super().__init__(CameraImage, f"camera_{camera}/image_raw", lazy=True)
+        self.camera = camera
+
+    def handler(self, component: Component[Any]) -> Callable[[CameraImage], None]:
+        """Bound to the camera."""
+        return partial(component.on_image, self.camera)
+
+
+class Listener(Component[C]):
+    """A component that takes messages by `on_message(channel, message)` and images by `on_image(camera, image)`.
+
+    Attributes:
+        codec: set by the node's file.
+        resolve: channel to the fully resolved name of its topic; set by a host with a namespace.
+        newest: newest stamp so far [ns].
+    """
+
+    codec: Codec
+
+    def __init__(self, config: C) -> None:
+        super().__init__(config)
+        self.resolve: Callable[[str], str] = lambda channel: f"/{channel.lstrip('/')}"
+        self.newest = 0
+
+    def serialized(self, channel: str, message: Any) -> Serialized:
+        """A message as it is on the wire, whether the host has it so or as a value; its stamp is when it was sent."""
+        if not isinstance(message, Serialized):
+            stamp = getattr(message, "stamp", 0)
+            message = Serialized(self.resolve(channel), stamp, self.codec.encode(channel, message), self.codec.message(channel))
+        if channel in STAMPLESS:
+            return message._replace(stamp=self.newest)
+        self.newest = max(self.newest, message.stamp)
+        return message
+
+
+def listening(channels: Iterable[str]) -> Callable[[T], T]:
+    """Gives a `Listener` a lazy port for each channel and camera."""
+
+    def declare(cls: T) -> T:
+        for port in (*(Wire(Serialized, channel, lazy=True) for channel in channels), *map(Images, CAMERAS)):
+            name = "in_" + port._channel.strip("/").replace("/", "_")
+            port.__set_name__(cls, name)
+            setattr(cls, name, port)
+        return cls
+
+    return declare

@@ -1,0 +1,123 @@
+"""Component `recorder`: writes the messages of a flight to an MCAP file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from perch_core.component import Diagnostics, LogLine, Wake
+from perch_core.config import quantity, text
+from perch_core.values import NANOSECONDS, CameraImage, CompressedPixels, Serialized
+from perch_eval.mcap_log import McapLog
+from perch_eval.messages_in import Listener, listening
+
+CHANNELS = (
+    "ground_truth/odometry", "ground_truth/target", "contact", "imu/data_raw", "rotor_state", "motor_command", "odometry", "vio/odometry",
+    "estimator/status", "target/pose", "target/detections", "powerlines", "trajectory", "recovery", "controller/command",
+    "controller/status", "controller/reference", "/diagnostics", "/tf", "/tf_static", "robot_description")
+SECOND = NANOSECONDS
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecorderParameters:
+    """Parameters of the node `recorder`."""
+
+    file: str = text("flight.mcap", doc="where to write")
+    image_rate: float = quantity(6.0, unit="Hz", low=0.0, high=60.0, doc="images kept per second and camera, 0: none")
+    image_quality: int = quantity(80, unit="%", low=10, high=100, doc="JPEG quality")
+
+
+@listening(CHANNELS)
+class Recorder(Listener[RecorderParameters]):
+    """Keeps messages as they are on the wire with simulation time, and some of the images as JPEG.
+
+    A file that cannot be written ends the recording with one line of log, and never the flight.
+    """
+
+    config_type = RecorderParameters
+
+    flush = Wake(0.1)
+
+    def __init__(self, config: RecorderParameters) -> None:
+        super().__init__(config)
+        self._log: McapLog | None = None
+        self._last_image: dict[str, int] = {}
+        self._messages, self._told = 0, -SECOND
+        self._failure = ""
+
+    def warm_up(self) -> None:
+        """Open the file."""
+        try:
+            self._log = McapLog(Path(self.config.file))
+        except OSError as error:
+            self._give_up(error)
+
+    def on_message(self, channel: str, message: Serialized) -> None:
+        """Put a message on file."""
+        if self._log is not None:
+            self._write(self.serialized(channel, message))
+
+    def on_image(self, camera: str, image: CameraImage) -> None:
+        """Put one of some images on file. `image_rate` counts by stamps."""
+        if self.config.image_rate == 0.0 or self._log is None:
+            return
+        last = self._last_image.get(camera)
+        if last is not None and last <= image.stamp < last + int(NANOSECONDS / self.config.image_rate):
+            return
+        self._last_image[camera] = image.stamp
+        packed = jpeg(image, self.config.image_quality)
+        if packed is None:
+            return
+        channel = f"camera_{camera}/image_raw/compressed"
+        self._write(self.serialized(channel, packed))
+
+    def on_flush(self, now: int) -> None:
+        """Hand to the operating system what is finished, and tell how it goes."""
+        if self._log is not None:
+            try:
+                self._log.flush()
+            except OSError as error:
+                self._give_up(error)
+        if self.newest - self._told >= SECOND:
+            self._told = self.newest
+            level, message = (2, self._failure) if self._failure else (0, "ok")
+            self.diagnostics(Diagnostics(self.newest, {"messages": self._messages}, level, message))
+
+    def close(self) -> None:
+        """Finish the file."""
+        log, self._log = self._log, None
+        if log is not None:
+            try:
+                log.close()
+            except OSError as error:
+                self._give_up(error)
+
+    def _write(self, message: Serialized) -> None:
+        try:
+            if message.topic not in self._log:
+                self._log.add_topic(message.topic, self.codec.schema(message.message))
+            self._log.write(message.topic, message.data, message.stamp)
+            self._messages += 1
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        log, self._log = self._log, None
+        if log is not None:
+            log.abandon()
+        self._failure = f"recording stopped: {self.config.file}: {error.strerror or error}"
+        self.log(LogLine("error", f"{self._failure}; the flight goes on, and what is written can be read"))
+
+
+def jpeg(image: CameraImage, quality: int) -> CompressedPixels | None:
+    """An image as JPEG; None where it has no pixels. `quality` [%]."""
+    pixels = image.pixels()
+    if pixels is None:
+        return None
+    if image.encoding == "rgb8":
+        pixels = pixels[..., ::-1]
+    done, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return CompressedPixels(image.stamp, image.frame, "jpeg", data.tobytes()) if done else None

@@ -1,0 +1,1 @@
+"""What perch_eval needs of ROS: message types and definitions, the recorded flight, the action client."""

@@ -1,0 +1,227 @@
+"""The user's side of a flight: sends the Perch goal, follows its feedback, waits for its result."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from perch_msgs.action import Perch
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+
+from perch_core.errors import PerchError
+from perch_core.ros import topics
+from perch_core.ros.messages.mission import goal_message
+from perch_eval.goal import goal_of, outcome_of
+from perch_sim.scenario import Scenario
+
+SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
+"""Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
+START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
+LOOK = 0.5              # between looks whether the mission that took the goal is still there [s]
+NAMED = 5.0             # time that stands still for so long is explained [s]
+
+
+@dataclass(frozen=True)
+class FlightResult:
+    """How a goal ended.
+
+    Attributes:
+        outcome: `perched` or the lower-case name of the error code.
+        message: the mission's words.
+        end_time: simulation time at the end [s].
+        wall_time: wall-clock time from the goal, or from when simulation time began after it, to the end [s].
+        start_time: simulation time then [s]; None where the goal never was sent.
+    """
+
+    outcome: str
+    message: str
+    end_time: float
+    wall_time: float
+    start_time: float | None = None
+
+
+class _Progress:
+    """Watches simulation time: since when it passes, and whether it stands still."""
+
+    def __init__(self, time_now: float) -> None:
+        self.began = self._moved = time.monotonic()
+        self.start = self._last = time_now
+        self._explained = False
+
+    def look(self, time_now: float) -> float:
+        """Wall-clock time for which simulation time has stood still [s]."""
+        now = time.monotonic()
+        if time_now > self._last:
+            if self._last == 0.0:  # it begins
+                self.began, self.start = now, time_now
+            self._last, self._moved, self._explained = time_now, now, False
+        return now - self._moved
+
+    def explain(self) -> bool:
+        """Once whenever it stands still: whether that is to be explained now."""
+        if self._explained or time.monotonic() - self._moved < NAMED:
+            return False
+        self._explained = True
+        return True
+
+
+class Pilot:
+    """An action client in a ROS context of its own. Time is that of `/clock`."""
+
+    def __init__(self, namespace: str = "") -> None:
+        self._context = Context()
+        rclpy.init(context=self._context)
+        self._node = Node("pilot", namespace=namespace or None, context=self._context, start_parameter_services=False)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._client = ActionClient(self._node, Perch, "perch")
+        self._vehicle = self._node.get_namespace().rstrip("/") + "/vehicle"
+        self._time, self._waiting_for, self._looked = 0.0, "", 0.0
+        self._interrupted, self._handler = False, None
+        if threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGINT, self._interrupt)
+        self._node.create_subscription(Clock, "/clock", self._receive_clock, topics.topic("/clock").qos.subscribe)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
+                                       topics.topic("/diagnostics").qos.subscribe)
+
+    def _interrupt(self, *_: Any) -> None:
+        self._interrupted = True
+
+    def _check_interrupt(self) -> None:
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt
+
+    def _spin(self, timeout: float) -> None:
+        """Run callbacks; an interrupt counts afterwards, as rclpy's C++ cannot pass on an exception out of a callback."""
+        self._executor.spin_once(timeout_sec=timeout)
+        self._check_interrupt()
+
+    @property
+    def time(self) -> float:
+        """Newest simulation time seen [s]."""
+        return self._time
+
+    @property
+    def waiting_for(self) -> str:
+        """Who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody."""
+        return self._waiting_for
+
+    def visible_nodes(self) -> set[str]:
+        """Fully qualified names of the nodes in the graph."""
+        self._spin(0.02)
+        return {f"{ns.rstrip('/')}/{name}" for name, ns in self._node.get_node_names_and_namespaces()}
+
+    def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
+            check: Callable[[], None] = lambda: None, stall: float = 60.0) -> FlightResult:
+        """Send the goal and wait for its end; past the scenario's time limit it is cancelled.
+
+        Args:
+            scenario: what to fly.
+            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, and who is waited for when
+                simulation time stands still.
+            check: called often; may raise to end the wait (a node that died).
+            stall: wall-clock time without progress of simulation time after which the flight has failed [s].
+
+        Raises:
+            PerchError: the mission does not answer, refuses the goal, or simulation time stands still.
+        """
+        seen = ("", "")
+
+        def feedback(msg: Any) -> None:
+            nonlocal seen
+            now = (msg.feedback.phase, msg.feedback.message)
+            if now != seen:
+                seen = now
+                on_phase(self._time, *now)
+
+        self._spin_until(self._client.server_is_ready, check, START_PATIENCE, "the mission's action server does not appear")
+        for node, service in SERVICES.items():
+            if node in scenario.nodes:
+                name = self._node.resolve_service_name(service)
+                self._spin_until(lambda: self._node.count_services(name) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
+        progress = _Progress(self._time)
+        sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
+        self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
+        handle = sent.result()
+        if not handle.accepted:
+            raise PerchError("the mission refused the goal: it is flying another one")
+        result = handle.get_result_async()
+        cancelled, servers = False, self._servers()
+        while not result.done():
+            self._spin(0.05)
+            check()
+            self._check_server(servers)
+            still = progress.look(self._time)
+            if progress.explain():
+                on_phase(self._time, "waiting", f"simulation time stands still: {self._whom()}")
+            if still > (stall if self._time > 0.0 else START_PATIENCE):
+                raise PerchError(f"simulation time has stood still at {self._time:.3f} s for {still:.0f} s: {self._whom()}")
+            if self._time > scenario.time_limit and not cancelled:
+                cancelled = True
+                on_phase(self._time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
+                handle.cancel_goal_async()
+        answer = result.result().result
+        outcome = outcome_of(answer.error_code, scenario)
+        if cancelled and outcome == "cancelled":
+            outcome = "timeout"
+        return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - progress.began, progress.start)
+
+    def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
+        """Let simulation time go on for a while, so that the recording shows the rest."""
+        end, last = self._time + duration, time.monotonic() + patience
+        while self._time < end and time.monotonic() < last:
+            self._spin(0.05)
+            check()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        if self._handler is not None:
+            signal.signal(signal.SIGINT, self._handler)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+        self._check_interrupt()
+
+    def _servers(self) -> set[bytes]:
+        """Who carries out goals."""
+        topic = f"{self._node.resolve_service_name('perch')}/_action/status"
+        return {bytes(info.endpoint_gid) for info in self._node.get_publishers_info_by_topic(topic)}
+
+    def _check_server(self, servers: set[bytes]) -> None:
+        """A result comes from the process that took the goal, or never."""
+        if time.monotonic() - self._looked < LOOK:
+            return
+        self._looked = time.monotonic()
+        now = self._servers()
+        if servers and (not now or now - servers):
+            raise PerchError(f"the mission {'was restarted' if now else 'has ended'}: the goal is lost")
+
+    def _whom(self) -> str:
+        return f"waiting for {self._waiting_for}" if self._waiting_for else f"{self._vehicle} does not say why"
+
+    def _spin_until(self, done: Callable[[], bool], check: Callable[[], None], timeout: float, problem: str) -> None:
+        last = time.monotonic() + timeout
+        while not done():
+            self._spin(0.05)
+            check()
+            if time.monotonic() > last:
+                waiting = f" (the vehicle is waiting for {self._waiting_for})" if self._waiting_for else ""
+                raise PerchError(f"{problem} within {timeout:g} s{waiting}")
+
+    def _receive_clock(self, msg: Clock) -> None:
+        self._time = max(self._time, msg.clock.sec + 1e-9 * msg.clock.nanosec)
+
+    def _receive_diagnostics(self, msg: DiagnosticArray) -> None:
+        for status in msg.status:
+            if status.name == self._vehicle:
+                self._waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")

@@ -1,0 +1,98 @@
+"""A flight from an MCAP file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from perch_core.errors import PerchError
+from perch_core.ros import topics
+from perch_eval.flight import Flight, time_of
+from perch_eval.mcap_log import McapLog, read
+from perch_eval.ros.definitions import schema_of, type_name
+
+Timed = list[tuple[float, Any]]
+
+
+class _Channels(Mapping[str, Timed]):
+    """Channels whose messages are decoded when somebody asks for them."""
+
+    def __init__(self, names: dict[str, str], messages: dict[str, list[tuple[int, bytes]]]) -> None:
+        self._names, self._messages = names, messages
+        self._decoded: dict[str, Timed] = {}
+
+    def __getitem__(self, key: str) -> Timed:
+        if key not in self._decoded:
+            self._decoded[key] = list(self._decode(self._names[key], self._messages[key]))
+        return self._decoded[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._messages)
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @staticmethod
+    def _decode(channel: str, messages: list[tuple[int, bytes]]) -> Iterator[tuple[float, Any]]:
+        for logged, data in messages:
+            try:
+                value = topics.decode(channel, data)
+            except (PerchError, LookupError):  # as the component that it was for dropped it; or an empty list of transforms
+                continue
+            time = time_of(value)
+            yield 1e-9 * logged if time is None else time, value
+
+
+class RecordedFlight(Flight):
+    """The flight of an MCAP file, as the recorder or rosbag2 writes them. Only channels of `perch_core.ros.topics` are read."""
+
+    def __init__(self, path: Path, namespace: str = "") -> None:
+        """
+        Args:
+            path: the file; one that is cut off is read as far as it goes.
+            namespace: of the vehicle, where several were recorded.
+        """
+        prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
+        names: dict[str, str] = {}
+        messages: dict[str, list[tuple[int, bytes]]] = {}
+        damage: list[str] = []
+        for topic, type_of, time, data in read(path, on_damage=damage.append):
+            key = topic.removeprefix(prefix).lstrip("/")
+            channel = _channel(key, type_of)
+            if channel is not None:
+                names[key] = channel
+                messages.setdefault(key, []).append((time, data))
+        super().__init__(_Channels(names, messages), damage[0] if damage else "")
+
+
+@lru_cache(maxsize=None)
+def _channel(key: str, type_of: str) -> str | None:
+    """The channel of `perch_core.ros.topics` that a topic is, if it has one with this type."""
+    for channel in (key, f"/{key}"):
+        try:
+            if type_name(topics.message_type(channel)) == type_of:
+                return channel
+        except PerchError:
+            continue
+    return None
+
+
+def write(path: Path, values: Iterable[tuple[str, int, Any]], namespace: str = "") -> None:
+    """Write values as an MCAP file, as the recorder would have.
+
+    Args:
+        path: the file.
+        values: (channel, time [ns], value) in the order in which they are to stand in the file.
+        namespace: of the vehicle.
+    """
+    log = McapLog(path)
+    try:
+        for channel, time, value in values:
+            topic = channel if channel.startswith("/") else f"{namespace}/{channel}"
+            if topic not in log:
+                log.add_topic(topic, schema_of(topics.message_type(channel)))
+            log.write(topic, topics.encode(channel, value), time)
+    finally:
+        log.close()

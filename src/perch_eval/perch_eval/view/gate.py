@@ -1,0 +1,135 @@
+"""A door in front of a WebSocket server that accepts every web page: it lets in those whose origin is known.
+
+Browsers let any page open a WebSocket to this machine and tell the server the page's origin; programs that are no browsers tell
+none. Foxglove's server does not look at it, so that any page a user visits could read the flight. It listens at a random address
+of the loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this door at the address that
+people know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import threading
+from collections.abc import Iterable
+from urllib.parse import urlsplit
+
+HEADER_MAX = 16384  # of a handshake [bytes]
+HANDSHAKE_TIME = 5.0  # [s]
+CHUNK = 65536
+REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+def hidden_host() -> str:
+    """A random address of this machine's loopback network."""
+    return "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))
+
+
+def allowed(origin: str | None, origins: Iterable[str]) -> bool:
+    """Whether a page of an origin may look.
+
+    Args:
+        origin: as in the handshake, `scheme://host[:port]`; None: no browser.
+        origins: those that may; without a port every port of the host, `*` everybody.
+    """
+    if origin is None:
+        return True
+    for one in origins:
+        if one in ("*", origin) and origin != "null":
+            return True
+        if "://" in one and _host(one) == _host(origin) and _port(one) is None:
+            return True
+    return False
+
+
+def _host(origin: str) -> tuple[str, str | None]:
+    with contextlib.suppress(ValueError):
+        parts = urlsplit(origin)
+        return parts.scheme.lower(), parts.hostname
+    return "", origin
+
+
+def _port(origin: str) -> int | None:
+    with contextlib.suppress(ValueError):
+        return urlsplit(origin).port
+    return -1
+
+
+class Gate:
+    """Listens at an address and passes connections of allowed origins on."""
+
+    def __init__(self, host: str, port: int, behind: tuple[str, int], origins: Iterable[str]) -> None:
+        """
+        Args:
+            host, port: address that is served; port 0: any free one.
+            behind: address of the server behind.
+            origins: who may look, see `allowed`.
+
+        Raises:
+            OSError: the address cannot be served.
+        """
+        self._behind, self._origins = behind, tuple(origins)
+        self._loop = asyncio.new_event_loop()
+        try:
+            self._server = self._loop.run_until_complete(asyncio.start_server(self._enter, host, port, limit=HEADER_MAX))
+        except BaseException:
+            self._loop.close()
+            raise
+        self._thread = threading.Thread(target=self._loop.run_forever, name="viewer gate", daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """The port that is served."""
+        return self._server.sockets[0].getsockname()[1]
+
+    def close(self) -> None:
+        """Let nobody in any more, and end the connections that the server behind has not ended."""
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(timeout=5.0)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(timeout=5.0)
+        if not self._thread.is_alive():
+            self._loop.close()
+
+    async def _end(self) -> None:
+        self._server.close()
+        tasks = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+        _, late = await asyncio.wait(tasks, timeout=0.5) if tasks else (None, ())
+        for task in late:
+            task.cancel()
+        await asyncio.gather(*late, return_exceptions=True)
+
+    async def _enter(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        inner: asyncio.StreamWriter | None = None
+        try:
+            header = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HANDSHAKE_TIME)
+            if not allowed(_origin(header), self._origins):
+                writer.write(REFUSAL)
+                await writer.drain()
+                return
+            from_inner, inner = await asyncio.open_connection(*self._behind)
+            inner.write(header)
+            await asyncio.gather(_pass_on(reader, inner), _pass_on(from_inner, writer))
+        except (OSError, asyncio.TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.CancelledError):
+            pass  # no handshake, or the end of a connection
+        finally:
+            for end in filter(None, (writer, inner)):
+                end.close()
+
+
+def _origin(header: bytes) -> str | None:
+    """Origin in a handshake; of several none that is allowed."""
+    found = [value.strip().decode("latin-1") for name, _, value in (line.partition(b":") for line in header.split(b"\r\n")[1:])
+             if name.strip().lower() == b"origin"]
+    return (found[0] if len(found) == 1 else "null") if found else None
+
+
+async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Bytes of one direction until its end, as fast as they are taken."""
+    while data := await reader.read(CHUNK):
+        writer.write(data)
+        await writer.drain()
+    if writer.can_write_eof():
+        with contextlib.suppress(OSError):
+            writer.write_eof()

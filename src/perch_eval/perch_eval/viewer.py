@@ -1,0 +1,175 @@
+"""Component `viewer`: serves the running flight to Foxglove by WebSocket, with markers of what a person wants to see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from perch_core.component import Output
+from perch_core.config import quantity, text
+from perch_core.errors import PerchError
+from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, Serialized
+from perch_core.vehicle import load_vehicle
+from perch_eval.messages_in import CAMERAS, Listener, listening
+from perch_eval.recorder import jpeg
+from perch_eval.view.scene import (
+    Path, map_markers, path_markers, plan_markers, target_markers, truth_markers, vehicle_markers, world_markers)
+from perch_eval.view.server import LiveServer
+from perch_sim.scenario import load_scenario
+
+FAST = ("odometry", "ground_truth/odometry", "imu/data_raw")
+RARE = (
+    "ground_truth/target", "contact", "rotor_state", "vio/odometry", "estimator/status", "target/pose", "target/detections", "powerlines",
+    "trajectory", "controller/status", "controller/reference", *(f"camera_{camera}/camera_info" for camera in CAMERAS), "/tf_static",
+    "robot_description")
+PASSING = ("/diagnostics", "/tf")  # of which the last message is nothing to who comes later
+KEPT = {"/tf_static": 100, "contact": 100}
+"""Messages kept for who comes later, where it is more than the last one."""
+MARKERS = "markers"
+SLOW_SCENE = 5  # what does not move is sent with every so many scenes: whoever comes late sees it too
+LOCAL = (
+    "http://localhost", "https://localhost", "http://127.0.0.1", "https://127.0.0.1", "http://[::1]", "file://", "https://app.foxglove.dev")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerParameters:
+    """Parameters of the node `viewer`."""
+
+    scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file: vehicle, room, surface, cables")
+    host: str = text("127.0.0.1", doc="address that is served; 0.0.0.0: to every machine that reaches this one")
+    port: int = quantity(8765, low=0, high=65535, doc="of the WebSocket, 0: any free one")
+    origins: tuple[str, ...] = text(LOCAL, doc="web pages that may look, as scheme://host[:port], *: all; what is no browser always may")
+    rate: float = quantity(50.0, unit="Hz", above=0.0, high=1000.0, doc="messages per second of simulation of the 500 Hz topics")
+    scene_rate: float = quantity(20.0, unit="Hz", above=0.0, high=100.0, doc="markers per second of simulation")
+    image_rate: float = quantity(10.0, unit="Hz", low=0.0, high=60.0,
+                                 doc="images per second of simulation and camera, while somebody looks; 0: none")
+    image_quality: int = quantity(75, unit="%", low=10, high=100, doc="JPEG quality")
+
+
+class _Pace:
+    """Lets a message through every so often, by the stamps; also where they begin anew."""
+
+    def __init__(self, rate: float) -> None:
+        self._period, self._next = round(NANOSECONDS / rate), -1
+
+    def __call__(self, stamp: int) -> bool:
+        if self._next - 2 * self._period <= stamp < self._next:
+            return False
+        late = 0 <= self._next <= stamp
+        self._next = max(self._next + self._period if late else 0, stamp + self._period // 2)
+        return True
+
+
+@listening((*FAST, *RARE, *PASSING))
+class Viewer(Listener[ViewerParameters]):
+    """Passes messages on as they are on the wire, and draws the scene."""
+
+    config_type = ViewerParameters
+
+    markers = Output(Markers, MARKERS)
+
+    def __init__(self, config: ViewerParameters) -> None:
+        """
+        Raises:
+            ConfigError: no such scenario, or the address cannot be served.
+        """
+        super().__init__(config)
+        scenario = load_scenario(config.scenario)
+        self._vehicle = load_vehicle(scenario.vehicle)
+        self._world = world_markers(scenario)
+        self._plan: list[Marker] = []
+        self._target: list[Marker] = []
+        self._map: list[Marker] = []
+        self._mapped: set[int] = set()
+        self._truth = b""
+        self._words = ""
+        self._flown, self._true_path = Path(), Path()
+        self._scene_pace, self._scenes = _Pace(config.scene_rate), 0
+        self._paces = {channel: _Pace(config.rate) for channel in FAST}
+        self._image_paces = {camera: _Pace(config.image_rate) for camera in CAMERAS if config.image_rate > 0.0}
+        self._looks: dict[str, Callable[[bytes, int], None]] = {
+            "odometry": self._see_odometry, "ground_truth/odometry": self._see_truth, "trajectory": self._see_trajectory,
+            "target/pose": self._see_target, "powerlines": self._see_lines, "controller/status": self._see_status}
+        self.server = LiveServer(config.host, config.port, f"perch: {scenario.name}", config.origins)
+
+    def warm_up(self) -> None:
+        """Tell where to look."""
+        self.info(f"ws://{self.config.host}:{self.server.port}")
+
+    def on_message(self, channel: str, message: Serialized) -> None:
+        """Pass a message on, and take from it what the scene needs."""
+        message = self.serialized(channel, message)
+        pace = self._paces.get(channel)
+        if pace is None or pace(message.stamp):
+            self._send(message, KEPT.get(channel, channel in RARE))
+        look = self._looks.get(channel)
+        if look is not None:
+            try:
+                look(message.data, message.stamp)
+            except PerchError as error:
+                self.warn(f"{channel} is not drawn: {error}", every=1.0)
+
+    def on_image(self, camera: str, image: CameraImage) -> None:
+        """Pass an image on while somebody looks."""
+        pace = self._image_paces.get(camera)
+        if pace is None:
+            return
+        channel = f"camera_{camera}/image_raw/compressed"
+        topic = self.resolve(channel)
+        self._declare(topic, self.codec.message(channel))
+        if not pace(image.stamp) or not self.server.watched(topic):
+            return
+        packed = jpeg(image, self.config.image_quality)
+        if packed is not None:
+            self._send(self.serialized(channel, packed))
+
+    def close(self) -> None:
+        """End the connections."""
+        self.server.close()
+
+    def _declare(self, topic: str, message: type) -> None:
+        if topic not in self.server:
+            self.server.add_topic(topic, self.codec.schema(message))
+
+    def _send(self, message: Serialized, keep: int = 0) -> None:
+        self._declare(message.topic, message.message)
+        self.server.send(message.topic, message.data, message.stamp, keep)
+
+    # -- what the scene is made of -----------------------------------------------------------------------------------
+
+    def _see_truth(self, data: bytes, stamp: int) -> None:
+        self._truth = data
+
+    def _see_trajectory(self, data: bytes, stamp: int) -> None:
+        order = self.codec.decode("trajectory", data)
+        self._plan = plan_markers(order.trajectory, order.at_end == AtEnd.CONTACT)
+
+    def _see_target(self, data: bytes, stamp: int) -> None:
+        pose = self.codec.decode("target/pose", data)
+        self._target = target_markers(pose.p_WS, pose.q_WS)
+
+    def _see_lines(self, data: bytes, stamp: int) -> None:
+        lines = self.codec.decode("powerlines", data)
+        self._mapped |= {line.id for line in lines.lines}
+        self._map = map_markers(lines, self._mapped)
+
+    def _see_status(self, data: bytes, stamp: int) -> None:
+        self._words = self.codec.decode("controller/status", data).message
+
+    def _see_odometry(self, data: bytes, stamp: int) -> None:
+        if not self._scene_pace(stamp):
+            return
+        state = self.codec.decode("odometry", data)
+        self._flown.add(state.p_WB)
+        found = vehicle_markers(self._vehicle, state, self._words)
+        if self._truth:
+            truth = self.codec.decode("ground_truth/odometry", self._truth)
+            self._true_path.add(truth.p_WB)
+            found += truth_markers(self._vehicle, truth)
+        if self._scenes % SLOW_SCENE == 0:
+            found += self._world + self._plan + self._target + self._map + path_markers(self._flown, self._true_path)
+        self._scenes += 1
+        scene = Markers(stamp, tuple(found))
+        self.markers(scene)
+        self._send(self.serialized(MARKERS, scene))
+        self.server.tell_time(stamp)

@@ -1,0 +1,143 @@
+"""The state estimator: IMU and VIO in, odometry at every IMU sample out. [M:IV-B]"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.component import Component, Diagnostics, Input, Output
+from perch_core.errors import PerchError
+from perch_core.values import EstimatorHealth, ImuSample, InertialState, OdometryState, Transform, rotated
+from perch_perception.estimators import EstimatorConfig
+from perch_perception.imu_intake import ImuIntake
+from perch_perception.ukf import Estimate, Estimator, VioOutcome, VioPose
+from perch_perception.ukf.odometry import covariances, pose_of, state_of
+from perch_perception.world_frames import MAP, is_world
+
+STATUS_PERIOD = 100_000_000        # [ns]
+DIAGNOSTICS_PERIOD = 1_000_000_000
+DIAGNOSTICS_PHASE = 334_000_000    # not with the status
+STATES_LAST = 1_000_000_000        # time after VIO's last whole state in which its odometry is ignored [ns]
+MOST_UNUSED = 20                   # measurements that wait for the next IMU sample
+_NEVER = -(1 << 62)
+V = TypeVar("V", InertialState, OdometryState)
+
+
+class StateEstimator(Component[EstimatorConfig]):
+    """Emits `odometry` with the stamp of each IMU sample, with what VIO said before it.
+
+    VIO's odometry is ignored while VIO's whole state is available: nothing made of both can be better.
+    """
+
+    config_type = EstimatorConfig
+
+    imu = Input(ImuSample, "imu/data_raw")
+    vio_state = Input(InertialState, "vio/state")
+    vio_odometry = Input(OdometryState, "vio/odometry")
+    transform = Input(Transform, "/tf_static")
+    odometry = Output(OdometryState, "odometry")
+    status = Output(EstimatorHealth, "estimator/status")
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        super().__init__(config)
+        self._intake = ImuIntake(self.warn)
+        self._begin()
+
+    def _begin(self) -> None:
+        """With nothing known."""
+        self._estimator = Estimator(self.config)
+        self._unused: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, what it says)
+        self._newest_state = _NEVER
+        self._covariances = (np.zeros((6, 6)), np.zeros((6, 6)))
+        self._covariance_age = self.config.covariance_stride  # IMU samples since they were computed
+        self._first: int | None = None  # stamp of the first estimate
+        self._statuses = self._diagnoses = 0
+
+    def on_transform(self, transform: Transform) -> None:
+        """Where a frame, perhaps the IMU's, is in another."""
+        self._intake.add_transform(transform)
+
+    def on_vio_state(self, state: InertialState) -> None:
+        """Keep VIO's state for the next IMU sample."""
+        self._keep("vio/state", state, state_of)
+
+    def on_vio_odometry(self, odometry: OdometryState) -> None:
+        """Keep VIO's odometry for the next IMU sample."""
+        self._keep("vio/odometry", odometry, pose_of)
+
+    def on_imu(self, sample: ImuSample) -> None:
+        """Use what VIO has said, move the state to the sample's stamp, and emit it."""
+        taken = self._intake.take(sample)
+        if taken is None:
+            return
+        if self._intake.restarted:
+            self._begin()
+        if self._unused:
+            self._use_vio()
+        outcome = self._estimator.add_imu(taken)
+        if not outcome.used:
+            self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
+        estimate = self._estimator.estimate
+        if estimate is None:
+            return
+        self._emit(sample.stamp, estimate)
+        if self._first is None:
+            self._first = sample.stamp
+        since = sample.stamp - self._first
+        if since >= self._statuses * STATUS_PERIOD:
+            self._statuses = since // STATUS_PERIOD + 1
+            self._emit_status(sample.stamp, estimate)
+        if since >= self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE:
+            self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
+            self._diagnose(sample.stamp)
+
+    def _keep(self, channel: str, value: V, read: Callable[[V], VioPose]) -> None:
+        """Read a measurement."""
+        if not is_world(value.frame):
+            self.warn(f"{channel}: frame {value.frame!r} is no fixed frame known here: not used", 1.0)
+            return
+        try:
+            pose = read(value)
+        except (PerchError, TypeError, ValueError) as error:
+            self.warn(f"{channel}: {error}: not used", 1.0)
+            return
+        if len(self._unused) >= MOST_UNUSED:
+            self.warn(f"{channel}: more than {MOST_UNUSED} values without an IMU sample: the oldest are dropped", 1.0)
+            self._unused.pop(0)
+        self._unused.append((pose.stamp, pose.inertial is None, pose))
+
+    def _use_vio(self) -> None:
+        """In the order of the stamps; an odometry that has come with the state of the same stamp after it."""
+        unused, self._unused = sorted(self._unused, key=lambda entry: entry[:2]), []
+        for stamp, is_odometry, pose in unused:
+            if is_odometry and stamp <= self._newest_state + STATES_LAST:
+                continue
+            outcome = self._estimator.add_vio(pose)
+            if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
+                self._newest_state = stamp
+            self._covariance_age = self.config.covariance_stride
+            if not outcome.used and outcome not in (VioOutcome.WAITING, VioOutcome.NO_IMU):
+                self.warn(f"{'vio/odometry' if is_odometry else 'vio/state'}: at {stamp} ns {outcome.value}", 1.0)
+
+    def _emit(self, stamp: int, e: Estimate) -> None:
+        if self._covariance_age >= self.config.covariance_stride:
+            self._covariances = covariances(so3.quat_to_matrix(e.q_WB), e.v_WB, e.P, self.config.imu.gyro_noise)
+            self._covariance_age = 0
+        self._covariance_age += 1
+        q_WB = tuple(e.q_WB.tolist())
+        self.odometry(OdometryState(stamp, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(e.w_WB_B.tolist()),
+                                    *self._covariances, MAP))
+
+    def _emit_status(self, stamp: int, e: Estimate) -> None:
+        s = self._estimator.status
+        self.status(EstimatorHealth(stamp, s.health.value, s.vio_age, s.accepted, s.rejected, s.nis, tuple(e.gyro_bias.tolist()),
+                                    tuple(e.accel_bias.tolist()), s.position_sigma, s.attitude_sigma, s.message))
+
+    def _diagnose(self, stamp: int) -> None:
+        s = self._estimator.status
+        level = 0 if s.health.name == "RUNNING" else 2 if s.health.name == "DIVERGED" else 1
+        self.diagnostics(Diagnostics(stamp, {"state": s.health.name, "vio_age_s": s.vio_age, "updates_accepted": s.accepted,
+                                             "updates_rejected": s.rejected}, level, s.message))

@@ -1,0 +1,89 @@
+"""The camera that a component looks through, as it becomes known: intrinsics from `camera_info`, place on the vehicle from file or TF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from perch_core.camera import Camera, CameraMount
+from perch_core.values import CameraModel, Transform
+from perch_perception.static_transforms import BASE, StaticTransforms
+
+CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which they are believed to have changed
+
+
+class MountedCamera:
+    """Rate, exposure and stamp offset are those of the vehicle file.
+
+    Args:
+        nominal: the camera as the vehicle file has it.
+        extrinsics: `file`: its place on the vehicle is that of the file; `tf`: that of its optical frame in `/tf_static`.
+        warn: called with a warning and the least time between two of its kind [s].
+
+    Attributes:
+        mount: the camera; None until it is known. It is `nominal` itself where nothing differs.
+    """
+
+    def __init__(self, nominal: CameraMount, extrinsics: str, warn: Callable[[str, float], None]) -> None:
+        self.nominal, self.mount = nominal, None
+        self._by_transforms, self._warn = extrinsics == "tf", warn
+        self._transforms = StaticTransforms()
+        self._camera: Camera | None = None
+        self._frame, self._topic = "", f"camera_{nominal.name}/camera_info"
+        self._other: Camera | None = None
+        self._others = 0
+
+    @property
+    def missing(self) -> str:
+        """What is not known yet; empty where the camera is."""
+        if self.mount is not None:
+            return ""
+        return f"no {self._topic} yet" if self._camera is None else f"/tf_static does not say yet where {self._frame!r} is in {BASE}"
+
+    def take_model(self, model: CameraModel) -> bool:
+        """Take a camera's intrinsics; whether `mount` is another one now."""
+        camera = model.camera
+        if camera is self._camera or camera == self._camera:
+            self._others = 0
+            if self._by_transforms and model.frame != self._frame:
+                self._frame = model.frame
+                return self._place()
+            return False
+        if self._camera is not None and not self._is_confirmed(camera):
+            return False
+        self._camera = self.nominal.camera if camera == self.nominal.camera else camera
+        self._frame, self._others = model.frame, 0
+        return self._place()
+
+    def take_transform(self, transform: Transform) -> bool:
+        """Take where a frame is in another; whether `mount` is another one now."""
+        problem = self._transforms.add(transform)
+        if problem:
+            self._warn(f"/tf_static: {problem}", 1.0)
+        return self._by_transforms and self._camera is not None and self._place()
+
+    def _is_confirmed(self, camera: Camera) -> bool:
+        """Whether other intrinsics have come often enough: one message of somebody else's camera must not upset a flight."""
+        self._others = self._others + 1 if camera == self._other else 1
+        self._other = camera
+        if self._others < CONFIRMATIONS:
+            self._warn(f"{self._topic}: differs from what it was: not used before {CONFIRMATIONS} in a row agree", 1.0)
+            return False
+        self._warn(f"{self._topic}: the camera has changed", 0.0)
+        return True
+
+    def _place(self) -> bool:
+        mount = self._mount()
+        changed = mount is not None and (self.mount is None or mount.camera != self.mount.camera or not (
+            np.array_equal(mount.p_BC, self.mount.p_BC) and np.array_equal(mount.R_BC, self.mount.R_BC)))
+        if changed:
+            self.mount = mount
+        return changed
+
+    def _mount(self) -> CameraMount | None:
+        if not self._by_transforms:
+            return self.nominal if self._camera is self.nominal.camera else replace(self.nominal, camera=self._camera)
+        place = self._transforms.pose(self._frame)
+        return None if place is None else replace(self.nominal, camera=self._camera, p_BC=place[0], R_BC=place[1])

@@ -1,0 +1,115 @@
+"""The powerline mapper: images of the front camera in, the map of powerlines out. [P:sec. VI]"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import config
+from perch_core.camera import CameraMount
+from perch_core.component import Diagnostics, Output
+from perch_core.covariance import largest_sigma
+from perch_core.values import CameraImage, MappedPowerline, PowerlineMap, nanoseconds
+from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
+from perch_perception.images import ImageError, mono_image, rgb_image
+from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
+from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+
+DIAGNOSTICS_PERIOD = 1.0  # [s]
+
+
+@dataclass(frozen=True)
+class PowerlineMapperConfig:
+    """Parameters of the powerline mapper."""
+
+    vehicle: str = config.text("rpg", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    camera: str = config.text("front", doc="camera of the vehicle, colour for red wires; its images are on camera_<name>/image_raw")
+    images: str = images_parameter()
+    extrinsics: str = extrinsics_parameter()
+    rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
+    max_pose_sigma: float = config.quantity(2.0, unit="m", above=0.0, high=10.0,
+                                            doc="odometry less certain than this maps nothing")
+    detection: LineDetectionConfig = config.part(LineDetectionConfig)
+    mapper: MapperConfig = config.part(MapperConfig)
+
+
+class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
+    """Emits the whole map for every image that is used, `rate` of them a second."""
+
+    config_type = PowerlineMapperConfig
+
+    powerlines = Output(PowerlineMap, "powerlines")
+
+    def __init__(self, config: PowerlineMapperConfig) -> None:
+        super().__init__(config)
+        self._pixels = rgb_image if config.detection.appearance == "red" else mono_image
+        self._images, self._diagnosed = 0, -np.inf
+        self._forget()
+
+    def _forget(self) -> None:
+        self._mapper, self._used = LineMapper(self.config.mapper), -np.inf
+
+    def unusable(self, mount: CameraMount) -> str:
+        """Red wires need colour."""
+        return "no colour camera" if self.config.detection.appearance == "red" and not mount.colour else ""
+
+    def use_camera(self, mount: CameraMount) -> None:
+        """Nothing is kept that depends on the camera."""
+
+    def restart(self) -> None:
+        """Forget the map, too."""
+        super().restart()
+        self._forget()
+
+    def look(self, image: CameraImage, exposed: float) -> None:
+        """Map one image where it is its turn, and tell."""
+        if exposed - self._used < 1.0 / self.config.rate - 1e-3:
+            return
+        self._used = exposed
+        mount, problem = self.mounted.mount, ""
+        try:
+            body = mapping_pose(self.bodies, exposed, self.config.max_pose_sigma)
+            sightings = detect_lines(self._pixels(image, mount.camera), mount.camera, self.config.detection)
+            lines = self._mapper.update(exposed, body, [place(one, body, mount) for one in sightings])
+            self._images += 1
+        except (ImageError, StampError) as error:
+            lines, problem = self._mapper.map(exposed), str(error)
+            self.warn(f"{self._topic}: {problem}", 1.0)
+        told = map_value(lines, exposed, problem)
+        self.powerlines(told)
+        if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD or exposed < self._diagnosed:
+            self._diagnosed = exposed
+            self.diagnostics(Diagnostics(told.stamp, {"images": self._images, "lines": len(told.lines), "dropped": self.dropped},
+                                         1 if told.message else 0, told.message or "ok"))
+
+
+def mapping_pose(poses: PoseBuffer, exposed: float, max_sigma: float) -> BodyState:
+    """Where the vehicle was at an exposure [s], when that is known well enough to map.
+
+    Raises:
+        StampError: there is no pose at this stamp, or its position is less certain than `max_sigma` [m].
+    """
+    body = poses.at(exposed)
+    sigma = largest_sigma(body.covariance[:3, :3])
+    if sigma > max_sigma:
+        raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")
+    return body
+
+
+def map_value(lines: LineMap, exposed: float, problem: str = "") -> PowerlineMap:
+    """The map as it is told.
+
+    Args:
+        lines: what is known.
+        exposed: middle of the last image's exposure [s].
+        problem: why that image was not used; empty when it was.
+    """
+    segments = []
+    for line in lines.lines:
+        start, end = line.segment.ends
+        segments.append(MappedPowerline(
+            int(line.segment.id), tuple(map(float, start)), tuple(map(float, end)), float(line.segment.radius),
+            line.covariance.astype(float), float(line.direction_sigma), int(line.observations)))
+    return PowerlineMap(nanoseconds(exposed), tuple(segments), bool(lines.degenerate),
+                        "; ".join(part for part in (problem, lines.message) if part))

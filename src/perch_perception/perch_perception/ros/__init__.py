@@ -1,1 +1,0 @@
-"""ROS code that several nodes of perch_perception share."""

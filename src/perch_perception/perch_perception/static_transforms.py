@@ -1,0 +1,61 @@
+"""Where frames that do not move are in each other: `/tf_static` as perception needs it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.values import Transform
+
+BASE = "base_link"
+MOST = 1000  # frames kept
+
+
+class StaticTransforms:
+    """A tree of frames, each with its place in its parent."""
+
+    def __init__(self) -> None:
+        self._placed: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # child -> parent, p, R
+
+    def add(self, transform: Transform) -> str:
+        """Take a transform; the last one of a child counts.
+
+        Returns:
+            Why it cannot be used; empty where it is taken.
+        """
+        name = f"transform {transform.parent!r} -> {transform.child!r}"
+        values = (*transform.p, *transform.q)
+        if len(values) != 7 or not all(math.isfinite(x) and abs(x) < 1e6 for x in values):
+            return f"{name} is not finite"
+        if abs(math.hypot(*transform.q) - 1.0) > 1e-2:
+            return f"{name} has no unit quaternion: its norm is {math.hypot(*transform.q):.3g}"
+        if not transform.parent or not transform.child or transform.parent == transform.child:
+            return f"{name} does not name two frames"
+        if len(self._placed) >= MOST and transform.child not in self._placed:
+            return f"{name} is one of more than {MOST}"
+        q = np.array(transform.q) / np.linalg.norm(transform.q)
+        self._placed[transform.child] = transform.parent, np.array(transform.p, float), so3.quat_to_matrix(q)
+        return ""
+
+    def pose(self, child: str, parent: str = BASE) -> tuple[np.ndarray, np.ndarray] | None:
+        """Position (3,) [m] and attitude (3, 3) of `child` in `parent`; None where no chain leads from one to the other."""
+        up, down = self._to_root(child), self._to_root(parent)
+        common = next((frame for frame in up if frame in down), None)
+        if common is None:
+            return None
+        (p_RC, R_RC), (p_RP, R_RP) = up[common], down[common]
+        return R_RP.T @ (p_RC - p_RP), R_RP.T @ R_RC
+
+    def _to_root(self, frame: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The pose of `frame` in itself and in each of its ancestors, nearest first."""
+        p, R = np.zeros(3), np.eye(3)
+        poses = {frame: (p, R)}
+        while frame in self._placed:
+            frame, p_step, R_step = self._placed[frame]
+            if frame in poses:
+                break  # a loop
+            p, R = p_step + R_step @ p, R_step @ R
+            poses[frame] = p, R
+        return poses

@@ -1,0 +1,169 @@
+"""The target localiser: images of the front camera in, the pose of the perching target in `map` out. [M:sec. IV-B]"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.camera import CameraMount, Region
+from perch_core.component import Diagnostics, Output
+from perch_core.covariance import largest_sigma
+from perch_core.tag_board import load_board
+from perch_core.values import CameraImage, TargetPose, TargetSighting, nanoseconds
+from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
+from perch_perception.images import ImageError, check_image, mono_image
+from perch_perception.pose_buffer import BodyState, StampError
+from perch_perception.tags import (
+    BoardLocalizer, CalibrationSigma, FusedTarget, Localization, LocalizerConfig, MapPose, fuse, start_fusion, to_map)
+
+DIAGNOSTICS_PERIOD = 1.0  # [s]
+
+
+@dataclass(frozen=True)
+class TargetLocalizerConfig:
+    """Parameters of the target localiser."""
+
+    vehicle: str = config.text("snapdragon", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    camera: str = config.text("front", doc="camera of the vehicle; its images are on camera_<name>/image_raw")
+    images: str = images_parameter()
+    extrinsics: str = extrinsics_parameter()
+    board: str = config.text("pad_four_tags", doc="tag board, config/boards/<name>.yaml")
+    mode: str = config.choice("joint", options=("joint", "average", "fused"),
+                              doc="joint: latest image, all corners together; average: the paper's mean over the tags of "
+                                  "the first complete image; fused: all images")
+    max_position_sigma: float = config.quantity(0.10, unit="m", above=0.0, high=10.0,
+                                                doc="worst axis with which target/pose is still published")
+    max_attitude_sigma: float = config.quantity(5.0, unit="deg", above=0.0, high=180.0, doc="the same for the attitude")
+    localizer: LocalizerConfig = config.part(LocalizerConfig)
+    calibration: CalibrationSigma = config.part(CalibrationSigma)
+
+
+class Localizer(Protocol):
+    """What finds the board in an image: `BoardLocalizer`, or an error model in its place."""
+
+    def process(self, image: Callable[[Region | None], np.ndarray], exposed: float, body: BodyState | None) -> Localization:
+        """Look for the board.
+
+        Args:
+            image: gives the grey image, uint8 (height, width), of which the region asked for holds.
+            exposed: middle of its exposure [s].
+            body: state of the vehicle then, where it is known.
+        """
+
+
+class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
+    """Emits `sighting` for every image and `pose` whenever the target is known well enough."""
+
+    config_type = TargetLocalizerConfig
+
+    pose = Output(TargetPose, "target/pose")
+    sighting = Output(TargetSighting, "target/detections")
+
+    def __init__(self, config: TargetLocalizerConfig, localizer: Localizer | None = None) -> None:
+        """
+        Args:
+            config: parameters.
+            localizer: what finds the board; None: `BoardLocalizer`, once the camera is known.
+
+        Raises:
+            ConfigError: no such vehicle, camera or board.
+        """
+        super().__init__(config)
+        self._board = load_board(config.board)
+        self._given, self._localizer = localizer, localizer
+        self._target: FusedTarget | MapPose | None = None
+        self._counts = {"images": 0, "found": 0, "complete": 0}
+        self._diagnosed = -np.inf
+
+    def use_camera(self, mount: CameraMount) -> None:
+        """Look through another lens, from another place."""
+        if self._given is None:
+            self._localizer = BoardLocalizer(self._board, mount, self.config.localizer, averaging=self.config.mode == "average",
+                                             calibration=self.config.calibration)
+
+    def restart(self) -> None:
+        """Forget the target, too."""
+        super().restart()
+        self._target = None
+        if self.mounted.mount is not None:
+            self.use_camera(self.mounted.mount)
+
+    def look(self, image: CameraImage, exposed: float) -> None:
+        """Localise the board in one image, and tell."""
+        body, problem = None, ""
+        try:
+            body = self.bodies.at(exposed)
+        except StampError as error:
+            problem = str(error)
+        camera = self.mounted.mount.camera
+        try:
+            check_image(image, camera)
+            result = self._localizer.process(lambda region=None: mono_image(image, camera, region), exposed, body)
+        except ImageError as error:
+            result = Localization(None, message=str(error))
+            self.warn(f"{self._topic}: {error}", 1.0)
+        self._tell(result, body, exposed, problem)
+
+    def refuse(self, image: CameraImage, exposed: float, reason: str) -> None:
+        """Tell why nothing is seen."""
+        super().refuse(image, exposed, reason)
+        self._tell(Localization(None, message=reason), None, exposed, "")
+
+    def _tell(self, result: Localization, body: BodyState | None, exposed: float, problem: str) -> None:
+        stamp = nanoseconds(exposed)
+        self._counts["images"] += 1
+        message = "; ".join(part for part in (result.message, problem if result.board is not None else "") if part)
+        sighting = TargetSighting(stamp, False, None, None, (), 0.0, 0, self.config.mode, message)
+        if result.board is not None:
+            shown = result.average or result.board
+            self._counts["complete"] += result.complete
+            sighting = sighting._replace(ids=tuple(int(i) for i in shown.ids), reprojection_rms=float(shown.rms),
+                                         pose_camera=_pose(stamp, shown.p_CS, shown.R_CS, shown.covariance))
+            if body is not None:
+                self._counts["found"] += 1
+                sighting = self._update(result, body, sighting)
+        self.sighting(sighting)
+        if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD or exposed < self._diagnosed:
+            self._diagnosed = exposed
+            self.diagnostics(Diagnostics(stamp, {**self._counts, "dropped": self.dropped, "mode": self.config.mode},
+                                         1 if message else 0, message or "ok"))
+
+    def _update(self, result: Localization, body: BodyState, sighting: TargetSighting) -> TargetSighting:
+        """Bring the target up to date by the mode, and tell where it is good enough."""
+        measured = to_map(result.average or result.board, body, self.mounted.mount, self.config.calibration)
+        fresh, frames, method = True, 1, self.config.mode
+        if method == "fused":
+            self._fuse(measured)
+            frames = self._target.frames if self._target is not None else 1
+        elif method == "average":
+            fresh = self._target is None and result.average is not None  # the first complete image, once
+            if fresh:
+                self._target = measured
+            elif self._target is None:
+                method = "joint"  # not all tags yet: this is no average
+        else:
+            self._target = measured
+        target = self._target if self._target is not None else measured
+        pose = _pose(sighting.stamp, target.p_WS, target.R_WS, target.covariance)
+        if fresh and self._good(target.covariance):
+            self.pose(pose)
+        return sighting._replace(found=True, pose=pose, frames_fused=frames, method=method)
+
+    def _fuse(self, measured: MapPose) -> None:
+        if self._target is not None:
+            self._target = fuse(self._target, measured)
+        elif self._good(measured.covariance):  # not before the estimator knows where it is
+            self._target = start_fusion(measured)
+
+    def _good(self, covariance: np.ndarray) -> bool:
+        """Whether the worst axes of position and attitude are known within the limits."""
+        position, attitude = largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:, 3:])
+        return bool(position <= self.config.max_position_sigma and attitude <= np.radians(self.config.max_attitude_sigma))
+
+
+def _pose(stamp: int, p: np.ndarray, R: np.ndarray, covariance: np.ndarray) -> TargetPose:
+    return TargetPose(stamp, np.asarray(p, float), so3.quat_from_matrix(R), np.asarray(covariance, float))

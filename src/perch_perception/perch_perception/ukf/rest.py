@@ -1,0 +1,51 @@
+"""The UKF at rest: pose constant, velocity zero, biases seen directly.
+
+While the vehicle rests, the IMU is no input of the motion model but a measurement: the pose does not move, the biases walk, and
+
+    0 = v + n_v,    w_mean = b_g + n_w,    f_mean = b_a + R^T g + n_f.
+
+So position and heading are as certain after an hour as they were when the rest began, and no surer. [OpenVINS: zero-velocity update]
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from perch_core import so3
+from perch_core.vehicle import GRAVITY
+from perch_perception.ukf import layout as at
+from perch_perception.ukf.config import UkfConfig
+from perch_perception.ukf.unscented import ACCEL, DT, GYRO, Belief, Innovation, UnscentedTransform
+
+
+def stopped(belief: Belief, config: UkfConfig) -> Belief | None:
+    """The belief of a vehicle that has come to rest; None: it knows that the vehicle moves, steadily."""
+    H = np.zeros((3, at.ERROR_SIZE))
+    H[:, at.D_VELOCITY] = np.eye(3)
+    innovation = _innovation(belief, H, -belief.x[at.VELOCITY], np.full(3, config.rest.velocity**2))
+    return UnscentedTransform.correct(belief, innovation) if innovation.nis < chi2.ppf(config.gate_probability, 3) else None
+
+
+def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:
+    """The belief of a vehicle at rest over IMU steps (m, 9), m > 0, at their end `stamp` [ns]."""
+    imu, x, P = config.imu, belief.x.copy(), belief.P.copy()
+    T, d = float(steps[:, DT].sum()), np.arange(3)
+    x[at.VELOCITY] = 0.0
+    P[at.D_VELOCITY, :] = P[:, at.D_VELOCITY] = 0.0
+    P[at.D_VELOCITY, at.D_VELOCITY] = config.rest.velocity**2 * np.eye(3)  # how it trembles now says nothing of then
+    P[9 + d, 9 + d] += imu.gyro_bias_walk**2 * T
+    P[12 + d, 12 + d] += imu.accel_bias_walk**2 * T
+    up_B = so3.quat_rotate(so3.quat_conjugate(x[at.QUATERNION]), np.array([0.0, 0.0, GRAVITY]))
+    H = np.zeros((6, at.ERROR_SIZE))
+    H[:3, at.D_GYRO_BIAS] = H[3:, at.D_ACCEL_BIAS] = np.eye(3)
+    H[3:, at.D_ATTITUDE] = so3.hat(up_B)
+    residual = np.concatenate([steps[:, GYRO].mean(axis=0) - x[at.GYRO_BIAS], steps[:, ACCEL].mean(axis=0) - x[at.ACCEL_BIAS] - up_B])
+    still = Belief(stamp, x, P)
+    return UnscentedTransform.correct(still, _innovation(still, H, residual, np.repeat([imu.gyro_noise**2, imu.accel_noise**2], 3) / len(steps)))
+
+
+def _innovation(belief: Belief, H: np.ndarray, residual: np.ndarray, variance: np.ndarray) -> Innovation:
+    S = H @ belief.P @ H.T + np.diag(variance)
+    gain = np.linalg.solve(S, H @ belief.P).T
+    return Innovation(residual, S, np.ascontiguousarray(gain), float(residual @ np.linalg.solve(S, residual)))

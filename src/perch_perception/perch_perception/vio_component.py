@@ -1,0 +1,140 @@
+"""Visual-inertial odometry: images of the downward camera and the IMU in, whole state and odometry for each frame out. [M:IV-B]"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.camera import CameraMount
+from perch_core.component import Diagnostics, Input, Output
+from perch_core.values import CameraImage, ImuSample, InertialState, OdometryState, Transform, rotated
+from perch_core.vehicle import load_vehicle
+from perch_perception.camera_component import CameraComponent, extrinsics_parameter, images_parameter
+from perch_perception.images import ImageError, mono_image
+from perch_perception.imu_intake import ImuIntake
+from perch_perception.ukf.odometry import covariances
+from perch_perception.vio import FrameOutcome, VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
+from perch_perception.vio.drawing import TrackPainter
+from perch_perception.world_frames import ODOM
+
+DIAGNOSTICS_PERIOD = 1_000_000_000  # [ns]
+
+
+@dataclass(frozen=True)
+class VioComponentConfig(VioConfig):
+    """Parameters of the component: those of the odometry, and what it belongs to."""
+
+    vehicle: str = config.text("snapdragon", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    camera: str = config.text("down", doc="camera of the vehicle; its images are on camera_<name>/image_raw")
+    images: str = images_parameter()
+    extrinsics: str = extrinsics_parameter()
+    start_position: tuple[float, float, float] = config.quantity(
+        (0.0, 0.0, 0.0), unit="m", doc="ground point under the vehicle in map, as in a scenario's start")
+    start_yaw_deg: float = config.quantity(0.0, unit="deg", low=-180.0, high=180.0, doc="heading at the start in map")
+
+
+class VioComponent(CameraComponent[VioComponentConfig]):
+    """Emits `state` and `odometry` for every frame that gives a pose, once the IMU has passed its exposure.
+
+    Attributes:
+        result: what became of the last frame.
+    """
+
+    config_type = VioComponentConfig
+
+    imu = Input(ImuSample, "imu/data_raw", lazy=True)
+    state = Output(InertialState, "vio/state")
+    odometry = Output(OdometryState, "vio/odometry")
+    debug_image = Output(CameraImage, "vio/debug_image")
+
+    def __init__(self, config: VioComponentConfig) -> None:
+        super().__init__(config)
+        self._standing_height = load_vehicle(config.vehicle).standing_height
+        self._intake = ImuIntake(self.warn)
+        self._counts = dict.fromkeys(FrameOutcome, 0)
+        self._painter = TrackPainter()
+        self._begin()
+
+    def _begin(self) -> None:
+        """On the ground, where the parameters say."""
+        c = self.config
+        standing = np.array(c.start_position) + [0.0, 0.0, self._standing_height]
+        self._vio = VisualInertialOdometry(c, self.mounted.mount or self.mounted.nominal, standing, float(np.radians(c.start_yaw_deg)),
+                                           float(c.start_position[2]))
+        self.result: VioResult | None = None
+        self._outcome: FrameOutcome | None = None
+        self._diagnosed: int | None = None
+
+    def use_camera(self, mount: CameraMount) -> None:
+        """Look through another lens, from another place."""
+        if mount is not self._vio.mount:
+            self._vio.use_camera(mount)
+
+    def on_transform(self, transform: Transform) -> None:
+        """Where a frame, perhaps the camera's or the IMU's, is in another."""
+        self._intake.add_transform(transform)
+        super().on_transform(transform)
+
+    def on_imu(self, sample: ImuSample) -> None:
+        """Keep a sample; images may have waited for it."""
+        taken = self._intake.take(sample)
+        if taken is None:
+            return
+        if self._intake.restarted:
+            self._begin()
+            self.forget_images()
+        outcome = self._vio.add_imu(taken)
+        if not outcome.used:
+            self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
+        if self._waiting:
+            self.advance()
+
+    def covers(self, image: CameraImage) -> bool:
+        """Whether the IMU has passed its exposure, or the stamp cannot be waited for."""
+        return self._vio.covers(image.stamp)
+
+    def use(self, image: CameraImage) -> None:
+        """Use a frame, and tell."""
+        try:
+            pixels = mono_image(image, self.mounted.mount.camera)
+        except ImageError as error:
+            pixels, result = None, VioResult(FrameOutcome.BAD_IMAGE, message=str(error))
+        else:
+            result = self._vio.add_image(image.stamp, pixels)
+        self.result = result
+        self._counts[result.outcome] += 1
+        if result.estimate is not None:
+            self._emit(result.estimate)
+        if result.outcome is not self._outcome:
+            self._outcome = result.outcome
+            (self.info if result.outcome.has_pose else self.warn)(f"{result.outcome.name.lower()}: {result.message}")
+        if pixels is not None and self.debug_image.wanted:
+            self._draw(image, pixels, result)
+        if self._diagnosed is None or abs(image.stamp - self._diagnosed) >= DIAGNOSTICS_PERIOD:
+            self._diagnosed = image.stamp
+            self._diagnose(image.stamp, result)
+
+    def _emit(self, e: VioPoseEstimate) -> None:
+        q = so3.quat_from_matrix(e.R_WB)
+        self.state(InertialState(e.stamp, e.p_WB, q, e.v_WB, e.gyro_bias, e.accel_bias, e.P, ODOM))
+        q_WB = tuple(q.tolist())
+        self.odometry(OdometryState(e.stamp, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(e.w_WB_B.tolist()),
+                                    *covariances(e.R_WB, e.v_WB, e.P, self.config.imu.gyro_noise), ODOM))
+
+    def _draw(self, image: CameraImage, pixels: np.ndarray, result: VioResult) -> None:
+        features = self._vio.tracker.latest
+        if features is None:
+            return
+        landmarks = set(self._vio.filter.state.landmarks) if self._vio.filter else set()
+        caption = f"{result.outcome.name.lower()}  {result.features} tracks, {result.used} used, {result.refused} refused"
+        drawn = self._painter.paint(pixels, features, landmarks, caption)
+        self.debug_image(CameraImage(image.stamp, image.frame, drawn.shape[1], drawn.shape[0], "bgr8", drawn))
+
+    def _diagnose(self, stamp: int, result: VioResult) -> None:
+        values = {"outcome": result.outcome.name, "features": result.features, "used": result.used, "refused": result.refused,
+                  "blind_for_s": float(result.blind_for), "restarts": result.restarts, "dropped": self.dropped,
+                  "time_offset_ms": 1e3 * float(self._vio.time_offset)}
+        values |= {f"frames_{outcome.name.lower()}": n for outcome, n in self._counts.items() if n}
+        self.diagnostics(Diagnostics(stamp, values, 0 if result.outcome.has_pose else 1, result.message))

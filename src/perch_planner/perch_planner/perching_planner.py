@@ -1,0 +1,194 @@
+"""The perching planner as a component: service `plan_perch`, requests to plans or typed refusals. [M:IV-C]"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.component import Component, Diagnostics, Job, JobStopped, Service
+from perch_core.config import quantity, text
+from perch_core.errors import ConfigError, PerchError
+from perch_core.surface import PerchSurface
+from perch_core.trajectory import FlatTrajectory
+from perch_core.values import PerchPlan, PerchPlanRequest, seconds
+from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
+from perch_planner import planner, refusals, request_limits
+from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
+from perch_planner.refusals import PerchRefusal
+
+OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
+OBJECTIVES = {4: "snap", 3: "jerk"}
+
+
+class PerchPlanError(IntEnum):
+    """Error codes of `PerchPlan`, as in perch_msgs/srv/PlanPerch; the names are those of the refusals in capitals."""
+
+    OK = 0
+    BAD_INPUT = 1
+    UNREACHABLE_TILT = 2
+    INFEASIBLE_WINDOW = 3
+    THRUST_FLOOR = 4
+    BOX = 5
+    BODY_RATE = 6
+    SOLVER = 7
+    TIME_LIMIT = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerchingPlannerParameters(PerchSettings):
+    """Parameters of the component: those of the planner, and the vehicle it plans for."""
+
+    vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
+    contact_time: float = quantity(0.3, unit="s", low=0.0, high=10.0, doc="wait for contact after the end")
+    time_limit: float = quantity(2.0, unit="s", above=0.0, high=60.0, doc="wall-clock limit of a plan, from the request on")
+
+
+class PerchingPlanner(Component[PerchingPlannerParameters]):
+    """Plans perches; each plan is a job that the host may run in another process."""
+
+    config_type = PerchingPlannerParameters
+    changeable = tuple(field.name for field in fields(PerchingPlannerParameters) if field.name != "vehicle")
+
+    plan_perch = Service(PerchPlanRequest, PerchPlan, "plan_perch")
+
+    def __init__(self, config: PerchingPlannerParameters) -> None:
+        super().__init__(config)
+        self._vehicle = load_vehicle(config.vehicle)
+
+    def preload(self) -> Callable[[], None]:
+        """Load or compile the kernels."""
+        return partial(_load, self.config, self._vehicle)
+
+    def on_plan_perch(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
+        """Plan, and reply when there is an answer."""
+        limit = self.config.time_limit
+        answer = partial(self._answer, request, reply, limit)
+        try:
+            request_limits.check("request", request, request_limits.PERCH_PLAN)
+            problem = perch_problem(request)
+            arguments = (problem, perch_settings(request, self.config, problem.surface), self._vehicle)
+        except PerchError as error:
+            answer(error)
+            return
+        self.work(Job(solve, arguments, answer, limit, isolated=True))
+
+    def _answer(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
+        """Reply with a plan, or with the error that there is in its place."""
+        if isinstance(found, planner.PerchPlan):
+            answer = perch_plan(found, request, float(self.config.contact_time))
+        else:
+            answer = refused(found, limit)
+            self.warn(f"no plan: {answer.message}")
+        self.diagnostics(Diagnostics(request_limits.stamp_of(request), {
+            "success": answer.success, "error_code": int(answer.error_code), "iterations": answer.iterations,
+            "solve_ms": 1e3 * answer.solve_time}))
+        reply(answer)
+
+
+def _load(settings: PerchSettings, vehicle: Vehicle) -> None:
+    """Plan once, so that the kernels are there before the first request."""
+    surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
+    try:
+        planner.plan(PerchProblem(StartState((0.0, 0.0, 1.5)), surface), settings, vehicle)
+    except PerchRefusal:  # these limits may leave no plan; the kernels are there all the same
+        pass
+
+
+def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> planner.PerchPlan:
+    """Plan; the job of a request.
+
+    Raises:
+        PerchRefusal: there is no plan; code solver where the numerics failed in a way that nobody had foreseen.
+    """
+    try:
+        return planner.plan(problem, settings, vehicle)
+    except (PerchError, MemoryError):
+        raise
+    except Exception as error:  # whoever asked must get an answer whatever happens here
+        raise PerchRefusal(refusals.SOLVER, "numerics", -math.inf, f"planning failed: {type(error).__name__}: {error}") from error
+
+
+def perch_problem(request: PerchPlanRequest) -> PerchProblem:
+    """The problem of a request.
+
+    Raises:
+        ConfigError: a quaternion that is none, or a start outside `current`.
+    """
+    norm = float(np.linalg.norm(request.q_WS))
+    if not abs(norm - 1.0) < 1e-3:
+        raise ConfigError("request", "q_WS", f"target.orientation: norm {norm:.4f} is not 1")
+    # What is normalised already stays as it is to the last bit.
+    q_WS = np.asarray(request.q_WS, float) / (norm if abs(norm - 1.0) > 1e-9 else 1.0)
+    surface = PerchSurface(np.asarray(request.p_WS, float), so3.quat_to_matrix(q_WS), (1.0, 1.0))
+    if request.current is not None:
+        current = request.current
+        if not isinstance(current, FlatTrajectory):
+            raise ConfigError("request", "current", "carries samples; a start needs polynomial segments")
+        if current.degree > request_limits.DEGREE:
+            raise ConfigError("request", "current", f"degree {current.degree} is above {request_limits.DEGREE}")
+        request_limits.check("request: current", current, request_limits.CURRENT)
+        start = StartState.on(current, seconds(request.start) - current.start_time)
+        request_limits.check("request: current", start, request_limits.STATE)
+    else:
+        start = StartState(request.p, request.v, request.a, request.j, request.yaw, request.yaw_rate)
+    return PerchProblem(start, surface, tuple(Waypoint(p) for p in request.waypoints), request.target_velocity,
+                        tuple(request.segment_times) or None)
+
+
+def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: PerchSurface) -> PerchSettings:
+    """Settings for a surface, with the options of a request in their place.
+
+    A surface that faces up is fallen onto, and what falls through the whole tube with g s3_z - alpha has risen from below the surface
+    before, unless alpha leaves so much that v_n is not yet reversed at the tube's beginning: where nobody asks for another,
+    alpha >= g s3_z - v_min / t_k.
+
+    Raises:
+        ConfigError: an option is out of its range.
+    """
+    changes: dict[str, Any] = {name: float(value) for name in OPTIONS if (value := getattr(request, name)) is not None}
+    if request.objective:
+        if request.objective not in OBJECTIVES:
+            raise ConfigError("request", "objective", f"{request.objective} is not one of {sorted({0, *OBJECTIVES})}")
+        changes["objective"] = OBJECTIVES[request.objective]
+    if request.minimum_time:
+        changes["minimum_time"] = True
+    if "impact_acceleration" not in changes and settings.tube_time > 0.0:
+        slowest = changes.get("impact_speed_min", settings.impact_speed_min)
+        changes["impact_acceleration"] = max(settings.impact_acceleration, GRAVITY * float(surface.normal[2]) - slowest / settings.tube_time)
+    try:
+        return config.replace(settings, **changes) if changes else settings
+    except ConfigError as error:
+        raise ConfigError("request", error.key, error.problem) from None
+
+
+def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time: float) -> PerchPlan:
+    """The answer that carries a plan."""
+    trajectory = FlatTrajectory(found.trajectory.durations, found.trajectory.coefficients, seconds(request.start))
+    return PerchPlan(
+        success=True, message=f"contact after {found.duration:.3f} s", trajectory=trajectory, contact_time=contact_time,
+        certificates=found.certificates, iterations=found.iterations, solve_time=float(found.solve_time))
+
+
+def refused(error: Exception, limit: float) -> PerchPlan:
+    """The answer where there is no plan.
+
+    Args:
+        error: a `PerchRefusal`, what a job ends with, or what is wrong with the request.
+        limit: wall-clock limit that the plan had [s].
+    """
+    if isinstance(error, PerchRefusal):
+        return PerchPlan(success=False, error_code=PerchPlanError[error.code.upper()], message=str(error),
+                         certificates=error.certificates, iterations=error.iterations)
+    if isinstance(error, JobStopped):
+        return PerchPlan(success=False, error_code=PerchPlanError.TIME_LIMIT,
+                         message=f"no plan within time_limit {limit:g} s ({error}); ask for fewer waypoints or raise time_limit")
+    if isinstance(error, ConfigError):
+        return PerchPlan(success=False, error_code=PerchPlanError.BAD_INPUT, message=str(error))
+    return PerchPlan(success=False, error_code=PerchPlanError.SOLVER, message=str(error))

@@ -1,0 +1,138 @@
+"""Requests of `plan_powerline` to what the planner takes, and its plans to answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import IntEnum
+
+import numpy as np
+
+from perch_core.errors import ConfigError, PerchError, PlanningRefusal
+from perch_core.lines import Segment
+from perch_core.rotor_model import P, THRUST, V, W, RotorModel, hover_state
+from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePlanRequest, seconds
+from perch_planner import request_limits
+from perch_planner.powerline import plan
+from perch_planner.powerline.request import PerchPose, PowerlineRequest
+
+POINT_REACH = 3.0
+"""A perch point farther from its line, or beyond its ends, means another one [m]."""
+
+
+class PowerlinePlanError(IntEnum):
+    """Error codes of `PowerlinePlan`, as in perch_msgs/srv/PlanPowerline; the names are those of the refusals in capitals."""
+
+    OK = 0
+    BAD_INPUT = 1
+    EMPTY_MAP = 2
+    PERCH_IN_COLLISION = 3
+    START_INVALID = 4
+    INFEASIBLE = 5
+    DEADLINE = 6
+    SOLVER = 7
+
+
+def check_request(request: PowerlinePlanRequest) -> None:
+    """Refuse what cannot be a request, before anything is made of it.
+
+    Raises:
+        ConfigError: names the field, its value and the range.
+    """
+    request_limits.check("request", request, request_limits.POWERLINE_PLAN)
+    if len(request.rotor_thrust) not in (0, 4):
+        raise ConfigError("request", "rotor_thrust", f"has {len(request.rotor_thrust)} values, needs 4 or none")
+    if len(request.lines) > request_limits.LINES_MAX:
+        raise ConfigError("request", "lines", f"{len(request.lines)} entries are more than {request_limits.LINES_MAX}")
+    for k, line in enumerate(request.lines):
+        request_limits.check(f"request: lines[{k}]", line, request_limits.LINE)
+    if request.perch_pose is not None:
+        for name, value, limit in zip(("position", "orientation"), request.perch_pose, request_limits.POSE):
+            request_limits.check_value("request", f"perch_pose.{name}", value, limit)
+
+
+def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offset: float) -> PowerlineRequest:
+    """The planner's request of one that was checked.
+
+    Args:
+        request: as asked.
+        model: of the vehicle, for the thrusts of a hover.
+        wire_offset: from the wire's axis to the centre of mass along b3 [m].
+
+    Raises:
+        PerchError: values that cannot be a request.
+    """
+    q_WB = np.asarray(request.q, float)
+    norm = float(np.linalg.norm(q_WB))
+    if not abs(norm - 1.0) < 1e-2:
+        raise PlanningRefusal("bad_input", "start attitude", -1.0, f"start quaternion has norm {norm:.4f}, not 1")
+    start = hover_state(model, np.asarray(request.p, float), q_WB)
+    start[V], start[W] = request.v, request.w
+    if len(request.rotor_thrust):
+        start[THRUST] = request.rotor_thrust
+    lines = tuple(_segment(line) for line in request.lines)
+    wanted = PowerlineRequest(start, lines, int(request.target_line), None, bool(request.perception_aware), bool(request.with_recovery),
+                              bool(request.recovery_only))
+    if request.recovery_only:
+        return wanted
+    target = wanted.target()
+    if request.perch_pose is not None:
+        perch = PerchPose.at(*request.perch_pose, request.end_velocity)
+    else:
+        _near(target, np.asarray(request.perch_point, float))
+        perch = PerchPose.on_line(target, request.perch_point, float(request.perch_pitch), wire_offset, start[P], request.end_velocity)
+    return replace(wanted, perch=perch)
+
+
+def _segment(line: MappedPowerline) -> Segment:
+    return Segment.between(np.array(line.start), np.array(line.end), float(line.radius), int(line.id))
+
+
+def _near(target: Segment, point: np.ndarray) -> None:
+    away = float(target.distance(point))
+    if away > POINT_REACH:
+        raise PlanningRefusal("bad_input", "perch point", POINT_REACH - away,
+                              f"perch_point {point.tolist()} is {away:.2f} m from line {target.id} between its ends "
+                              f"(allowed {POINT_REACH:g} m)")
+
+
+def answer(found: plan.PowerlinePlan, model: RotorModel, sample_step: float, contact_time: float, start: int) -> PowerlinePlan:
+    """The answer that carries a plan.
+
+    Args:
+        found: what was planned.
+        model: of the vehicle, for the accelerations.
+        sample_step: spacing of the trajectory's samples [s].
+        contact_time: how long the grip is awaited after a perch without recovery [s].
+        start: stamp of the trajectory's start [ns].
+    """
+    sampled = found.trajectory(model, step=sample_step)
+    trajectory = replace(sampled, q=sampled.q / np.linalg.norm(sampled.q, axis=1)[:, None], start_time=seconds(start))
+    perch, recovery = found.perch, found.recovery
+    at_end, recovery_start = AtEnd.CONTACT, -1.0
+    if recovery is not None:
+        at_end, recovery_start = (AtEnd.HOLD, 0.0) if perch is None else (AtEnd.RECOVER, float(perch.duration))
+    words = ([] if perch is None else [f"perch after {perch.duration:.3f} s"]) + (
+        [] if recovery is None else [f"recovery of {recovery.duration:.3f} s"])
+    return PowerlinePlan(
+        success=True, message=", then ".join(words), trajectory=trajectory, at_end=at_end,
+        contact_time=0.0 if perch is None else float(contact_time), recovery_start=recovery_start,
+        certificates=found.bounds,
+        perch_time=0.0 if perch is None else float(perch.duration), recovery_time=0.0 if recovery is None else float(recovery.duration),
+        solve_time=0.0 if perch is None else float(perch.solve_time),
+        recovery_solve_time=0.0 if recovery is None else float(recovery.solve_time),
+        iterations=int(sum(part.iterations for part in found.parts)), solver=found.parts[0].solver)
+
+
+def refused(error: Exception) -> PowerlinePlan:
+    """The answer where there is no plan.
+
+    Args:
+        error: a `PlanningRefusal`, what a job ends with, or what is wrong with the request.
+    """
+    if isinstance(error, PlanningRefusal):
+        code = PowerlinePlanError[error.code.upper()]
+    elif isinstance(error, ConfigError) or type(error) is PerchError:  # a line without length
+        code = PowerlinePlanError.BAD_INPUT
+    else:
+        code = PowerlinePlanError.SOLVER
+    return PowerlinePlan(success=False, error_code=code, message=str(error))

@@ -1,0 +1,150 @@
+"""The powerline planner as a component: service `plan_powerline`, requests to plans or typed refusals. [P:V]"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
+from typing import Any
+
+from perch_core.component import Component, Diagnostics, Job, JobStopped, Service
+from perch_core.config import quantity, text
+from perch_core.errors import ConfigError, PerchError, PlanningRefusal
+from perch_core.rotor_model import RotorModel
+from perch_core.values import PowerlinePlan, PowerlinePlanRequest
+from perch_core.vehicle import load_vehicle
+from perch_planner import request_limits
+from perch_planner.powerline import service
+from perch_planner.powerline.planner import PowerlinePlanner
+from perch_planner.powerline.request import PowerlineRequest
+from perch_planner.powerline.settings import DEADLINE_MAX, PowerlineSettings
+
+FIRST_SHARE = 0.6  # of the deadline: when the first solver has not answered by then, ipopt gets the rest
+_FALLBACK_LEAST = 0.05  # it needs more than that [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PowerlinePlannerParameters(PowerlineSettings):
+    """Parameters of the component: those of the planner, the vehicle it plans for, and how finely it answers."""
+
+    vehicle: str = text("rpg", doc="config/vehicles/<name>.yaml, or a file")
+    sample_step: float = quantity(0.004, unit="s", low=0.001, high=0.05, doc="spacing of the trajectory's points")
+    contact_time: float = quantity(0.1, unit="s", low=0.0, high=10.0, doc="wait for the grip after a perch without recovery")
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a job is about.
+
+    Attributes:
+        vehicle: name or file.
+        settings: of the planner.
+        request: what to plan.
+        sample_step, contact_time, start: as in `service.answer`.
+    """
+
+    vehicle: str
+    settings: PowerlineSettings
+    request: PowerlineRequest
+    sample_step: float
+    contact_time: float
+    start: int
+
+
+class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
+    """Plans perches on lines; each plan is a job that the host may run in another process.
+
+    A deadline counts from the request on, other requests being solved first. A first solver that was stopped at 60 % of it
+    leaves the rest to ipopt.
+    """
+
+    config_type = PowerlinePlannerParameters
+    changeable = ("deadline", "sample_step", "contact_time")
+
+    plan_powerline = Service(PowerlinePlanRequest, PowerlinePlan, "plan_powerline")
+
+    def __init__(self, config: PowerlinePlannerParameters) -> None:
+        super().__init__(config)
+        self._vehicle = load_vehicle(config.vehicle)
+        if config.camera not in self._vehicle.mounts:
+            raise ConfigError("powerline_planner", "camera", f"vehicle {self._vehicle.name} has no camera {config.camera!r}")
+        if not math.isfinite(self._vehicle.thrust_rate_max):
+            raise ConfigError("powerline_planner", "vehicle", f"{self._vehicle.name} has no thrust_rate_max, which [P:eq14g] needs")
+        self._model = RotorModel.of(self._vehicle)
+        # What may change is not part of it: it goes with each request.
+        own = {field.name: getattr(config, field.name) for field in fields(PowerlineSettings)}
+        self._settings = PowerlineSettings(**own | {"deadline": PowerlineSettings.deadline})
+
+    def preload(self) -> Callable[[], Any]:
+        """Load the planner, and compile it the first time on a machine."""
+        return partial(planner_of, self.config.vehicle, self._settings)
+
+    def on_plan_powerline(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None]) -> None:
+        """Plan, and reply when there is an answer."""
+        try:
+            service.check_request(request)
+            deadline = min(float(request.deadline or self.config.deadline), DEADLINE_MAX)
+            wanted = replace(service.planner_request(request, self._model, self._vehicle.wire_offset), deadline=deadline)
+        except PerchError as error:
+            self._reply(request, reply, error)
+            return
+        task = Task(self.config.vehicle, self._settings, wanted, self.config.sample_step, self.config.contact_time, request.start)
+        self._ask(request, reply, task, FIRST_SHARE if self._settings.solver != "ipopt" else 1.0)
+
+    def _ask(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], task: Task, share: float) -> None:
+        """Have a task solved within a share of its deadline; what is left is for ipopt."""
+        deadline = task.request.deadline
+
+        def then(found: Any) -> None:
+            rest = (1.0 - share) * deadline
+            if not isinstance(found, JobStopped):
+                self._reply(request, reply, found)
+            elif task.request.solver != "ipopt" and rest > _FALLBACK_LEAST:
+                again = replace(task, request=replace(task.request, solver="ipopt"))
+                self.work(Job(solve, (again,), partial(self._reply_late, request, reply, deadline), rest, isolated=True))
+            else:
+                self._reply_late(request, reply, deadline, found)
+
+        self.work(Job(solve, (task,), then, share * deadline, isolated=True))
+
+    def _reply_late(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], deadline: float, found: Any) -> None:
+        if isinstance(found, JobStopped):
+            found = PlanningRefusal("deadline", "wall-clock time", -1.0, f"no plan within {deadline:g} s ({found}); allow more time, "
+                                                                         "ask again, or start from elsewhere")
+        self._reply(request, reply, found)
+
+    def _reply(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], found: Any) -> None:
+        """Reply with a plan, or with the error that there is in its place."""
+        if isinstance(found, PowerlinePlan):
+            answer = found
+        else:
+            answer = service.refused(found)
+            self.warn(f"no plan: {answer.message}")
+        self.diagnostics(Diagnostics(request_limits.stamp_of(request), {
+            "success": answer.success, "error_code": int(answer.error_code), "iterations": answer.iterations,
+            "solve_ms": 1e3 * answer.solve_time, "recovery_solve_ms": 1e3 * answer.recovery_solve_time, "solver": answer.solver}))
+        reply(answer)
+
+
+@lru_cache(maxsize=2)
+def planner_of(vehicle: str, settings: PowerlineSettings) -> PowerlinePlanner:
+    """The planner with everything that its first plan would load; kept for the next plan of this process."""
+    planner = PowerlinePlanner(load_vehicle(vehicle), settings)
+    planner.warm_up()
+    return planner
+
+
+def solve(task: Task) -> PowerlinePlan:
+    """Plan; the job of a request.
+
+    Raises:
+        PlanningRefusal: there is no plan; code solver where the numerics failed in a way that nobody had foreseen.
+    """
+    planner = planner_of(task.vehicle, task.settings)
+    try:
+        return service.answer(planner.plan(task.request), planner.solver.model, task.sample_step, task.contact_time, task.start)
+    except (PerchError, MemoryError):
+        raise
+    except Exception as error:  # whoever asked must get an answer whatever happens here
+        raise PlanningRefusal("solver", "numerics", -math.inf, f"planning failed: {type(error).__name__}: {error}") from error

@@ -1,1 +1,0 @@
-"""Messages of the planners, to their requests and from their plans."""

@@ -1,0 +1,62 @@
+"""What crosses the schedule: a value on a channel, as a value or as the bytes of its message, each made when it is asked for."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+
+class Codec(Protocol):
+    """Values to serialised messages and back."""
+
+    def encode(self, channel: str, value: Any) -> bytes:
+        """The message of a value."""
+
+    def decode(self, channel: str, data: bytes) -> Any:
+        """The value of a message."""
+
+
+class Packet:
+    """One emission.
+
+    Attributes:
+        channel: relative name of the topic.
+        value: as components take it; decoded from `data` when it is first looked at.
+        data: serialised message; encoded from `value` when it is first looked at.
+    """
+
+    __slots__ = ("channel", "value", "data", "_codec")
+
+    channel: str
+    value: Any
+    data: bytes
+
+    def __init__(self, channel: str, value: Any, codec: Codec | None = None) -> None:
+        """
+        Args:
+            channel: relative name of the topic.
+            value: as components take it.
+            codec: makes `data`; None: nobody asks for it.
+        """
+        self.channel, self.value, self._codec = channel, value, codec
+
+    @classmethod
+    def received(cls, channel: str, data: bytes, codec: Codec | None = None) -> Packet:
+        """A packet of a serialised message."""
+        packet = cls.__new__(cls)
+        packet.channel, packet.data, packet._codec = channel, data, codec
+        return packet
+
+    def __getattr__(self, name: str) -> Any:
+        """The form that is not there yet: a slot that is set is read without this call."""
+        if name not in ("value", "data"):
+            raise AttributeError(name)
+        if self._codec is None:
+            raise TypeError(f"{self.channel}: a packet without a codec has no {name}")
+        if name == "value":
+            self.value = self._codec.decode(self.channel, self.data)
+            return self.value
+        self.data = self._codec.encode(self.channel, self.value)
+        return self.data
+
+    def __repr__(self) -> str:
+        return f"Packet({self.channel!r})"

@@ -1,0 +1,282 @@
+"""Who takes part in a flight: batches of packets in, packets out. `LocalParticipant` is a component in this process."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Wake, ports, run_now
+from perch_core.errors import PerchError
+from perch_sim.lockstep.packet import Codec, Packet
+from perch_sim.lockstep.tasks import BEGUN
+
+SECOND = 1_000_000_000
+
+
+class Participant(Protocol):
+    """One who takes part, wherever it works.
+
+    Attributes:
+        name: as in the schedule's tasks.
+        inputs: channels that it takes.
+    """
+
+    name: str
+    inputs: frozenset[str]
+
+    def begin(self, now: int, batch: Sequence[Packet]) -> None:
+        """Work on a batch; the batch before it has been finished.
+
+        Args:
+            now: stamp of the step at which the batch was closed [ns].
+            batch: packets in order.
+        """
+
+    def results(self) -> list[Packet] | None:
+        """What the batch has led to, in the order of emission, once; None: it is still being worked on. Never waits."""
+
+    def listen(self, taken: Callable[[str], bool]) -> None:
+        """The channels that somebody takes have changed; what nobody takes need not be emitted."""
+
+
+class Future(Protocol):
+    """An answer that may still have to come, such as `concurrent.futures.Future` or rclpy's."""
+
+    def done(self) -> bool:
+        """Whether it has come."""
+
+    def result(self) -> Any:
+        """The answer; raises what it failed with."""
+
+
+Ask = Callable[[str, Any], Future]  # (channel of the service, request)
+
+
+class Answer:
+    """An answer that comes once, by a call; those after the first count for nothing."""
+
+    def __init__(self) -> None:
+        self._done, self._value = False, None
+
+    def __call__(self, value: Any) -> None:
+        if not self._done:
+            self._done, self._value = True, value
+
+    def done(self) -> bool:
+        """Whether it has come."""
+        return self._done
+
+    def result(self) -> Any:
+        """The answer."""
+        return self._value
+
+
+class _Awaited(NamedTuple):
+    """An answer to a component's own request: `take` gets it in the first batch from `due` [ns] on."""
+
+    due: int
+    take: Callable[[Any], None]
+    answer: Future
+
+
+class Emissions:
+    """Collects what a component emits as packets. Log lines and diagnostics are none: add receivers to these ports."""
+
+    def __init__(self, component: Component[Any], codec: Codec | None = None) -> None:
+        self._packets: list[Packet] = []
+        self._receivers = []
+        for port in ports(type(component), Output):
+            if port not in (Component.log, Component.diagnostics):
+                channel = port.channel(component)
+                self._receivers.append((channel, getattr(component, port.name).receivers, self._receiver(channel, codec)))
+        self.listen(lambda channel: True)
+
+    def _receiver(self, channel: str, codec: Codec | None) -> Callable[[Any], None]:
+        append = self._packets.append
+        return lambda value: append(Packet(channel, value, codec))
+
+    def listen(self, taken: Callable[[str], bool]) -> None:
+        """Collect these channels and no others."""
+        for channel, receivers, receive in self._receivers:
+            if (receive in receivers) != taken(channel):
+                receivers.append(receive) if taken(channel) else receivers.remove(receive)
+
+    def take(self) -> list[Packet]:
+        """What has been emitted since the last call."""
+        packets = self._packets.copy()
+        self._packets.clear()
+        return packets
+
+
+def handlers(component: Component[Any]) -> dict[str, Callable[[Any], None]]:
+    """What handles each channel that a component takes.
+
+    Raises:
+        PerchError: two inputs have one channel.
+    """
+    found: dict[str, Callable[[Any], None]] = {}
+    for port in ports(type(component), Input):
+        channel = port.channel(component)
+        if channel in found:
+            raise PerchError(f"{type(component).__name__}: two inputs take {channel!r}")
+        found[channel] = port.handler(component)
+    return found
+
+
+class LocalParticipant(Participant):
+    """A component in this process: a batch is worked on as it begins.
+
+    It is finished at once, unless an answer to a request of its own that counts by now has not come, or its first batch waits for
+    a goal.
+    """
+
+    def __init__(self, component: Component[Any], codec: Codec | None = None, ask: Ask | None = None, hold: str = "", *,
+                 name: str = "") -> None:
+        """
+        Args:
+            component: works here alone; its jobs run at once.
+            codec: of its packets; None: they never leave this process.
+            ask: takes the component's requests to whoever serves them; None: nobody does.
+            hold: name of an action without whose first goal the flight does not begin; one that joins a flight under way does not wait.
+            name: as in the schedule's tasks; empty: the class's, in lower case with underscores.
+
+        Raises:
+            PerchError: two inputs have one channel, or `hold` is no action.
+        """
+        kind = type(component)
+        self.component, self.name = component, name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
+        self._handlers = handlers(component)
+        self.inputs = frozenset(self._handlers)
+        self._emissions = Emissions(component, codec)
+        self._ask = ask
+        self._wakes = [[0, round(port.period * SECOND), port.handler(component)] for port in ports(kind, Wake)]
+        self._outside: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
+        self._awaited: list[_Awaited] = []
+        self._now, self._batch, self._begun = 0, None, False
+        self._hold = hold
+        if hold and hold not in (port.name for port in ports(kind, Action)):
+            raise PerchError(f"{self.name}: {hold!r} is none of its actions")
+        component.work = run_now
+        for port in ports(kind, Client):
+            setattr(component, port.name, self._client(port))
+
+    # -- batches -----------------------------------------------------------------------------------------------------
+
+    def begin(self, now: int, batch: Sequence[Packet]) -> None:
+        """Work on a batch, or wait for what it needs."""
+        if now > BEGUN:
+            self._hold = ""
+        self._now, self._batch, self._begun = now, batch, True
+        self._go_on()
+
+    def results(self) -> list[Packet] | None:
+        """The packets of the batch; None: it waits for an answer or its first goal."""
+        if self._batch is not None:
+            self._go_on()
+            if self._batch is not None:
+                return None
+        return self._emissions.take()
+
+    def listen(self, taken: Callable[[str], bool]) -> None:
+        """Emit on these channels alone."""
+        self._emissions.listen(taken)
+
+    def _go_on(self) -> None:
+        if self._outside or self._awaited or self._hold:
+            if self._hold or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self._now):
+                return
+            self._take_what_came()
+        now, batch, self._batch = self._now, self._batch, None
+        handle = self._handlers
+        for packet in batch:
+            handle[packet.channel](packet.value)
+        for wake in self._wakes:
+            if now >= wake[0]:
+                wake[0] = wake[0] + wake[1] if wake[0] + wake[1] > now else now + wake[1]
+                wake[2](now)
+
+    def _take_what_came(self) -> None:
+        while self._outside:
+            self._outside.popleft()()
+        due = [awaited for awaited in self._awaited if awaited.due <= self._now]
+        self._awaited = [awaited for awaited in self._awaited if awaited.due > self._now]
+        for awaited in due:
+            try:
+                answer = awaited.answer.result()
+            except Exception as error:  # whatever befell a server, it is no answer
+                answer = Unavailable(f"{type(error).__name__}: {error}")
+            awaited.take(answer)
+
+    # -- requests ----------------------------------------------------------------------------------------------------
+
+    def request(self, port_name: str, request: Any, reply: Callable[[Any], None]) -> None:
+        """A request to a service of the component: in front of the next batch; at once as long as there has been none."""
+        handler = self._port(Service, port_name).handler(self.component)
+        self._from_outside(lambda: handler(request, reply))
+
+    def goal(self, port_name: str, goal: Any, answered: Callable[[str], None] | None = None) -> None:
+        """A goal for an action of the component, as `request`.
+
+        Args:
+            port_name: of the action.
+            goal: a `perch_core.component.Goal`.
+            answered: gets why it is rejected, or an empty string.
+        """
+        handler = self._port(Action, port_name).handler(self.component)
+
+        def hand_over() -> None:
+            rejected = handler(goal)
+            if answered is not None:
+                answered(rejected)
+
+        if port_name == self._hold:
+            self._hold = ""
+        self._from_outside(hand_over)
+
+    def serves(self, channel: str) -> str | None:
+        """The name of the service with this channel; None: there is none."""
+        return next((port.name for port in ports(type(self.component), Service) if port.channel(self.component) == channel), None)
+
+    def _port(self, kind: type, name: str) -> Any:
+        for port in ports(type(self.component), kind):
+            if port.name == name:
+                return port
+        raise PerchError(f"{self.name}: {name!r} is none of its ports of type {kind.__name__}")
+
+    def _from_outside(self, call: Callable[[], None]) -> None:
+        if self._begun:
+            self._outside.append(call)
+        else:
+            call()
+
+    def _client(self, port: Client[Any, Any]) -> Callable[..., None]:
+        channel, take = port.channel(self.component), port.handler(self.component)
+
+        def send(request: Any, due: int = 0) -> None:
+            answer: Future = Answer()
+            if self._ask is None:
+                answer(Unavailable(f"nobody serves {channel!r}"))
+            else:
+                answer = self._ask(channel, request)
+            self._awaited.append(_Awaited(due, take, answer))
+
+        return send
+
+
+def local_servers(servers: Iterable[LocalParticipant]) -> Ask:
+    """Takes requests to components in this process."""
+    known = list(servers)
+
+    def ask(channel: str, request: Any) -> Future:
+        answer = Answer()
+        for server in known:
+            name = server.serves(channel)
+            if name is not None:
+                server.request(name, request, answer)
+                return answer
+        answer(Unavailable(f"nobody serves {channel!r}"))
+        return answer
+
+    return ask

@@ -1,0 +1,399 @@
+"""The order of a simulated flight: who sees what at which step. Nothing here waits, and nothing here knows ROS or a clock.
+
+Per control period, at the stamp t at which it ends:
+
+1. The vehicle advances. Camera frames that have arrived start the work of those who take them.
+2. Results of slow participants that are due at t are released, sorted by channel, within a channel in the order of emission; then
+   comes what the vehicle emitted.
+3. Fast participants work, one after the other, each on what has come to it; what they emit goes on at once.
+4. Slow participants whose frame has arrived, or whose period is over, get all that has come to them as one batch.
+
+Slow participants work while the flight goes on, but their results *count* only from trigger + latency, however long the work took:
+the step at which they are due waits for them. So a seed gives the same flight wherever and however fast the participants work.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
+from typing import Any, NamedTuple, Protocol
+
+from perch_core.component import Component
+from perch_core.errors import PerchError
+from perch_core.timing import CONTROL_PERIOD_NS
+from perch_core.values import CameraImage
+from perch_sim.lockstep.packet import Codec, Packet
+from perch_sim.lockstep.participant import Emissions, Participant, handlers
+from perch_sim.lockstep.tasks import Task
+
+MOST_UNDRAWN = 2            # frames of a camera that have arrived before their images
+LONGEST_SILENCE = 500       # steps without a frame after which a participant gets what has come to it all the same
+LATCHED = ("/tf_static", "target/pose", "powerlines", "ground_truth/target")
+_CHANNEL = attrgetter("channel")
+
+
+class Arrival(NamedTuple):
+    """A camera frame that has arrived.
+
+    Attributes:
+        camera: its name.
+        stamp: as in its header [ns].
+        middle: of the exposure, on the IMU's clock [ns].
+        image: as emitted; None: the camera takes no images, or this one is lost.
+    """
+
+    camera: str
+    stamp: int
+    middle: int
+    image: CameraImage | None
+
+    @property
+    def has_image(self) -> bool:
+        """Whether an image came with the frame's `camera_info`."""
+        return self.image is not None
+
+
+class Owed(NamedTuple):
+    """What the flight waits for: of whom, what, and for which stamp [ns]."""
+
+    name: str
+    what: str
+    since: int
+
+
+class Vehicle(Protocol):
+    """A component that owns the flight's time; its inputs are handled as they come."""
+
+    time: int  # stamp of the step that it has reached [ns]
+
+    def advance(self) -> Sequence[Arrival]:
+        """One control period and what is emitted in it; the frames that have arrived."""
+
+
+class _Batch:
+    """Work of a slow participant."""
+
+    __slots__ = ("stamp", "due", "packets", "begun", "results")
+
+    def __init__(self, stamp: int, due: int, packets: list[Packet]) -> None:
+        self.stamp, self.due, self.packets = stamp, due, packets
+        self.begun, self.results = False, ()
+
+
+class _Place:
+    """A participant's place in the order, taken or empty.
+
+    Attributes:
+        inbox: what has come since the last batch.
+        coming: slow: batches without results yet, oldest first; one at a time is worked on.
+        done: slow: batches whose results do not count yet.
+        last: step of the last batch.
+    """
+
+    def __init__(self, name: str, task: Task) -> None:
+        self.name, self.task = name, task
+        self.latency = 0 if task.latency is None else round(task.latency * 1e9)
+        self.participant: Participant | None = None
+        self.inbox: list[Packet] = []
+        self.coming: deque[_Batch] = deque()
+        self.done: deque[_Batch] = deque()
+        self.last = 0
+
+    @property
+    def takes_images(self) -> bool:
+        """Whether images are among what its participant takes."""
+        return any(channel.endswith("/image_raw") for channel in self.participant.inputs)
+
+    def awaits(self, arrival: Arrival) -> bool:
+        """Whether a frame starts work: with its image for those who take images."""
+        inputs = self.participant.inputs
+        if f"camera_{arrival.camera}/image_raw" in inputs:
+            return arrival.image is not None
+        return f"camera_{arrival.camera}/camera_info" in inputs
+
+
+class _Routes(dict):
+    """Channel -> what takes its packets; made when a channel is first used."""
+
+    def __init__(self, find: Callable[[str], list[Callable[[Packet], None]]]) -> None:
+        super().__init__()
+        self._find = find
+
+    def __missing__(self, channel: str) -> list[Callable[[Packet], None]]:
+        self[channel] = self._find(channel)
+        return self[channel]
+
+
+class Schedule:
+    """One flight. Call `advance` whenever something may have come.
+
+    Attributes:
+        now: stamp of the present step [ns].
+        index: number of steps completed.
+    """
+
+    def __init__(self, vehicle: Vehicle & Component[Any], participants: Iterable[Participant], tasks: Mapping[str, Task],
+                 codec: Codec | None = None) -> None:
+        """
+        Args:
+            vehicle: owns time.
+            participants: who takes part from the beginning.
+            tasks: of all who may take part, in the order in which they work within a step.
+            codec: of what the vehicle emits; None: it never leaves this process.
+
+        Raises:
+            PerchError: a participant has no task.
+        """
+        self.now, self.index = 0, 0
+        self._vehicle = vehicle
+        self._vehicle_handlers = handlers(vehicle)
+        self._emissions = Emissions(vehicle, codec)
+        self._places = {name: _Place(name, task) for name, task in tasks.items()}
+        self._fast = [place for place in self._places.values() if place.task.latency is None]
+        self._slow = [place for place in self._places.values() if place.task.latency is not None]
+        self._latest: dict[str, list[Packet]] = {}
+        self._undrawn: dict[str, deque[CameraImage]] = {}
+        self._awaited: _Place | None = None  # fast participant whose answer is missing
+        self._routes = _Routes(self._takers)
+        for participant in participants:
+            self.join(participant)
+        self._steps = self._flight()
+
+    # -- who takes part ----------------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> list[str]:
+        """Who takes part, in the order in which they work within a step."""
+        return [name for name, place in self._places.items() if place.participant is not None]
+
+    def join(self, participant: Participant) -> None:
+        """Take a participant in, or in the place of one with its name, whose debts end.
+
+        It is given the latest packet of each latched channel; a fast one whose answer is awaited gets the present batch, too.
+
+        Raises:
+            PerchError: there is no task for its name.
+        """
+        if participant.name not in self._places:
+            raise PerchError(f"{participant.name!r} is not one of {', '.join(self._places)}")
+        self.drop(participant.name)
+        place = self._places[participant.name]
+        place.participant, place.last = participant, self.index
+        for channel in sorted(self._latest):
+            if channel in participant.inputs:
+                place.inbox += self._latest[channel]
+        self._reroute()
+
+    def drop(self, name: str) -> None:
+        """Go on without a participant, and without what it owes."""
+        place = self._places[name]
+        place.participant = None
+        place.inbox.clear(), place.coming.clear(), place.done.clear()
+        self._reroute()
+
+    def _reroute(self) -> None:
+        self._routes.clear()
+        taken = {channel for place in self._places.values() if place.participant for channel in place.participant.inputs}
+        taken |= set(self._vehicle_handlers)
+
+        def is_taken(channel: str) -> bool:
+            return channel in taken or _is_latched(channel)
+
+        self._emissions.listen(is_taken)
+        for place in self._places.values():
+            if place.participant is not None:
+                place.participant.listen(is_taken)
+
+    def _takers(self, channel: str) -> list[Callable[[Packet], None]]:
+        takers: list[Callable[[Packet], None]] = [
+            place.inbox.append for place in self._places.values() if place.participant and channel in place.participant.inputs]
+        if channel in self._vehicle_handlers:
+            handle = self._vehicle_handlers[channel]
+            takers.append(lambda packet: handle(packet.value))
+        if _is_latched(channel):
+            takers.append(self._keep)
+        return takers
+
+    def _keep(self, packet: Packet) -> None:
+        kept = self._latest.setdefault(packet.channel, [])
+        if packet.channel != "/tf_static":  # one transform each: all of them count
+            kept.clear()
+        kept.append(packet)
+
+    # -- going on ----------------------------------------------------------------------------------------------------
+
+    def advance(self) -> bool:
+        """Go on as far as one control period.
+
+        Returns:
+            True: a control period has been completed. False: something is `owed`; call again when it may have come.
+        """
+        for place in self._slow:
+            if place.coming:
+                self._work(place)
+        return next(self._steps)
+
+    def owed(self) -> list[Owed]:
+        """What the flight waits for, after `advance` has returned False."""
+        if self._awaited is not None:
+            return [Owed(self._awaited.name, "its answer to the present step", self.now)]
+        missing = [Owed(f"camera_{camera}", "an image", images[0].stamp)
+                   for camera, images in self._undrawn.items() if len(images) > MOST_UNDRAWN]
+        for place in self._slow:
+            if place.coming and place.coming[0].due <= self.now:
+                batch = place.coming[0]
+                image = None if batch.begun else _first_undrawn(batch)
+                missing.append(Owed(place.name, "its results", batch.stamp) if image is None
+                               else Owed(image.channel.split("/")[0], f"an image for {place.name}", image.value.stamp))
+        return missing
+
+    def await_image(self, timeout: float) -> bool:
+        """Wait for an image without which the flight cannot go on. False: it waits for none.
+
+        Args:
+            timeout: longest wait [s].
+        """
+        for images in self._undrawn.values():
+            if len(images) > MOST_UNDRAWN:
+                images[0].ready(timeout)
+                return True
+        for place in self._slow:
+            if place.coming and place.coming[0].due <= self.now and not place.coming[0].begun:
+                image = _first_undrawn(place.coming[0])
+                if image is not None:
+                    image.value.ready(timeout)
+                    return True
+        return False
+
+    def _flight(self) -> Iterator[bool]:
+        """Control period after control period; yields True after each, and False where it has to wait."""
+        routes, vehicle, emissions = self._routes, self._vehicle, self._emissions
+        while True:
+            arrivals = vehicle.advance()
+            now = self.now = vehicle.time
+            packets = emissions.take()
+            if arrivals:
+                self._note_images(arrivals)
+                while self._crowded():
+                    yield False
+            released: list[Packet] = []
+            for place in self._slow:
+                while True:
+                    while place.done and place.done[0].due <= now:
+                        released += place.done.popleft().results
+                    if not place.coming or place.coming[0].due > now:
+                        break
+                    yield False
+            if len(released) > 1:
+                released.sort(key=_CHANNEL)
+            for packet in released:
+                for take in routes[packet.channel]:
+                    take(packet)
+            for packet in packets:
+                for take in routes[packet.channel]:
+                    take(packet)
+            for place in self._fast:
+                if place.participant is None:
+                    continue
+                worker, batch = place.participant, place.inbox.copy()
+                place.inbox.clear()
+                worker.begin(now, batch)
+                results = worker.results()
+                while results is None:
+                    self._awaited = place
+                    yield False
+                    if place.participant is not worker:
+                        if place.participant is None:
+                            break
+                        worker, batch = place.participant, place.inbox + batch
+                        place.inbox.clear()
+                        worker.begin(now, batch)
+                    results = worker.results()
+                self._awaited = None
+                for packet in results or ():
+                    for take in routes[packet.channel]:
+                        take(packet)
+            self._trigger(now, arrivals)
+            self.index += 1
+            yield True
+
+    # -- slow participants -------------------------------------------------------------------------------------------
+
+    def _trigger(self, now: int, arrivals: Sequence[Arrival]) -> None:
+        """Close the batches of those whose work begins at this step."""
+        for place in self._slow:
+            if place.participant is None:
+                continue
+            due = None
+            if place.task.period:
+                if self.index % place.task.period == 0:
+                    due = now + place.latency
+            elif arrivals:
+                due = max((arrival.middle + place.latency for arrival in arrivals if place.awaits(arrival)), default=None)
+            if due is None:
+                if place.task.period or self.index - place.last < LONGEST_SILENCE:
+                    continue
+                due = now + place.latency
+            place.last = self.index
+            place.coming.append(_Batch(now, max(due, now + CONTROL_PERIOD_NS), place.inbox.copy()))
+            place.inbox.clear()
+            self._work(place)
+
+    def _work(self, place: _Place) -> None:
+        """Take results and begin batches in their order, as far as that goes."""
+        coming = place.coming
+        while coming:
+            batch = coming[0]
+            if not batch.begun:
+                if place.takes_images:
+                    if _first_undrawn(batch) is not None:
+                        return
+                    lost = [packet for packet in batch.packets if _is_lost(packet)]
+                    if lost:  # nothing comes of it; the rest of the batch goes with the next
+                        coming.popleft()
+                        after = coming[0].packets if coming else place.inbox
+                        after[:0] = [packet for packet in batch.packets if packet not in lost]
+                        continue
+                batch.begun = True
+                place.participant.begin(batch.stamp, batch.packets)
+            results = place.participant.results()
+            if results is None:
+                return
+            batch.results = results
+            place.done.append(coming.popleft())
+
+    # -- images ------------------------------------------------------------------------------------------------------
+
+    def _note_images(self, arrivals: Sequence[Arrival]) -> None:
+        for arrival in arrivals:
+            if arrival.image is not None and arrival.image.ready is not None:
+                self._undrawn.setdefault(arrival.camera, deque()).append(arrival.image)
+
+    def _crowded(self) -> bool:
+        """Whether a camera's frames arrive faster than they are drawn: the flight waits even where nobody else does."""
+        crowded = False
+        for images in self._undrawn.values():
+            while images and images[0].ready(0.0):
+                images.popleft()
+            crowded = crowded or len(images) > MOST_UNDRAWN
+        return crowded
+
+
+def _is_latched(channel: str) -> bool:
+    return channel in LATCHED or channel.endswith("/camera_info")
+
+
+def _is_image(packet: Packet) -> bool:
+    return packet.channel.endswith("/image_raw")
+
+
+def _first_undrawn(batch: _Batch) -> Packet | None:
+    """The first packet of a batch whose image is still being drawn."""
+    return next((packet for packet in batch.packets
+                 if _is_image(packet) and packet.value.ready is not None and not packet.value.ready(0.0)), None)
+
+
+def _is_lost(packet: Packet) -> bool:
+    """Whether it is an image that will never come. One that is drawn when it is looked at always comes."""
+    return _is_image(packet) and packet.value.ready is not None and packet.value.pixels() is None

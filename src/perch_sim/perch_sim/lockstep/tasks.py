@@ -1,0 +1,46 @@
+"""Who may take part in a flight, in which order, what starts their work, and how long it takes in simulation time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from perch_sim.scenario import Latency
+
+START = 1_000_000_000  # stamp at which a flight begins: ROS reads zero as "no time yet" [ns]
+BEGUN = START + 100_000_000  # a flight that waits for its goal has not gone on for so long
+DECISION_STEPS = 10   # the mission decides at 50 Hz
+RECORDING_STEPS = 50  # the recorder writes every 0.1 s of flight within 0.1 s, so that the flight cannot outrun the disk
+RECORDING_TIME = 0.1  # [s]
+
+
+class Task(NamedTuple):
+    """When a participant works.
+
+    Attributes:
+        latency: from the middle of an exposure or from a step to when the results count [s]; None: it works at every step, and its
+            results count at once.
+        period: steps from one batch to the next; 0: a batch with every frame of the cameras that it takes.
+    """
+
+    latency: float | None = None
+    period: int = 0
+
+
+def flight_tasks(latency: Latency) -> dict[str, Task]:
+    """Everybody's task by name, in the order in which they work within a step."""
+    return {
+        "estimator": Task(),
+        "controller": Task(),
+        "vio": Task(latency.vio),
+        "vio_model": Task(latency.vio),
+        "target_localizer": Task(latency.target_localizer),
+        "powerline_mapper": Task(latency.powerline_mapper),
+        "mission": Task(latency.mission, DECISION_STEPS),
+        "recorder": Task(RECORDING_TIME, RECORDING_STEPS),
+    }
+
+
+def is_slow(name: str) -> bool:
+    """Whether the results of a participant count later than its step."""
+    task = flight_tasks(Latency()).get(name)
+    return task is not None and task.latency is not None

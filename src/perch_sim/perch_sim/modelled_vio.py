@@ -1,0 +1,119 @@
+"""A STAND-IN for VIO that degrades the truth with drift, noise and latency. Not an estimator: see `perch_sim.vio_model`."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from perch_core.component import Component, Input, Output
+from perch_core.errors import ConfigError
+from perch_core.values import NANOSECONDS, CameraModel, InertialState, OdometryState, nanoseconds, rotated
+from perch_core.vehicle import load_vehicle
+from perch_sim import seeding
+from perch_sim.imu import Imu
+from perch_sim.lockstep import START
+from perch_sim.state_history import StateHistory, TrueState
+from perch_sim.vio_model import BiasModel, VioModel, VioModelParameters
+
+MEMORY = 200              # true states kept: 0.4 s
+MOST_FRAMES = 20          # that wait for the truth to cover their exposure, or for their answer to be due
+LONGEST_AHEAD = NANOSECONDS  # of a frame to the truth [ns]
+RATE_VARIANCE = 1e-4      # of each axis of the angular velocity [rad^2/s^2]
+
+
+class ModelledVio(Component[VioModelParameters]):
+    """One `vio/state` and one `vio/odometry` per frame of the camera, stamped with the middle of its exposure on the IMU's clock.
+
+    It takes `camera_info` instead of images, so that it works with the cameras off.
+    """
+
+    config_type = VioModelParameters
+
+    truth = Input(OdometryState, "ground_truth/odometry")
+    camera_info = Input(CameraModel, "camera_{camera}/camera_info")
+    state = Output(InertialState, "vio/state")
+    odometry = Output(OdometryState, "vio/odometry")
+
+    def __init__(self, config: VioModelParameters) -> None:
+        """
+        Raises:
+            ConfigError: the vehicle does not exist or has no such camera.
+        """
+        super().__init__(config)
+        vehicle = load_vehicle(config.vehicle)
+        if config.camera not in vehicle.mounts:
+            raise ConfigError("vio_model", "camera", f"{config.camera!r} is not one of {', '.join(vehicle.mounts)}")
+        self._offset = nanoseconds(vehicle.mounts[config.camera].stamp_offset)
+        self._model = VioModel(config, seeding.stream(config.seed, "vio_model"))
+        turn_on = Imu(vehicle.imu, seeding.stream(config.seed, "imu")).bias
+        self._biases = BiasModel(config, vehicle.imu, np.concatenate([turn_on[3:], turn_on[:3]]),
+                                 seeding.stream(config.seed, "vio_model_biases"))
+        self._latency = nanoseconds(config.latency)
+        self._warned = False
+        self._begin()
+
+    def _begin(self) -> None:
+        self._history, self._newest = StateHistory(MEMORY), 0
+        self._frames: deque[int] = deque(maxlen=MOST_FRAMES)     # stamps of frames to be answered
+        self._last_frame = 0
+        self._answers: deque[tuple[int, InertialState, OdometryState]] = deque(maxlen=MOST_FRAMES)  # (when it is due, ...)
+
+    def on_truth(self, state: OdometryState) -> None:
+        """Take in a true state."""
+        if not self._warned:
+            self._warned = True
+            self.warn("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
+        x = (*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B)
+        if not math.isfinite(sum(x)) or abs(sum(k * k for k in state.q_WB) - 1.0) > 1e-3:
+            self.warn("ground_truth/odometry: not a finite state with a unit quaternion: not used", every=1.0)
+            return
+        if state.stamp <= self._newest:
+            self.warn("ground_truth/odometry: its stamps go back: begun anew", every=1.0)
+            self._begin()
+        self._newest = state.stamp
+        self._history.append(TrueState(state.stamp, np.array(x)))
+        if self._frames:
+            self._answer()
+        self._emit()
+
+    def on_camera_info(self, model: CameraModel) -> None:
+        """A frame, to be answered when the truth covers its exposure."""
+        if not self._last_frame < model.stamp <= self._newest + LONGEST_AHEAD:
+            self.warn(f"camera_{self.config.camera}/camera_info: a stamp goes back or is ahead of the truth: not used", every=1.0)
+            return
+        self._last_frame = model.stamp
+        self._frames.append(model.stamp)
+        self._answer()
+        self._emit()
+
+    def _answer(self) -> None:
+        """Answer every frame whose exposure the truth covers by now."""
+        while self._frames and self._frames[0] - self._offset <= self._newest:
+            exposed = self._frames.popleft() - self._offset
+            try:
+                state = self._history.at(exposed)
+            except LookupError as error:
+                self.warn(f"frame without truth: {error}", every=1.0)
+            else:
+                self._answers.append((exposed + self._latency, *self._estimate(state)))
+
+    def _estimate(self, state: TrueState) -> tuple[InertialState, OdometryState]:
+        e = self._model.degrade(state.time * 1e-9, state.p_WB, state.q_WB, state.v_WB)
+        biases, variances = self._biases.at(max(0, state.time - START) * 1e-9)
+        P = np.zeros((15, 15))
+        P[:9, :9] = e.covariance
+        P[9:, 9:] = np.diag(variances)
+        inertial = InertialState(state.time, e.p_WB, e.q_WB, e.v_WB, biases[:3], biases[3:], P)
+        q_WB = tuple(e.q_WB.tolist())
+        odometry = OdometryState(
+            state.time, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(state.w_WB_B.tolist()),
+            np.diag(e.pose_variance), np.diag([e.velocity_variance] * 3 + [RATE_VARIANCE] * 3), "odom")
+        return inertial, odometry
+
+    def _emit(self) -> None:
+        while self._answers and self._answers[0][0] <= self._newest:
+            _, inertial, odometry = self._answers.popleft()
+            self.state(inertial)
+            self.odometry(odometry)

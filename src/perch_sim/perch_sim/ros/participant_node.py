@@ -1,0 +1,168 @@
+"""The lockstep host: a node whose inputs are ordered by the simulator's schedule.
+
+It is the same component with the same outputs, services and actions as in the arrival host. Its inputs come from the vehicle's
+node: in this process as values, from another as batches of serialised messages over a local socket. What it publishes goes
+back the same way, and on its topics for everybody else; nothing that others publish there has any influence.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any
+
+from perch_core.component import Client, Component, Input, Service, ports
+from perch_core.errors import PerchError
+from perch_core.ros import topics
+from perch_core.ros.component_node import ComponentNode
+from perch_core.ros.intake import Intake
+from perch_core.ros.priority import priority
+from perch_core.ros.wiring import Wiring
+from perch_core.values import Serialized
+from perch_sim.lockstep import Answer, LocalParticipant, is_slow
+from perch_sim.lockstep.link import Waiting, address, knock, pack, unpack
+from rclpy.clock import Clock, ClockType
+
+KNOCK = 0.1     # between looks for the vehicle [s]
+LOOK = 0.005    # between looks whether what a batch waits for has come [s]
+PATIENCE = 0.01  # with which a batch is waited for before other events are looked at [s]
+BURST = 40      # batches between which other events are looked at
+OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken as they come by who only keeps messages
+
+
+class ParticipantNode(ComponentNode):
+    """One component that takes part in the lockstep."""
+
+    def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
+        """
+        Args:
+            name, component, wiring, kwargs: as in `ComponentNode`.
+        """
+        super().__init__(name, component, wiring, **kwargs)
+        hold = self.declare_parameter("lockstep_hold", "").value
+        self.declare_parameter("lockstep", True)
+        self.participant = LocalParticipant(self.component, codec=topics, ask=self._ask, hold=hold, name=name)
+        self.participant.begin = partial(self.guarded, "step", self.participant.begin)
+        self._observed = [port for port in ports(component, Input) if port.channel(self.component) in OBSERVED and port.value is Serialized]
+        self.participant.inputs -= {port.channel(self.component) for port in self._observed}
+        self._intake = Intake(self)
+        self._asking: dict[str, Callable[[Any, int], None]] = {}
+        self._answers: dict[str, Answer] = {}
+        self._busy = False  # with a batch
+        self._vehicle: Connection | None = None
+        self._waiting = Waiting()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        wiring.participants[name] = self.participant
+
+    def connect(self) -> None:
+        """Join the vehicle of this process, or greet that of another."""
+        asks = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
+        self.connect_clients(self._deliver_answer)
+        self._asking = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
+        for port in self._client_ports():  # the participant's own, which keep the time of answers
+            setattr(self.component, port.name, asks[port.channel(self.component)])
+        self.serve()
+        for port in self._observed:
+            self._intake.add(port)
+        if self.wiring.schedule_here:
+            return
+        if is_slow(self.get_name()):
+            priority.give_way()  # a step goes before work that has time
+        self._where = address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace())
+        self._look = self.create_timer(LOOK, self._go_on, clock=self._steady)
+        self._look.cancel()
+        self.create_timer(KNOCK, self._knock, clock=self._steady)
+        self._knock()
+
+    # -- batches from another process --------------------------------------------------------------------------------
+
+    def _knock(self) -> None:
+        """Look for the vehicle, as long as there is no connection to it."""
+        if self._vehicle is None:
+            self._vehicle = knock(self._where, self.get_name(), self.participant.inputs)
+            if self._vehicle is not None:
+                self._waiting.add(self._vehicle)
+                self.wiring.from_thread(self._work_on)
+
+    def _work_on(self) -> None:
+        """Work on what comes; then other events, then what comes next."""
+        for _ in range(BURST):
+            if not self._waiting.ready(PATIENCE):
+                break
+            try:
+                stamp, batch = unpack(self._vehicle.recv_bytes(), topics)
+            except (OSError, EOFError, PerchError):
+                self._leave()
+                return
+            self._busy = True
+            self.participant.begin(stamp, batch)
+            self._go_on()
+            if self._busy:
+                return
+        self.wiring.from_thread(self._work_on)
+
+    def _go_on(self) -> None:
+        """Give the results, where the batch is finished; one that waits for something is looked at again."""
+        if not self._busy:
+            return
+        packets = self.participant.results()
+        if packets is None:
+            if self._look.is_canceled():
+                self._look.reset()
+            return
+        self._busy = False
+        waited = not self._look.is_canceled()
+        self._look.cancel()
+        try:
+            self._vehicle.send_bytes(pack(0, packets))
+        except OSError:
+            self._leave()
+            return
+        if waited:
+            self.wiring.from_thread(self._work_on)
+
+    def _leave(self) -> None:
+        """The vehicle has gone; another one may come."""
+        self._busy = False
+        self._waiting.remove(self._vehicle)
+        self._vehicle = None
+
+    # -- requests ----------------------------------------------------------------------------------------------------
+
+    def request(self, port: Service, request: Any, reply: Callable[[Any], None]) -> None:
+        """In front of the next batch."""
+        self.participant.request(port.name, request, reply)
+
+    def goal(self, port: Any, goal: Any) -> None:
+        """In front of the next batch, which it may have been waited for."""
+        self.participant.goal(port.name, goal, partial(self._answered, goal))
+        self._progress()
+
+    @staticmethod
+    def _answered(goal: Any, why: str) -> None:
+        if why:
+            goal.reject(why)
+
+    def _client_ports(self) -> list[Client]:
+        return list(ports(type(self.component), Client))
+
+    def _ask(self, channel: str, request: Any) -> Answer:
+        """Send a component's request by its service; the answer is handed over by the participant when it counts."""
+        answer = self._answers[channel] = Answer()
+        self._asking[channel](request, 0)
+        return answer
+
+    def _deliver_answer(self, port: Client, value: Any) -> None:
+        answer = self._answers.get(port.channel(self.component))
+        if answer is not None:
+            answer(value)
+        self._progress()
+
+    def _progress(self) -> None:
+        """What the present batch waits for may have come."""
+        if self.wiring.schedule_here:
+            self.wiring.progress()
+        else:
+            self._go_on()

@@ -1,0 +1,226 @@
+"""The simulated vehicle as a component: motor commands in; IMU, cameras, truth and contact out. It owns simulation time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+
+import cv2
+import numpy as np
+
+from perch_core import so3
+from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
+from perch_core.errors import ConfigError
+from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
+from perch_core.urdf import fixed_frames, optical_frame
+from perch_core.values import (
+    NANOSECONDS, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RotorState, Transform,
+    nanoseconds, rotated)
+from perch_sim.camera_stream import Delivery
+from perch_sim.contact_event import ContactEvent
+from perch_sim.drawing import Drawing, DrawnInProcesses
+from perch_sim.lockstep.schedule import Arrival
+from perch_sim.motors import MotorCommandError
+from perch_sim.pacing import Pacing
+from perch_sim.parameters import CAMERAS, VehicleParameters
+from perch_sim.scenario import Scenario, load_scenario
+from perch_sim.simulation import Simulation
+from perch_sim.state_history import TrueState
+
+SLOW_STEPS = 5                         # steps from one clock, rotor state or pose of a moving pad to the next: 100 Hz
+MOST_WAITING = 2                       # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
+REAL_TIME_MOTOR_TIMEOUT = 200_000_000  # with a busy operating system in between [ns]
+EXACT = np.zeros((6, 6))               # covariance of the truth
+
+MakeDrawing = Callable[[Scenario, int, Collection[str]], Drawing]
+
+
+class SimulatedVehicle(Component[VehicleParameters]):
+    """Drives a `Simulation`: step by step where a schedule calls `advance`, by the host's time where `pace` is woken.
+
+    Attributes:
+        scenario: what is flown.
+        simulation: the vehicle.
+        time: stamp of the step that it has reached [ns].
+    """
+
+    config_type = VehicleParameters
+
+    motor_command = Input(MotorCommand, "motor_command")
+    pace = Wake(CONTROL_PERIOD)
+    imu = Output(ImuSample, "imu/data_raw")
+    truth = Output(OdometryState, "ground_truth/odometry")
+    target = Output(PoseStamped, "ground_truth/target")
+    rotors = Output(RotorState, "rotor_state")
+    contact = Output(Contact, "contact")
+    clock = Output(int, "/clock")
+    frames = Output(Transform, "/tf_static")
+    info_down, image_down = Output(CameraModel, "camera_down/camera_info"), Output(CameraImage, "camera_down/image_raw")
+    info_front, image_front = Output(CameraModel, "camera_front/camera_info"), Output(CameraImage, "camera_front/image_raw")
+
+    def __init__(self, config: VehicleParameters, scenario: Scenario | None = None, drawing: MakeDrawing = DrawnInProcesses) -> None:
+        """
+        Args:
+            config: parameters.
+            scenario: what is flown; None: that which the parameters name.
+            drawing: where images are drawn, `DrawnInProcesses` or `DrawnOnDemand`.
+
+        Raises:
+            ConfigError: the scenario, its vehicle or its board does not exist, or has a camera that is not simulated.
+        """
+        super().__init__(config)
+        self.scenario = scenario = load_scenario(config.scenario) if scenario is None else scenario
+        cameras = CAMERAS[config.cameras]
+        self._drawing = drawing(scenario, config.seed, cameras) if cameras else None
+        try:
+            self.simulation = Simulation(scenario, config.seed, self._drawing)
+            self._cameras = {name: self._ports(name) for name in self.simulation.cameras}
+        except ConfigError:
+            self.close()
+            raise
+        self.time = self.simulation.time
+        self._index = 0                          # steps so far
+        self._last_command = 0                   # newest stamp of a command
+        self._pacing: Pacing | None = None       # in real time
+        self._broken: set[str] = set()           # cameras without images for the rest of the flight
+        self._diagnosed = self.time
+        self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
+
+    def warm_up(self) -> None:
+        """OpenCV's threads would fight with those who fly for the processors."""
+        cv2.setNumThreads(1)
+
+    def ready(self) -> bool:
+        """Whether images that are ordered now come without delay."""
+        return self._drawing is None or self._drawing.ready()
+
+    def close(self) -> None:
+        """End the drawing processes."""
+        if self._drawing is not None:
+            self._drawing.close()
+
+    # -- inputs ------------------------------------------------------------------------------------------------------
+
+    def on_motor_command(self, command: MotorCommand) -> None:
+        """Speeds that count from the next step on."""
+        try:
+            self.simulation.motors.command(self.time, command.armed, command.rotor_speed)
+        except MotorCommandError as error:
+            self._counts["commands_refused"] += 1
+            self.log(LogLine("error", str(error), 1.0))
+        if self._last_command < command.stamp <= self.time:
+            self._last_command = command.stamp
+
+    # -- going on ----------------------------------------------------------------------------------------------------
+
+    def advance(self) -> list[Arrival]:
+        """One control period with the motors' present command, and all that it shows; images may still be being drawn.
+
+        Returns:
+            Camera frames that have arrived.
+        """
+        self._step()
+        arrivals = []
+        for name, camera in self.simulation.cameras.items():
+            if camera.due(self.time) is not None:
+                arrivals.append(self._show(name, camera.take()))
+        return arrivals
+
+    def on_pace(self, now: int) -> None:
+        """In real time: every period that the host's time [ns] has reached; images when they are drawn."""
+        if self._pacing is None:
+            self._pacing = Pacing(CONTROL_PERIOD_NS, now)
+            self.simulation.motors.timeout = REAL_TIME_MOTOR_TIMEOUT
+            for camera in self.simulation.cameras.values():
+                camera.most_waiting = MOST_WAITING
+        for _ in range(self._pacing.due(now)):
+            if 0 < self._last_command < self.time:
+                self._counts["commands_missed"] += 1
+            self._step()
+            for name, camera in self.simulation.cameras.items():
+                delivery = camera.due(self.time)
+                if delivery is None:
+                    continue
+                if delivery.image is None or delivery.image.on_demand or delivery.image.done():
+                    self._show(name, camera.take())
+                else:
+                    self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
+            if self.time - self._diagnosed >= NANOSECONDS:
+                self.diagnose()
+
+    def _step(self) -> None:
+        output, index = self.simulation.advance(), self._index
+        time = self.time = output.time
+        if index == 0:
+            for frame in fixed_frames(self.simulation.vehicle):
+                self.frames(frame)
+        self.imu(ImuSample(time, tuple(output.imu.gyro.tolist()), tuple(output.imu.accel.tolist())))
+        if self.truth.wanted:
+            self.truth(true_odometry(output.state))
+        for event in output.contacts:
+            self._touch(event)
+        if index % SLOW_STEPS == 0:
+            self._show_slow(index)
+        self._index += 1
+
+    def _show_slow(self, index: int) -> None:
+        plant, scenario = self.simulation.plant, self.scenario
+        self.clock(self.time)
+        if self.rotors.wanted:
+            self.rotors(RotorState(self.time, tuple(plant.rotor_speed.tolist()), tuple(plant.rotor_thrust.tolist())))
+        if scenario.mode == "surface" and (index == 0 or any(scenario.target.velocity)):
+            pad = self.simulation.pad
+            self.target(PoseStamped(self.time, tuple(pad.p_WS.tolist()), tuple(so3.quat_from_matrix(pad.R_WS).tolist())))
+
+    def _touch(self, event: ContactEvent) -> None:
+        self.contact(Contact(nanoseconds(event.time), int(event.state), event.body, float(event.normal_speed),
+                             float(event.tangential_speed), float(event.tilt_error), float(event.offset), event.reason))
+        self.info(f"t = {event.time:.3f} s: {event.body}: {event.state.name.lower()}" + (f" ({event.reason})" if event.reason else ""))
+
+    # -- cameras -----------------------------------------------------------------------------------------------------
+
+    def _ports(self, camera: str) -> tuple[Callable[[CameraModel], None], Callable[[CameraImage], None]]:
+        try:
+            return getattr(self, f"info_{camera}"), getattr(self, f"image_{camera}")
+        except AttributeError:
+            raise ConfigError(f"vehicles/{self.scenario.vehicle}", f"cameras.{camera}",
+                              "is not one of down, front, which are simulated") from None
+
+    def _show(self, name: str, delivery: Delivery) -> Arrival:
+        """Emit a frame: its model, and its image where one was taken."""
+        stream, frame, coming = self.simulation.cameras[name], delivery.frame, delivery.image
+        if stream.broken and name not in self._broken:
+            self._broken.add(name)
+            self.log(LogLine("error", f"camera_{name}: the process that draws its images has ended: no images any more"))
+        info, emit = self._cameras[name]
+        camera, image = stream.mount.camera, None
+        info(CameraModel(frame.stamp, optical_frame(name), camera))
+        if coming is not None:
+            image = CameraImage(frame.stamp, optical_frame(name), camera.width, camera.height, "rgb8" if stream.mount.colour else "mono8",
+                                coming.result, None if coming.on_demand else coming.done)
+            emit(image)
+        return Arrival(name, frame.stamp, frame.middle, image)
+
+    # -- people ------------------------------------------------------------------------------------------------------
+
+    def diagnose(self) -> None:
+        """How the vehicle is."""
+        self._diagnosed = self.time
+        simulation = self.simulation
+        values = {"time_s": self.time * 1e-9, "steps": self._index, **self._counts, "motors_timed_out": simulation.motors.timed_out,
+                  "crashed": simulation.plant.crashed}
+        if self._pacing is not None:
+            values |= {"images_dropped": sum(camera.dropped for camera in simulation.cameras.values()),
+                       "deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
+        level, message = 0, "ok"
+        if simulation.motors.timed_out:
+            level, message = 1, "motors stopped: no motor_command"
+        if simulation.plant.crashed:
+            level, message = 2, "crashed"
+        self.diagnostics(Diagnostics(self.time, values, level, message))
+
+
+def true_odometry(state: TrueState) -> OdometryState:
+    """A true state as odometry."""
+    x = state.x.tolist()
+    q = tuple(x[3:7])
+    return OdometryState(state.time, tuple(x[0:3]), q, rotated(q, x[7:10], -1.0), tuple(x[10:13]), EXACT, EXACT)

@@ -1,0 +1,101 @@
+"""Starts executables of nodes as a user does, and plain scripts beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import rclpy
+from perch_eval.node_launch import NODES
+from perch_eval.nodes import executable
+from rcl_interfaces.srv import ListParameters
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+PLAIN = Path(__file__).parent / "plain"
+PATIENCE = 300.0  # only ever waited for in full when a test fails [s]
+
+
+class Running:
+    """One executable. Its output goes into a file: nobody reads a pipe that a node may fill."""
+
+    def __init__(self, name: str, folder: Path, namespace: str, parameters: Mapping[str, object]) -> None:
+        self.name = f"{namespace}/{name}"
+        self._log = folder / f"{name}.log"
+        given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
+        with self._log.open("w") as file:
+            self.process = subprocess.Popen(
+                [executable(NODES[name].package, name), "--ros-args", "-r", f"__ns:={namespace or '/'}", *given],
+                env=dict(os.environ), stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
+
+    @property
+    def log(self) -> str:
+        """All that it has written."""
+        return self._log.read_text()
+
+    def check(self) -> None:
+        """It works, and has met no defect of its own."""
+        assert self.process.poll() is None, f"{self.name} has ended:\n{self.log[-3000:]}"
+        assert "defect" not in self.log and "Traceback" not in self.log, f"{self.name}:\n{self.log[-3000:]}"
+
+    def stop(self) -> None:
+        """End it."""
+        self.process.terminate()
+        self.process.wait(timeout=PATIENCE)
+
+
+@contextmanager
+def nodes(names: Collection[str], folder: Path, namespaces: Mapping[str, str] | None = None,
+          parameters: Mapping[str, Mapping[str, object]] | None = None) -> Iterator[dict[str, Running]]:
+    """Executables, alone with their parameters; all of them work, and are stopped afterwards.
+
+    Args:
+        names: of the nodes.
+        folder: receives their logs.
+        namespaces: node -> namespace, as in `/lines`, where it is not the root.
+        parameters: node -> parameter -> value in YAML.
+    """
+    running: dict[str, Running] = {}
+    try:
+        for name in names:
+            running[name] = Running(name, folder, (namespaces or {}).get(name, ""), (parameters or {}).get(name, {}))
+        wait_for(running.values())
+        yield running
+    finally:
+        for node in running.values():
+            node.stop()
+
+
+def wait_for(running: Collection[Running]) -> None:
+    """Wait until every node is in the graph with its services, which it offers when it works."""
+    context = Context()
+    rclpy.init(args=[], context=context)
+    node = Node("watch", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    missing = {one: node.create_client(ListParameters, f"{one.name}/list_parameters") for one in running}
+    try:
+        for _ in range(round(PATIENCE / 0.05)):
+            missing = {one: client for one, client in missing.items() if not client.service_is_ready()}
+            if not missing:
+                return
+            for one in missing:
+                one.check()
+            executor.spin_once(timeout_sec=0.05)
+        raise AssertionError(f"{', '.join(one.name for one in missing)} did not come up")
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def plain(script: str, *arguments: str) -> dict:
+    """What a script of `plain/` prints; it may import nothing of perch but messages."""
+    done = subprocess.run([sys.executable, str(PLAIN / script), *arguments], env=dict(os.environ), capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)

@@ -1,0 +1,70 @@
+"""Nodes work from plain publishers of standard messages: no process of the simulator, no Step, any rate, any clock."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from nodes.node_process import PLAIN, plain
+from perch_core.vehicle import load_vehicle
+from system.scripts import run_script
+
+
+def test_the_plain_scripts_import_nothing_of_perch_but_messages():
+    for script in PLAIN.glob("*.py"):
+        imported = set(re.findall(r"^\s*(?:from|import) (perch\w*)", script.read_text(), re.M))
+        assert imported <= {"perch_msgs"}, script
+
+
+def check_chain(seen: dict) -> None:
+    """Every sample was answered from the first estimate on, by the estimator and by the controller."""
+    begun = seen["sent"][seen["sent"].index(seen["states"][0]):]
+    assert seen["states"] == begun[:len(seen["states"])], "an answer is missing, or stamped with no sample's stamp"
+    first = seen["states"].index(seen["commands"][0])
+    assert seen["commands"][:-1] == seen["states"][first:][:len(seen["commands"]) - 1]
+    assert len(seen["speeds"]) == 4 and min(seen["speeds"]) > 100.0, "the controller has not armed"  # idle [rad/s]
+
+
+@pytest.mark.parametrize("rate, count", [(100, 300), (200, 500), (1000, 2000)])
+def test_every_imu_sample_is_answered_with_odometry_and_a_motor_command(rate, count, graph):
+    seen = plain("states.py", str(rate), str(count))
+    check_chain(seen)
+    assert len(seen["commands"]) >= count
+    assert not [kind for kind in seen["types"] if "Step" in kind or "Packet" in kind]
+    assert not {"vehicle", "vio_model"} & set(seen["nodes"])
+
+
+def test_time_may_be_that_of_a_clock_topic(graph):
+    names = [graph[name].name for name in ("estimator", "controller", "vio")]
+    try:
+        for name in names:
+            assert run_script("param.py", "set", name, "use_sim_time", "true").returncode == 0
+        check_chain(plain("states.py", "200", "400", "clock"))
+    finally:
+        for name in names:
+            run_script("param.py", "set", name, "use_sim_time", "false")
+
+
+@pytest.mark.parametrize("kind", ["raw", "compressed"])
+def test_cameras_of_anybody_are_used(kind, graph):
+    """Images lead to odometry by the nodes `vio` and `estimator`, and with it to the pose of the board."""
+    seen = plain("cameras.py", kind)
+    poses, targets = np.array(seen["poses"]), np.array(seen["targets"])
+    assert len(poses) >= 20 and len(targets) >= 5
+    assert np.ptp(poses, axis=0).max() < 0.02, "a vehicle at rest moves"
+    mount = load_vehicle("snapdragon").mounts["front"]
+    assert np.median(targets - np.median(poses, axis=0), axis=0) == pytest.approx(mount.p_BC + [1.5, 0.0, 0.0], abs=0.03)
+
+
+def test_wires_are_mapped(graph):
+    lines = np.array(plain("wires.py", "--ros-args", "-r", "__ns:=/lines")["lines"])
+    assert lines.shape == (1, 2, 3)
+    assert lines[0, :, 0] == pytest.approx(4.0, abs=0.1) and lines[0, :, 2] == pytest.approx(1.5, abs=0.05)
+    assert abs(lines[0, 0, 1] - lines[0, 1, 1]) > 2.0
+
+
+def test_planners_plan(graph):
+    for name, plan in plain("plans.py").items():
+        assert plan["success"], (name, plan["message"])
+        assert plan["parts"] > 0 and plan["proofs"] and all(plan["proofs"])

@@ -1,0 +1,73 @@
+"""What the ROS graph opens to the outside: nothing but loopback, unless the caller names a network."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+from perch_core.errors import ConfigError
+from perch_eval.arguments import open_network
+
+PEER = """
+import os, sys, time
+import rclpy
+node = rclpy.create_node(f"peer_{os.getpid()}", context=(context := rclpy.Context(), context.init())[0])
+while len([name for name in node.get_node_names() if name.startswith("peer_")]) < int(sys.argv[1]):
+    time.sleep(0.01)
+inodes = {os.readlink(f"/proc/self/fd/{fd}")[8:-1] for fd in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{fd}")}
+for protocol in ("udp", "udp6", "tcp", "tcp6"):
+    for line in open(f"/proc/self/net/{protocol}").readlines()[1:]:
+        address, inode = line.split()[1].split(":")[0], line.split()[9]
+        if inode in inodes:
+            print(bytes.fromhex(address)[::-1].hex() if len(address) == 8 else address, flush=True)
+print("done", flush=True)
+sys.stdin.read()
+node.destroy_node()
+context.shutdown()
+"""
+
+
+def sockets(count: int, **variables: str) -> list[set[str]]:
+    """The addresses to which the sockets of processes are bound that find each other as `count` ROS nodes."""
+    command = [sys.executable, "-c", PEER, str(count)]
+    peers = [subprocess.Popen(command, env=os.environ | variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(count)]
+    found = []
+    for peer in peers:
+        lines = iter(peer.stdout.readline, "done\n")
+        found.append({str(ipaddress.ip_address(bytes.fromhex(line.strip()))) for line in lines})
+    for peer in peers:
+        peer.communicate(timeout=60)
+    return found
+
+
+def test_processes_find_each_other_over_sockets_that_are_bound_to_loopback(ros_domain):
+    for addresses in sockets(3):
+        assert addresses == {"127.0.0.1"}
+
+
+def test_they_find_each_other_where_discovery_is_local_as_well(ros_domain):
+    assert len(sockets(2, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")) == 2
+
+
+def test_a_named_network_is_the_only_one_that_is_opened(ros_domain, monkeypatch):
+    monkeypatch.setenv("PERCH_NETWORK", "127.0.0.1")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
+        try:
+            route.connect(("192.0.2.1", 9))  # nothing is sent
+        except OSError:
+            pytest.skip("this machine is in no network")
+        own = route.getsockname()[0]
+    open_network(own)
+    assert sockets(2) == [{own}] * 2
+
+
+@pytest.mark.parametrize("address", ["192.0.2.77", "0.0.0.0", "not-a-host.invalid", "1" * 300])
+def test_an_address_that_is_not_ours_is_refused(monkeypatch, address):
+    monkeypatch.setenv("PERCH_NETWORK", "127.0.0.1")
+    with pytest.raises(ConfigError, match="^--network: .*(this machine)"):
+        open_network(address)
+    assert os.environ["PERCH_NETWORK"] == "127.0.0.1"

@@ -1,0 +1,165 @@
+"""A stack whose programs can be killed, stopped and started again while a goal is flown."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from nav_msgs.msg import Odometry
+from perch_core.errors import PerchError
+from perch_core.ros import topics
+from perch_eval.nodes import ALL_NODES, programs
+from perch_eval.program import RunningProgram
+from perch_eval.ros.pilot import FlightResult, Pilot
+from perch_msgs.msg import ControllerStatus
+from perch_sim.scenario import load_scenario
+from system.scripts import PATIENCE
+
+SHORT = """
+extends: surface_90
+name: short
+nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
+parameters: {vehicle: {cameras: front}, perching_planner: {time_limit: 60.0}}
+"""
+"""A perch whose VIO is a model, and whose front camera alone takes images; a busy machine may take its time to plan."""
+
+
+class Rig:
+    """Programs, the lines that they write, and a pilot.
+
+    Attributes:
+        pilot: sends goals; time is that of `/clock`.
+        truth: the vehicle's newest true state.
+        controller: newest state of the controller, as in `perch_msgs/ControllerStatus`.
+    """
+
+    def __init__(self, folder: Path, alone: Collection[str], lockstep: bool) -> None:
+        """
+        Args:
+            folder: receives scenario, parameters and logs.
+            alone: nodes with a process each; the others share one.
+            lockstep: simulation time waits; otherwise the wall clock paces it.
+        """
+        source = folder / "short.yaml"
+        source.write_text(SHORT)
+        self.scenario = load_scenario(source)
+        self._folder, self._lines, self._came = folder, [], threading.Condition()
+        started = programs(self.scenario, 1, scenario_source=str(source), composed=[n for n in ALL_NODES if n not in alone], lockstep=lockstep,
+                           hold_for_goal=lockstep, folder=folder)
+        self._programs = {program.name: program for program in started}
+        self._running: dict[str, RunningProgram] = {}
+        self.pilot = Pilot()
+        self.truth, self.controller, self._cues = None, -1, []
+        node = self.pilot._node
+        node.create_subscription(Odometry, "ground_truth/odometry", self._see, topics.topic("odometry").qos.subscribe)
+        node.create_subscription(ControllerStatus, "controller/status", self._hear, topics.topic("controller/status").qos.subscribe)
+
+    def _see(self, message: Odometry) -> None:
+        self.truth = message
+
+    def _hear(self, message: ControllerStatus) -> None:
+        self.controller = message.state
+
+    def start(self, name: str) -> None:
+        """Start a program, for the first time or again."""
+        log = self._folder / f"{name}.{time.monotonic_ns()}.log"
+        self._running[name] = RunningProgram(self._programs[name], log, {**os.environ, "PYTHONUNBUFFERED": "1"}, self._write)
+
+    def start_all(self) -> None:
+        """Start all programs, and wait until their nodes are in the graph."""
+        for name in self._programs:
+            self.start(name)
+        wanted = {node for program in self._programs.values() for node in program.nodes}
+        self.until(lambda: wanted <= self.pilot.visible_nodes(), "the nodes do not come up")
+
+    def _write(self, name: str, line: str) -> None:
+        with self._came:
+            self._lines.append(f"{name}: {line}")
+
+    def said(self, words: str) -> int:
+        """How many lines match."""
+        with self._came:
+            return sum(re.search(words, line) is not None for line in self._lines)
+
+    def kill(self, name: str) -> None:
+        """Kill a program, and wait for its end."""
+        self._running[name].signal(signal.SIGKILL)
+        self._running[name].ending()
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a program."""
+        self._running[name].signal(number)
+
+    def until(self, done: Callable[[], bool], problem: str) -> None:
+        """Run the pilot's callbacks until `done`."""
+        end = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < end, f"{problem}\n" + "\n".join(self._lines[-30:])
+            self.pilot._spin(0.02)
+
+    def listen(self, duration: float) -> None:
+        """Run the pilot's callbacks for some wall-clock time [s]."""
+        end = time.monotonic() + duration
+        self.until(lambda: time.monotonic() > end, "")
+
+    def fly(self, acts: Iterator[Callable[[], bool] | str]) -> FlightResult | PerchError:
+        """Fly the scenario's goal, and meanwhile go through `acts`: it yields what it waits for, a condition, or a phase or the goal's end."""
+        state: dict[str, object] = {"phase": "", "waits": None, "over": False}
+
+        def go_on() -> None:
+            while not state["over"]:
+                waits = state["waits"]
+                if waits is not None and not (state["phase"] == waits if isinstance(waits, str) else waits()):
+                    return
+                try:
+                    state["waits"] = next(acts)
+                except StopIteration:
+                    state["over"] = True
+
+        try:
+            result: FlightResult | PerchError = self.pilot.fly(self.scenario, lambda t, phase, text: state.update(phase=phase), go_on)
+        except PerchError as error:
+            result = error
+        while not state["over"]:  # what is still to be done after the goal's end
+            if isinstance(state["waits"], str):
+                state["waits"] = None
+            go_on()
+            self.pilot._spin(0.02)
+        return result
+
+    def at_rest(self) -> bool:
+        """Whether the vehicle hardly moves."""
+        v = self.truth.twist.twist.linear
+        return max(map(abs, (v.x, v.y, v.z))) < 0.3
+
+    def on_floor(self) -> bool:
+        """Whether it stands or lies on the floor."""
+        return self.truth.pose.pose.position.z < 0.25 and self.at_rest()
+
+    def stop(self) -> None:
+        """End everything."""
+        for running in self._running.values():
+            running.signal(signal.SIGCONT)
+            running.signal(signal.SIGINT)
+        for running in self._running.values():
+            if not running.wait(10.0):
+                running.signal(signal.SIGKILL)
+                running.ending()
+        self.pilot.close()
+
+
+@contextmanager
+def rig(folder: Path, alone: Collection[str], lockstep: bool = True) -> Iterator[Rig]:
+    """A rig that is up, in the domain of `ROS_DOMAIN_ID`."""
+    one = Rig(folder, alone, lockstep)
+    try:
+        one.start_all()
+        yield one
+    finally:
+        one.stop()

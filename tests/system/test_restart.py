@@ -1,0 +1,88 @@
+"""A node that is killed in flight and started again takes its place; one that hangs is named with what it owes; every flight ends safely."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+from perch_msgs.msg import ControllerStatus
+from system.rig import Rig, rig
+
+NAMED = 5.0  # within which a hanging node is named; its process is stopped, so that only the vehicle's own time counts [s]
+
+
+@pytest.fixture(autouse=True)
+def domain(ros_domain):
+    """Each test in a ROS domain of its own."""
+
+
+def killed(flight: Rig, name: str):
+    """Kill a node and start it again; then it is there."""
+    gone, back = flight.said(f"lockstep: {name} is gone"), flight.said(f"lockstep: {name} is back")
+    flight.kill(name)
+    yield lambda: flight.said(f"lockstep: {name} is gone") > gone
+    flight.start(name)
+    yield lambda: flight.said(f"lockstep: {name} is back") > back
+
+
+def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
+    with rig(tmp_path, ("vio_model", "estimator", "mission")) as flight:
+        def acts():
+            yield "take_off"
+            yield from killed(flight, "vio_model")
+            yield "searching"
+            yield from killed(flight, "estimator")
+            yield from killed(flight, "mission")
+
+        lost = flight.fly(acts())
+        assert "the mission was restarted: the goal is lost" in str(lost)
+        result = flight.fly(iter(()))
+        assert result.outcome == "perched", result.message
+
+
+def test_a_restarted_controller_leaves_the_motors_off_and_the_mission_says_so(tmp_path):
+    with rig(tmp_path, ("controller",)) as flight:
+        def acts():
+            yield "searching"
+            yield from killed(flight, "controller")
+
+        result = flight.fly(acts())
+        assert result.outcome == "tracking_lost" and "disarmed" in result.message
+        flight.until(lambda: flight.on_floor() and flight.controller == ControllerStatus.DISARMED, "it is not on the floor with its motors off")
+
+
+def test_a_hanging_node_is_named_with_what_it_owes_and_goes_on(tmp_path):
+    with rig(tmp_path, ("estimator", "target_localizer")) as flight:
+        def acts():
+            for name, owed in (("estimator", "its answer to the present step"), ("target_localizer", "its results")):
+                yield "searching"
+                flight.signal(name, signal.SIGSTOP)
+                stopped = time.monotonic()
+                yield lambda: f"{name}: {owed}" in flight.pilot.waiting_for
+                yield lambda: flight.said(f"lockstep: for .* waiting for .*{name}: {owed}") > 0
+                named.append(time.monotonic() - stopped)
+                flight.signal(name, signal.SIGCONT)
+
+        named: list[float] = []
+        result = flight.fly(acts())
+        assert getattr(result, "outcome", "") == "perched", result
+        assert len(named) == 2 and min(named) <= NAMED, named
+
+
+def test_in_real_time_every_flight_ends_safely_and_the_next_begins(tmp_path):
+    """Deadlines are not judged here: on a busy machine a goal may end otherwise, but it ends, and the vehicle is at rest."""
+    safe = (ControllerStatus.DISARMED, ControllerStatus.HOVERING, ControllerStatus.FAILED)  # the last one: motors off, and it says why
+    with rig(tmp_path, ("vio_model", "estimator", "mission", "controller"), lockstep=False) as flight:
+        for name in ("vio_model", "estimator", "mission", "controller"):
+            def acts():
+                yield "searching"
+                flight.kill(name)
+                flight.start(name)
+                yield lambda: f"/{name}" in flight.pilot.visible_nodes()
+
+            result = flight.fly(acts())
+            assert getattr(result, "message", "") or str(result)
+            flight.listen(2.0)  # what is left of the one that was killed in the graph may take part in the next goal's discovery
+            flight.until(lambda: flight.at_rest() and flight.controller in safe, f"after {name} was killed, and {result}")
+        assert flight.on_floor()  # the controller's restart was the last

@@ -1,0 +1,268 @@
+"""Target localiser and powerline mapper as components: images that wait, cameras that become known, and every fault of the inputs."""
+
+import math
+
+import numpy as np
+import pytest
+from perch_core.camera import PinholeCamera, RadialTangentialCamera
+from perch_core.config import from_mapping
+from perch_core.errors import ConfigError
+from perch_core.so3 import quat_from_matrix
+from perch_core.values import CameraImage, CameraModel, OdometryState, Transform
+from perch_core.vehicle import load_vehicle
+from perch_perception.camera_component import MOST_WAITING
+from perch_perception.powerline_mapper import PowerlineMapper, PowerlineMapperConfig
+from perch_perception.tags import Localization
+from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
+
+from unit.component_outputs import Outputs
+
+MS = 1_000_000
+FRONT = load_vehicle("snapdragon").mounts["front"]
+CAMERA = FRONT.camera
+FRAME = "camera_front_optical_frame"
+EXPOSED = -round(FRONT.stamp_offset * 1e9)  # middle of the exposure after the stamp [ns]
+OTHER = RadialTangentialCamera(CAMERA.width, CAMERA.height, 400.0, 400.0, 320.0, 240.0, (-0.1, 0.01, 0.0, 0.0, 0.0))
+
+
+class Blind:
+    """In the place of the localiser: remembers what it was asked."""
+
+    def __init__(self):
+        self.asked = []
+
+    def process(self, image, exposed, body):
+        self.asked.append((image(None), exposed, body))
+        return Localization(None, message="blind")
+
+
+def picture(stamp, camera=CAMERA, encoding="mono8", **changes):
+    shape = (camera.height, camera.width) + ((3,) if encoding.endswith(("b8", "r8", "C3")) else ())
+    arguments = dict(stamp=stamp, frame=FRAME, width=camera.width, height=camera.height, encoding=encoding, pixels=np.zeros(shape, np.uint8))
+    return CameraImage(**{**arguments, **changes})
+
+
+def odometry(stamp, **changes):
+    value = OdometryState(stamp, (0.001 * (stamp // MS), 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0),
+                          np.eye(6) * 1e-4, np.eye(6) * 1e-4)
+    return value._replace(**changes)
+
+
+class Bench:
+    """A localiser with a blind eye."""
+
+    def __init__(self, known=True, **parameters):
+        self.eye = Blind()
+        self.component = TargetLocalizer(from_mapping(TargetLocalizerConfig, parameters, "target_localizer"), self.eye)
+        self.out = Outputs(self.component)
+        if known:
+            self.component.on_camera_info(CameraModel(0, FRAME, CAMERA))
+
+    def odometry(self, begin, end):
+        """500 Hz from `begin` to `end` [ms]."""
+        for ms in range(begin, end + 1, 2):
+            self.component.on_odometry(odometry(ms * MS))
+
+    def image(self, ms, **changes):
+        self.component.on_image(picture(ms * MS, **changes))
+
+    @property
+    def exposures(self):
+        return [round(exposed * 1e3) for _, exposed, _ in self.eye.asked]
+
+
+def test_an_image_waits_for_the_odometry_after_its_exposure():
+    bench = Bench()
+    bench.odometry(0, 100)
+    bench.image(98)  # exposed at 106 ms
+    assert bench.exposures == []
+    bench.odometry(102, 104)
+    assert bench.exposures == []
+    bench.odometry(106, 106)
+    assert bench.exposures == [98 + EXPOSED // MS]
+    _, exposed, body = bench.eye.asked[0]
+    assert body.p_WB[0] == pytest.approx(exposed) and body.time == pytest.approx(exposed)
+    [sighting] = bench.out["sighting"]
+    assert (sighting.stamp, sighting.found, sighting.message) == (round(exposed * 1e9), False, "blind")
+
+
+def test_the_order_of_arrival_between_images_and_odometry_does_not_matter():
+    early, late = Bench(), Bench()
+    early.image(98), early.odometry(0, 200)
+    late.odometry(0, 200), late.image(98)
+    (_, a, before), (_, b, after) = early.eye.asked[0], late.eye.asked[0]
+    assert a == b and before.p_WB.tobytes() == after.p_WB.tobytes()
+
+
+def test_repeated_images_and_those_of_another_time_are_told_and_do_not_spoil_the_order():
+    bench = Bench()
+    bench.odometry(0, 300)
+    for ms in (100, 100, 50, 5000, 150):
+        bench.image(ms)
+    assert bench.exposures == [100 + EXPOSED // MS, 150 + EXPOSED // MS]
+    messages = [s.message for s in bench.out["sighting"]]
+    assert "not newer" in messages[1] and "not newer" in messages[2] and "ahead of the odometry" in messages[3]
+
+
+def test_the_queue_is_bounded():
+    bench = Bench()
+    for k in range(MOST_WAITING + 5):
+        bench.image(100 + 10 * k)
+    assert bench.component.dropped == 5
+    assert any("dropped" in text for text in bench.out.warnings())
+    bench.odometry(0, 400)
+    assert len(bench.exposures) == MOST_WAITING and bench.exposures[0] == 150 + EXPOSED // MS
+
+
+@pytest.mark.parametrize("bad", [
+    dict(p_WB=(math.nan, 0.0, 0.0)), dict(q_WB=(0.0, 0.0, 0.0, 0.0)), dict(frame="camera"), dict(pose_covariance=np.eye(6) * 1e300),
+    dict(pose_covariance=-np.eye(6)), dict(pose_covariance=np.full((6, 6), np.nan)), dict(pose_covariance=np.eye(3)),
+    dict(v_B=(0.0, math.inf, 0.0))])
+def test_bad_odometry_is_dropped_with_a_warning(bad):
+    bench = Bench()
+    bench.odometry(0, 100)
+    bench.component.on_odometry(odometry(102 * MS, **bad))
+    assert bench.out.warnings()
+    bench.image(93)  # exposed at 101 ms
+    assert bench.exposures == []
+    bench.odometry(104, 104)
+    assert bench.exposures == [101]
+    assert np.isfinite(bench.eye.asked[0][2].covariance).all()
+
+
+@pytest.mark.parametrize("jump", [-2_000, 3_600_000])
+def test_odometry_that_was_started_again_is_followed(jump):
+    """One wrong stamp changes nothing; a new stream is believed after a few, and images of its time are used."""
+    bench = Bench()
+    bench.odometry(5000, 6000)
+    bench.image(5900)
+    bench.component.on_odometry(odometry((6000 + jump) * MS))
+    bench.odometry(6002, 6010)
+    bench.image(5990)
+    assert len(bench.exposures) == 2
+    bench.odometry(6002 + jump, 6200 + jump)
+    assert any("starting anew" in text for text in bench.out.warnings())
+    bench.image(6100 + jump)
+    assert bench.exposures[-1] == 6100 + jump + EXPOSED // MS
+
+
+def test_images_wait_for_camera_info():
+    bench = Bench(known=False)
+    bench.odometry(0, 200)
+    bench.image(100)
+    assert bench.exposures == [] and any("camera_front/camera_info" in text for text in bench.out.warnings())
+    bench.component.on_camera_info(CameraModel(100 * MS, FRAME, CAMERA))
+    assert bench.exposures == [100 + EXPOSED // MS]
+    assert bench.component.mounted.mount is bench.component.mounted.nominal  # the calibrated camera itself: caches stay
+
+
+def test_another_camera_is_believed_when_it_stays():
+    bench = Bench()
+    bench.component.on_camera_info(CameraModel(1, FRAME, OTHER))
+    bench.component.on_camera_info(CameraModel(2, FRAME, CAMERA))
+    assert bench.component.mounted.mount.camera is CAMERA or bench.component.mounted.mount.camera == CAMERA
+    for _ in range(10):  # two that contradict each other: the first one holds
+        bench.component.on_camera_info(CameraModel(3, FRAME, OTHER))
+        bench.component.on_camera_info(CameraModel(3, FRAME, CAMERA))
+    assert bench.component.mounted.mount.camera == CAMERA
+    for _ in range(10):
+        bench.component.on_camera_info(CameraModel(4, FRAME, OTHER))
+    assert bench.component.mounted.mount.camera == OTHER
+    assert any("the camera has changed" in text for text in bench.out.warnings())
+
+
+@pytest.mark.parametrize("changes", [
+    dict(encoding="16UC1"), dict(width=320), dict(pixels=np.zeros((10, 10), np.uint8)), dict(pixels=lambda region: None),
+    dict(encoding="rgb8", pixels=np.zeros((480, 640), np.uint8)), dict(pixels=np.zeros((480, 640), np.float32))])
+def test_an_image_of_another_kind_is_told(changes):
+    bench = Bench()
+    bench.odometry(0, 200)
+    bench.image(100, **changes)
+    [sighting] = bench.out["sighting"]
+    assert "image:" in sighting.message and not sighting.found
+    bench.image(130)
+    assert bench.out["sighting"][-1].message == "blind"
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1", "rgb8", "bgr8", "8UC3"])
+def test_every_encoding_is_looked_at_in_grey(encoding):
+    bench = Bench()
+    bench.odometry(0, 200)
+    pixels = np.zeros((480, 640, 3), np.uint8)
+    pixels[..., 0 if encoding == "rgb8" else 2] = 200  # red
+    grey = np.full((480, 640), 60, np.uint8)
+    bench.component.on_image(picture(100 * MS, encoding=encoding, pixels=grey if encoding in ("mono8", "8UC1") else pixels))
+    assert bench.eye.asked[0][0].shape == (480, 640)
+    assert abs(int(bench.eye.asked[0][0][0, 0]) - 60) <= 1
+
+
+def test_extrinsics_by_transforms():
+    bench = Bench(extrinsics="tf")
+    bench.odometry(0, 200)
+    bench.image(100)
+    assert bench.exposures == [] and any("/tf_static" in text for text in bench.out.warnings())
+    upright = (0.0, 0.0, 0.0, 1.0)
+    bench.component.on_transform(Transform("camera_link", FRAME, (0.0, 0.0, 0.0), tuple(quat_from_matrix(FRONT.R_BC).tolist())))
+    assert bench.exposures == []
+    bench.component.on_transform(Transform("base_link", "camera_link", (0.5, 0.0, 0.1), upright))
+    assert len(bench.exposures) == 1
+    np.testing.assert_allclose(bench.component.mounted.mount.p_BC, (0.5, 0.0, 0.1))
+    np.testing.assert_allclose(bench.component.mounted.mount.R_BC, FRONT.R_BC, atol=1e-12)
+
+
+@pytest.mark.parametrize(("cls", "parameters"), [
+    (TargetLocalizer, {"camera": "tail"}), (PowerlineMapper, {"vehicle": "snapdragon"}), (PowerlineMapper, {"camera": "tail"})])
+def test_a_camera_that_cannot_be_used_is_refused_at_the_start(cls, parameters):
+    with pytest.raises(ConfigError, match="usable"):
+        cls(from_mapping(cls.config_type, parameters, "node"))
+
+
+# -- powerline mapper ------------------------------------------------------------------------------------------------------
+
+
+def mapper(**parameters):
+    component = PowerlineMapper(from_mapping(PowerlineMapperConfig, parameters, "powerline_mapper"))
+    mount = load_vehicle("rpg").mounts["front"]
+    component.on_camera_info(CameraModel(0, FRAME, mount.camera))
+    return component, Outputs(component), mount
+
+
+def test_the_mapper_takes_so_many_images_a_second():
+    component, out, mount = mapper(rate=10.0)
+    for ms in range(0, 1100, 2):
+        component.on_odometry(odometry(ms * MS))
+        if ms % 34 == 0:
+            component.on_image(picture(ms * MS, mount.camera, "rgb8"))
+    gaps = np.diff([m.stamp for m in out["powerlines"]]) / MS
+    assert 9 <= len(out["powerlines"]) <= 11 and gaps.min() > 95
+    assert out["powerlines"][-1].lines == ()
+
+
+@pytest.mark.parametrize(("odometries", "encoding", "why"), [
+    (dict(pose_covariance=np.eye(6) * 9.0), "rgb8", "nothing is mapped"), ({}, "mono8", "no colour"), ({}, "16UC1", "encoding")])
+def test_the_mapper_says_why_an_image_was_not_used(odometries, encoding, why):
+    component, out, mount = mapper()
+    for ms in range(0, 200, 2):
+        component.on_odometry(odometry(ms * MS, **odometries))
+    component.on_image(picture(100 * MS, mount.camera, encoding))
+    assert why in out["powerlines"][0].message
+    assert any(why in text for text in out.warnings())
+
+
+def test_the_mapper_works_in_grey_where_wires_are_dark():
+    component, out, _ = mapper(detection={"appearance": "dark"})
+    for ms in range(0, 200, 2):
+        component.on_odometry(odometry(ms * MS))
+    component.on_image(picture(100 * MS, load_vehicle("rpg").mounts["front"].camera, "mono8"))
+    assert out["powerlines"][0].message.startswith(("", "no"))
+    assert out.warnings() == []
+
+
+def test_a_camera_without_distortion_will_do():
+    component = TargetLocalizer(TargetLocalizerConfig())
+    out = Outputs(component)
+    component.on_camera_info(CameraModel(0, FRAME, PinholeCamera(320, 240, 200.0, 200.0, 160.0, 120.0)))
+    for ms in range(0, 200, 2):
+        component.on_odometry(odometry(ms * MS))
+    component.on_image(picture(100 * MS, PinholeCamera(320, 240, 200.0, 200.0, 160.0, 120.0)))
+    assert out["sighting"][0].message == "no tag of the board found"

@@ -1,0 +1,474 @@
+"""The controller as a component: any rate, silence, bad input, restart of time, nonsense on every port, laws and parameters."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from closed_loop.plant import Plant
+from perch_control.controller import Controller
+from perch_control.laws import LAWS
+from perch_control.modes import Command, State
+from perch_control.parameters import ControllerChoice, ControllerParameters
+from perch_core.errors import ConfigError, PerchError
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
+from perch_core.values import (
+    NANOSECONDS, Ask, AtEnd, ChooseLaw, ControllerCommand, EstimatorHealth, ImuSample, MappedPowerline, OdometryState, PowerlineMap,
+    TrajectoryOrder, rotated)
+from perch_core.vehicle import load_vehicle
+
+NONE = np.zeros((6, 6))
+START = 3 * NANOSECONDS
+
+
+def parameters(**choice) -> ControllerParameters:
+    return ControllerParameters(controller=ControllerChoice(**{"standby": False} | choice))
+
+
+class Flight:
+    """A controller on a plant whose state is the odometry, at any rate; stamps are whole nanoseconds."""
+
+    def __init__(self, rate: float = 500.0, params: ControllerParameters | None = None) -> None:
+        self.component = Controller(params or parameters())
+        self.plant = Plant(load_vehicle("snapdragon"), np.zeros(3), speed=np.zeros(4))
+        self.period, self.stamp = round(1e9 / rate), START
+        self.motors, self.status, self.lines, self.references = [], [], [], []
+        for name, kept in (("motor_command", self.motors), ("status", self.status), ("log", self.lines), ("reference", self.references)):
+            getattr(self.component, name).receivers.append(kept.append)
+
+    def odometry(self, **changes) -> OdometryState:
+        s = self.plant.state
+        return OdometryState(self.stamp, s[0:3], s[6:10], rotated(s[6:10], s[3:6], -1.0), s[10:13], NONE, NONE)._replace(**changes)
+
+    def imu(self, **changes) -> ImuSample:
+        return ImuSample(self.stamp, tuple(self.plant.w.tolist()), tuple(self.plant.specific_force_B.tolist()))._replace(**changes)
+
+    def step(self, seconds: float, odometry=True, imu=True, **changes) -> None:
+        for _ in range(round(seconds * 1e9 / self.period)):
+            before = len(self.motors)
+            if imu:
+                self.component.on_imu(self.imu())
+            if odometry:
+                self.component.on_odometry(self.odometry(**changes))
+            if len(self.motors) > before:
+                self.command = self.motors[-1]
+            speed = np.array(self.command.rotor_speed) if self.command.armed else np.zeros(4)
+            self.plant.advance(speed, self.period * 1e-9, max(2, self.period // 1_000_000))
+            self.stamp += self.period
+
+    def follow(self, trajectory, **changes) -> None:
+        self.component.on_trajectory(TrajectoryOrder.of(5, trajectory)._replace(**changes))
+
+    def order(self, command: Command, stamp: int = 0) -> None:
+        self.component.on_command(ControllerCommand(stamp, int(command), "test"))
+
+    def take_off(self) -> Flight:
+        self.step(0.5)
+        self.order(Command.ARM)
+        self.follow(self.path((0, 0, 0), (0, 0, 0.6), 1.0))
+        self.step(1.6)
+        assert self.state is State.HOVERING, self.said
+        return self
+
+    def path(self, a, b, duration) -> FlatTrajectory:
+        return rest_to_rest(np.array(a, float), np.array(b, float), 0.0, 0.0, duration, start_time=self.stamp * 1e-9 + 0.02)
+
+    @property
+    def state(self) -> State:
+        return self.component.flight.state
+
+    @property
+    def said(self) -> str:
+        return " | ".join(line.text for line in self.lines)
+
+
+# -- rates -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate, law, adaptive", [(100.0, "geometric", False), (100.0, "nmpc", True), (333.0, "geometric", True),
+                                                 (1000.0, "geometric", True), (1000.0, "nmpc", False)])
+def test_every_odometry_sample_is_answered_and_flown_on_at_any_rate(rate, law, adaptive):
+    flight = Flight(rate, parameters(type=law, adaptive=adaptive)).take_off()
+    stamps = [m.stamp for m in flight.motors]
+    assert stamps == list(range(START, flight.stamp, flight.period))
+    flight.follow(flight.path(flight.plant.p, flight.plant.p + [1.0, 0.5, 0.2], 1.6), id=6)
+    flight.step(2.4)
+    assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05, flight.said
+    np.testing.assert_allclose(flight.plant.p, [1.0, 0.5, 0.8], atol=0.03)
+    assert flight.component.flight.law.period == pytest.approx(flight.period * 1e-9, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [100.0, 333.0, 500.0])
+def test_status_and_reference_keep_their_periods_of_stamps(rate):
+    flight = Flight(rate).take_off()
+    stamps = np.array([s.stamp for s in flight.status])
+    due = START + 20_000_000 * np.arange(len(stamps))
+    assert len(stamps) == pytest.approx((flight.stamp - START) / 20e6, abs=1.0)
+    assert ((stamps - due >= 0) & (stamps - due < flight.period)).all(), "the first sample at or after each instant of the grid"
+    gaps = np.diff([r.stamp for r in flight.references if r.trajectory_id == 5])
+    assert np.median(gaps) == pytest.approx(10e6, abs=flight.period / 2 + 1)
+
+
+def test_a_reference_that_nobody_wants_is_not_made():
+    flight = Flight()
+    flight.component.reference.asked = lambda: False
+    flight.take_off()
+    assert not flight.references
+
+
+# -- silence -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+def test_where_odometry_stops_the_imu_is_answered_down_to_the_ground(rate):
+    flight = Flight(rate).take_off()
+    last = flight.motors[-1].stamp
+    flight.step(0.2, odometry=False)
+    first = next(m.stamp for m in flight.motors if m.stamp > last)
+    assert first - last == pytest.approx(80e6, abs=flight.period), "before the motors stop by themselves, after 0.1 s"
+    assert flight.state is State.LANDING and "odometry has stopped" in flight.said
+    assert flight.status[-1].stamp > first, "the status goes on"
+    flight.step(6.0, odometry=False)
+    assert flight.state is State.DISARMED and flight.plant.p[2] < 0.02 and flight.plant.impact_speed < 1.5
+    count = len(flight.motors)
+    flight.step(0.5, odometry=False)
+    assert len(flight.motors) == count, "disarmed, silence needs no answer"
+
+
+def test_an_imu_that_is_alone_before_the_first_odometry_is_not_answered():
+    flight = Flight()
+    flight.command = None
+    for _ in range(200):
+        flight.component.on_imu(flight.imu())
+        flight.stamp += flight.period
+    assert not flight.motors
+
+
+def test_where_both_stop_the_watchdog_goes_on_by_the_clock():
+    flight = Flight().take_off()
+    clock, last, count = 77 * NANOSECONDS, flight.motors[-1].stamp, len(flight.motors)
+    for _ in range(4):  # 60 ms after the wake that saw the last input
+        flight.component.on_watchdog(clock)
+        clock += 20_000_000
+    assert len(flight.motors) == count
+    for _ in range(10):
+        flight.component.on_watchdog(clock)
+        clock += 20_000_000
+    answered = [m.stamp for m in flight.motors[count:]]
+    assert len(answered) == 10 and (np.diff(answered) == 20_000_000).all() and answered[0] - last == 80_000_000
+    assert flight.state is State.LANDING and "neither odometry nor IMU" in flight.said and flight.motors[-1].armed
+    assert all(isinstance(m.stamp, int) for m in flight.motors)
+    flight.stamp += 280_000_000
+    flight.step(8.0, odometry=False)  # the IMU is back
+    assert flight.state is State.DISARMED
+
+
+def test_the_watchdog_is_quiet_while_inputs_come_and_while_disarmed():
+    flight = Flight()
+    for k in range(100):
+        flight.component.on_watchdog(k * NANOSECONDS)
+    assert not flight.motors
+    flight.take_off()
+    count = len(flight.motors)
+    for k in range(100):  # simulation far slower than the clock: something has come between any two wakes
+        flight.step(0.002)
+        flight.component.on_watchdog(k * NANOSECONDS)
+    assert len(flight.motors) == count + 100 and flight.state is State.HOVERING
+
+
+# -- bad sensors -------------------------------------------------------------------------------------------------------
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize("changes", [
+    {"p_WB": (NAN, 0.0, 0.0)}, {"v_B": (0.0, float("inf"), 0.0)}, {"q_WB": (0.0, 0.0, 0.0, 0.0)}, {"q_WB": (0.0, 0.0, 0.0, 0.4)},
+    {"p_WB": (1e300, 0.0, 0.0)}, {"w_B": (0.0, 0.0, 1e200)}])
+def test_odometry_that_cannot_be_used_is_answered_bridged_and_then_descended_without(changes):
+    flight = Flight().take_off()
+    count = len(flight.motors)
+    flight.step(0.04, **changes)
+    assert len(flight.motors) == count + 20 and flight.state is State.HOVERING and "refused" in flight.said
+    flight.step(0.04, **changes)
+    assert len(flight.motors) == count + 40 and flight.state is State.LANDING
+
+
+def test_odometry_in_another_frame_is_ignored():
+    flight = Flight().take_off()
+    count = len(flight.motors)
+    flight.component.on_odometry(flight.odometry(frame="odom"))
+    assert len(flight.motors) == count and "'odom'" in flight.said
+
+
+@pytest.mark.parametrize("offset", [-2000 * NANOSECONDS, -2 * NANOSECONDS, 2 * NANOSECONDS, 10**18])
+def test_stamps_of_another_time_are_ignored_however_many_come_between(offset):
+    flight = Flight().take_off()
+    for _ in range(300):
+        flight.step(0.002)
+        for _ in range(3):
+            flight.component.on_odometry(flight.odometry(stamp=flight.stamp + offset))
+            flight.component.on_imu(flight.imu(stamp=flight.stamp + offset))
+    assert flight.state is State.HOVERING and "not of the present" in flight.said
+    assert max(m.stamp for m in flight.motors) < flight.stamp
+    np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
+
+
+def test_a_little_older_stamps_are_refused_by_the_flight_and_move_nothing():
+    flight = Flight().take_off()
+    for _ in range(50):
+        flight.step(0.002)
+        flight.component.on_odometry(flight.odometry(stamp=flight.stamp - 300_000_000))
+    assert flight.state is State.HOVERING
+    np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
+
+
+@pytest.mark.parametrize("changes", [{"f_B": (NAN, 0.0, 9.8)}, {"w_B": (1e300, 0.0, 0.0)}, {"frame": "camera_down_optical_frame"}])
+def test_imu_samples_that_cannot_be_used_are_ignored(changes):
+    flight = Flight().take_off()
+    ratio = flight.component.flight.health.ratio
+    for _ in range(50):
+        flight.component.on_imu(flight.imu(**changes))
+        flight.step(0.002)
+    assert flight.state is State.HOVERING and "imu/data_raw" in flight.said
+    assert flight.component.flight.health.ratio == pytest.approx(ratio, abs=0.02)
+
+
+def test_a_vehicle_that_was_started_again_is_answered_again():
+    flight = Flight().take_off()
+    flight.order(Command.LAND)
+    flight.step(5.0)
+    assert flight.state is State.DISARMED
+    flight.stamp, flight.plant = 5_000_000, Plant(load_vehicle("snapdragon"), np.zeros(3), speed=np.zeros(4))
+    count = len(flight.status)
+    flight.step(0.5)
+    assert flight.motors[-1].stamp == flight.stamp - flight.period and "starting anew" in flight.said
+    assert flight.status[-1].stamp < NANOSECONDS and len(flight.status) > count + 15
+    flight.order(Command.ARM)
+    flight.follow(flight.path((0, 0, 0), (0, 0, 0.5), 1.0))
+    flight.step(1.5)
+    assert flight.plant.p[2] == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_vehicle_that_was_killed_in_flight_and_started_again_is_answered_again():
+    flight = Flight().take_off()
+    for k in range(100):
+        flight.component.on_watchdog(k * 20_000_000)
+    assert flight.state is State.FAILED and "neither odometry nor IMU" in flight.said
+    flight.stamp, flight.plant = 5_000_000, Plant(load_vehicle("snapdragon"), np.zeros(3), speed=np.zeros(4))
+    flight.step(0.5)
+    assert flight.state is State.DISARMED and flight.motors[-1].stamp == flight.stamp - flight.period
+
+
+# -- nonsense in orders ------------------------------------------------------------------------------------------------
+
+
+def samples(flight: Flight, **changes) -> SampledTrajectory:
+    """A hover at the present place, as samples."""
+    n = 40
+    zero, thrust = np.zeros((n, 3)), np.full((n, 4), flight.component.flight.vehicle.hover_thrust / 4)
+    fields = {"times": np.linspace(0.0, 1.0, n), "p": np.tile([0.0, 0.0, 0.6], (n, 1)), "q": np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), "v": zero,
+              "w": zero, "a": zero, "dw": zero, "rotor_thrust": thrust}
+    return SampledTrajectory(**fields | changes, start_time=flight.stamp * 1e-9 + 0.02)
+
+
+def with_rates(flight):
+    return samples(flight, w=np.full((40, 3), 1e9))
+
+
+def many_coefficients(flight):
+    c = np.zeros((1, 4, 1100))
+    c[:, 2] = 0.6
+    return FlatTrajectory(np.array([2.0]), c, flight.stamp * 1e-9 + 0.02)
+
+
+def far_away(flight):
+    t = flight.path((0, 0, 0.6), (1, 0, 0.6), 2.0)
+    return FlatTrajectory(t.durations, t.coefficients + np.array([1e300, 0, 0, 0])[None, :, None], t.start_time)
+
+
+def in_no_time(flight):
+    t = flight.path((0, 0, 0.6), (1, 0, 0.6), 2.0)
+    return FlatTrajectory(t.durations * 1e-7, t.coefficients, t.start_time)
+
+
+def too_long(flight):
+    return replace(flight.path((0, 0, 0.6), (1, 0, 0.6), 2.0), durations=np.array([1e7]))
+
+
+@pytest.mark.parametrize("make, changes, word", [
+    (None, {"contact_time": NAN}, "contact_time"), (None, {"contact_time": -1.0}, "contact_time"), (None, {"recovery_start": NAN}, "recovery_start"),
+    (None, {"recovery_start": 1e9}, "recovery_start"), (None, {"at_end": 9}, "at_end 9"), (None, {"id": -3}, "id -3"),
+    (many_coefficients, {}, "degree 1099"), (with_rates, {}, "w of 1e+09"), (far_away, {}, "position"), (in_no_time, {}, "velocity"),
+    (too_long, {}, "lasts"), (lambda f: samples(f, q=np.tile([0.0, 0.0, 0.0, 0.9], (40, 1))), {}, "norm 0.9"),
+    (lambda f: samples(f, rotor_thrust=np.full((40, 4), 1e6)), {}, "rotor thrust"),
+    (lambda f: samples(f, times=np.linspace(-1.0, 1.0, 40)), {}, "before its start"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=NAN), {}, "start time"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=1e12), {}, "future"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=-1e12), {}, "past"),
+    (lambda f: f.path((2, 0, 0.6), (3, 0, 0.6), 2.0), {}, "away"),
+])
+def test_nonsense_on_trajectory_is_refused_and_said(make, changes, word):
+    flight = Flight().take_off()
+    trajectory = make(flight) if make else flight.path((0, 0, 0.6), (1, 0, 0.6), 2.0)
+    flight.component.on_trajectory(TrajectoryOrder(99, trajectory)._replace(**changes))
+    flight.step(0.3)
+    assert flight.state is State.HOVERING
+    assert "refused" in flight.status[-1].message and word in flight.status[-1].message and word in flight.said
+    flight.component.on_recovery(TrajectoryOrder(99, trajectory)._replace(**changes))
+    flight.step(0.1)
+    assert flight.state is State.HOVERING
+    np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
+
+
+def test_samples_are_flown_by_their_normalised_quaternions():
+    flight = Flight().take_off()
+    q = np.tile([0.0, 0.0, 0.0, 1.0005], (40, 1))
+    flight.follow(samples(flight, q=q), at_end=AtEnd.HOLD)
+    flight.step(0.1)
+    assert flight.state is State.TRACKING
+    assert np.linalg.norm(flight.component.flight.maneuvers.order.source.trajectory.q, axis=1) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("command, stamp, said", [(77, 0, "77"), (int(Command.DISARM), 0, "land first"), (int(Command.LAND), 1000, "too old")])
+def test_commands_that_are_none_or_not_now_are_refused(command, stamp, said):
+    flight = Flight().take_off()
+    flight.component.on_command(ControllerCommand(stamp, command, "x" * 10_000))
+    flight.step(0.2)
+    assert flight.state is State.HOVERING and said in flight.said
+
+
+@pytest.mark.parametrize("health, state", [
+    (EstimatorHealth(0, 3, 0.0, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, "of long ago"), State.HOVERING),
+    (EstimatorHealth(-1, 9, 0.0, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, "nonsense"), State.HOVERING),
+    (EstimatorHealth(-1, 2, NAN, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""), State.HOVERING),
+    (EstimatorHealth(-1, 3, 0.0, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, "now"), State.LANDING)])
+def test_an_estimators_status_counts_where_it_is_of_now(health, state):
+    flight = Flight().take_off()
+    flight.component.on_estimator(health._replace(stamp=flight.stamp if health.stamp < 0 else health.stamp))
+    flight.step(0.1)
+    assert flight.state is state
+
+
+def test_a_map_with_lines_that_are_none_is_ignored():
+    params = parameters()
+    params = replace(params, nmpc=replace(params.nmpc, lines=replace(params.nmpc.lines, collision=1.0)))
+    flight = Flight(params=params).take_off()
+    for end in ((NAN, 0.0, 0.0), (0.0, 0.0, 0.0)):
+        flight.component.on_powerlines(PowerlineMap(flight.stamp, (MappedPowerline(1, (0.0, 0.0, 0.0), end, 0.01, np.eye(3), 0.1, 3),), False, ""))
+    assert "powerlines" in flight.said
+
+
+# -- laws and parameters -----------------------------------------------------------------------------------------------
+
+
+def ask(component, port, request):
+    answers = []
+    getattr(component, f"on_{port}")(request, answers.append)
+    return answers[0]
+
+
+def test_laws_are_chosen_in_flight_when_they_are_built():
+    jobs = []
+    flight = Flight(params=parameters(standby=True))
+    flight.component.work = jobs.append
+    flight.component.warm_up()
+    flight.take_off()
+    component = flight.component
+    answer = ask(component, "set_controller", ChooseLaw("pid", False))
+    assert (answer.success, answer.error_code) == (False, 1) and "geometric, nmpc" in answer.message
+    answer = ask(component, "set_controller", ChooseLaw("nmpc", False))
+    assert (answer.success, answer.error_code) == (False, 2) and "not ready" in answer.message
+    job, = jobs
+    built = job.function(*job.arguments)
+    # Gains that change while it is being built are not lost.
+    config = replace(component.config, nmpc=replace(component.config.nmpc, thrust=2.5), snapdragon=replace(component.config.snapdragon, position=(5.0, 5.0, 6.0)))
+    component.reconfigure(config)
+    job.then(built)
+    before = np.array(flight.motors[-1].rotor_speed)
+    assert ask(component, "set_controller", ChooseLaw("nmpc", True)).message == "nmpc+l1 flies"
+    flight.step(0.002)
+    assert np.abs(np.array(flight.motors[-1].rotor_speed) - before).max() < 0.05 * before.max(), "no jump"
+    assert built.settings.thrust == 2.5 and built.fallback.gains.position == (5.0, 5.0, 6.0)
+    flight.step(0.5)
+    assert flight.status[-1].controller == "nmpc+l1" and np.linalg.norm(flight.plant.v) < 0.05
+
+
+def test_a_law_whose_settings_are_compiled_in_is_built_again_where_these_have_changed():
+    jobs = []
+    component = Controller(parameters(standby=True))
+    component.work = jobs.append
+    component.warm_up()
+    component.reconfigure(replace(component.config, nmpc=replace(component.config.nmpc, nodes=10)))
+    first = jobs.pop()
+    first.then(first.function(*first.arguments))
+    assert ask(component, "set_controller", ChooseLaw("nmpc", False)).error_code == 2
+    again = jobs.pop()
+    assert again.arguments[2].nmpc.nodes == 10
+
+
+def test_a_law_that_could_not_be_built_says_why():
+    jobs = []
+    component = Controller(parameters(standby=True))
+    component.work, lines = jobs.append, []
+    component.log.receivers.append(lines.append)
+    component.warm_up()
+    jobs[0].then(PerchError("no compiler"))
+    assert "no compiler" in lines[-1].text
+    assert "no compiler" in ask(component, "set_controller", ChooseLaw("nmpc", False)).message
+
+
+def test_gains_change_in_flight_and_what_is_fixed_is_refused():
+    flight = Flight().take_off()
+    component = flight.component
+    old = component.config
+    component.reconfigure(replace(old, snapdragon=replace(old.snapdragon, position=(5.0, 5.0, 6.0))))
+    assert component.flight.law.gains.position == (5.0, 5.0, 6.0)
+    with pytest.raises(ConfigError, match="fixed"):
+        component.reconfigure(replace(component.config, vehicle="rpg"))
+    with pytest.raises(ConfigError, match="not ready"):
+        component.reconfigure(replace(component.config, controller=ControllerChoice(type="nmpc", standby=False)))
+    assert component.config.vehicle == "snapdragon" and component.config.controller.type == "geometric"
+    component.reconfigure(replace(component.config, controller=ControllerChoice(adaptive=True, standby=False)))
+    flight.step(0.5)
+    assert flight.status[-1].controller == "geometric+l1" and np.linalg.norm(flight.plant.v) < 0.05
+    with pytest.raises(ConfigError, match="'pid' is not one of geometric, nmpc"):
+        parameters(type="pid")
+
+
+def test_abort_brakes_to_a_hover():
+    flight = Flight().take_off()
+    flight.follow(flight.path((0, 0, 0.6), (2, 0, 0.6), 2.0), id=6)
+    flight.step(1.0)
+    answer = ask(flight.component, "abort", Ask())
+    assert answer.success and "abort" in answer.message
+    flight.step(1.5)
+    assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05 and flight.plant.p[0] < 2.6
+
+
+GUIDE = Path(__file__).resolve().parents[2] / "docs/howto/own_controller.md"
+
+
+def test_the_law_of_the_guide_flies(tmp_path, monkeypatch):
+    text, = re.findall(r"```py\n# pd_law.py\n(.*?)```", GUIDE.read_text(), re.S)
+    (tmp_path / "pd_law.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    name, place = re.search(r'^"(\w+)": "([\w:.]+)",$', GUIDE.read_text(), re.M).groups()
+    monkeypatch.setitem(LAWS, name, place)
+    flight = Flight(params=parameters(type=name)).take_off()
+    assert flight.status[-1].controller == "pd"
+    flight.follow(flight.path((0, 0, 0.6), (1.5, 1.0, 1.0), 2.0), id=6)
+    flight.step(1.0)
+    reference = np.array(flight.references[-1].p)
+    assert np.linalg.norm(flight.plant.p - reference) < 0.08  # it aims 20 ms ahead, at 1.8 m/s
+    flight.step(1.5)
+    np.testing.assert_allclose(flight.plant.p, [1.5, 1.0, 1.0], atol=0.02)
+    assert ask(flight.component, "set_controller", ChooseLaw("geometric", False)).success
+    flight.step(0.3)
+    assert ask(flight.component, "set_controller", ChooseLaw("pd", True)).message == "pd+l1 flies"
+    flight.step(0.5)
+    assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05

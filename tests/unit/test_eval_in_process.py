@@ -1,0 +1,65 @@
+"""The flight loop: its first moments, what is disturbed on its way, and the same flight again."""
+
+from dataclasses import replace
+
+import pytest
+
+from perch_core.errors import PerchError
+from perch_core.vehicle import load_vehicle
+from perch_eval.in_process import Sensing, arrange, fly
+from perch_eval.in_process.flights import perch
+from perch_eval.in_process.stand_ins import TruthEstimator
+from perch_eval.metrics import flight_metrics
+from perch_eval.ros.recorded_flight import RecordedFlight, write
+from perch_sim.scenario import load_scenario
+from perch_sim.simulation import START
+
+
+def test_an_image_exposed_before_the_first_step_ends_is_looked_at():
+    loop = arrange(load_scenario("surface_90_far"), 64)
+    first = loop.step()
+    for _ in range(30):
+        loop.step()
+    seen = loop.trace["target/detections"]
+    assert START < seen[0][0] < first
+
+
+def test_a_flight_without_vio_does_not_take_off():
+    loop = arrange(load_scenario("surface_90"), 1)
+    for channel in ("vio/state", "vio/odometry"):
+        loop.filters["estimator", channel] = lambda now, value: None
+    trace = perch(loop, load_scenario("surface_90"))
+    assert trace.outcome == "timeout" and trace["vio/state"] and trace.values("odometry")[-1].p_WB[2] < 0.2
+
+
+def test_a_component_is_replaced_by_its_name():
+    scenario = load_scenario("surface_90")
+    trace = perch(arrange(scenario, 1, replace={"estimator": TruthEstimator()}), scenario)
+    assert trace.outcome == "perched"
+    assert [e.p_WB for e in trace.values("odometry")] == [t.p_WB for t in trace.values("ground_truth/odometry")]
+
+
+def test_the_same_seed_is_the_same_flight_and_another_one_is_not():
+    flights = [fly(load_scenario("surface_90"), seed) for seed in (2, 2, 3)]
+    hashes = [trace.flight.digest(trace.end_time) for trace in flights]
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert [phase for _, phase, _ in flights[0].phases] == [
+        "arming", "arming", "take_off", "searching", "searching", "planning", "tracking", "verifying", "perched"]
+
+
+def test_a_recording_of_a_flight_has_its_digest_and_its_figures(tmp_path):
+    scenario = load_scenario("surface_90")
+    trace = fly(scenario, 4)
+    write(tmp_path / "flight.mcap", trace.timeline())
+    recorded, vehicle = RecordedFlight(tmp_path / "flight.mcap"), load_vehicle(scenario.vehicle)
+    assert recorded.digest(trace.end_time) == trace.flight.digest(trace.end_time)
+    assert flight_metrics(recorded, vehicle, trace.end_time) == flight_metrics(trace.flight, vehicle, trace.end_time)
+
+
+def test_what_has_no_error_model_is_refused():
+    line = load_scenario("line_180")
+    hanging = replace(line, world=replace(line.world, cables=tuple(replace(cable, sag=0.5) for cable in line.world.cables)))
+    with pytest.raises(PerchError, match="sag have no error model"):
+        fly(hanging, 1)
+    with pytest.raises(PerchError, match="sensing.vio: 'real' is not one of model, rendered"):
+        Sensing(vio="real")

@@ -1,0 +1,55 @@
+"""Ctrl-C while scripts come up: it is never lost, and leaves no traceback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from perch_eval.program import Program
+from perch_eval.stack import Stack
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+
+
+@pytest.fixture
+def visit(monkeypatch, ros_domain):
+    """`ros_graph.connection.visit`, of the scripts."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from ros_graph.connection import visit
+
+    return visit
+
+
+def test_ctrl_c_ends_the_wait_for_nodes(visit, tmp_path):
+    loading = Program("loading", (sys.executable, "-S", "-c", "import time; time.sleep(1000)"), ("/loading",))
+    with Stack([loading], tmp_path) as stack, pytest.raises(KeyboardInterrupt), visit() as graph:
+        os.kill(os.getpid(), signal.SIGINT)
+        stack.wait_until_ready(graph.nodes, timeout=60.0)
+    assert stack.pids == {}
+
+
+def test_ctrl_c_that_nobody_looked_for_counts_at_the_end_of_the_visit(visit):
+    with pytest.raises(KeyboardInterrupt), visit():
+        os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_while_modules_are_loaded_leaves_no_traceback():
+    code = f"""
+import os, signal, sys
+sys.path.insert(0, {str(SCRIPTS)!r})
+from perch_setup import quiet_on_interrupt
+with quiet_on_interrupt():
+    print("loading", flush=True)
+    while True:
+        signal.pause()
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "loading\n"
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=60.0)
+    assert (process.returncode, error) == (130, "")

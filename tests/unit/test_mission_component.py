@@ -1,0 +1,359 @@
+"""The mission as a component: a perch through its ports, planners that fail, hang or are missing, bad goals and bad input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from perch_control.mission.parameters import MissionParameters
+from perch_control.mission.values import Command, ControllerState, Result
+from perch_control.mission_component import Mission
+from perch_core import so3
+from perch_core.component import Unavailable
+from perch_core.surface import PerchSurface
+from perch_core.trajectory import SampledTrajectory, rest_to_rest
+from perch_core.values import (
+    NANOSECONDS, ControllerStatus, EstimatorHealth, ImuSample, MappedPowerline, OdometryState, PerchGoal, PerchPlan, PowerlineMap, PowerlinePlan,
+    TargetPose, seconds)
+from perch_core.vehicle import GRAVITY
+
+TICK, NAN = 20_000_000, float("nan")
+SURFACE = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.2]), math.pi / 2)
+Q_PERCH = so3.quat_from_matrix(SURFACE.R_WS)
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+NONE = np.zeros((6, 6))
+
+
+class Sent:
+    """A goal, as a host hands it over."""
+
+    def __init__(self, value):
+        self.value, self.cancel_requested, self.told, self.ending, self.result = value, False, [], None, None
+
+    def feedback(self, value):
+        self.told.append(value)
+
+    def finish(self, ending, result):
+        assert self.ending is None, "once"
+        self.ending, self.result = ending, result
+
+
+class World:
+    """A controller that obeys, a pad in view, velcro that holds; a planner as told. IMU at a rate of its own."""
+
+    def __init__(self, planner=None, period=2_000_000, params=None, **goal):
+        self.mission = Mission(params or MissionParameters())
+        self.period, self.stamp, self.clock, self.planner = period, 5 * NANOSECONDS, 900 * NANOSECONDS, planner or self.plan
+        self.p, self.q, self.state, self.id = np.zeros(3), LEVEL, ControllerState.DISARMED, 0
+        self.flown = self.contact = None
+        self.requests, self.orders, self.commands, self.lines, self.sees, self.odometry = [], [], [], [], True, True
+        self.mission.trajectory.receivers.append(self.fly)
+        self.mission.recovery.receivers.append(self.orders.append)
+        self.mission.command.receivers.append(self.obey)
+        self.mission.log.receivers.append(self.lines.append)
+        self.mission.plan_perch = self.mission.plan_powerline = lambda request, due: (self.requests.append((request, due)), self.planner(request))
+        self.goal = Sent(PerchGoal(**goal))
+
+    def plan(self, request):
+        path = rest_to_rest(request.p, SURFACE.p_WS, 0.0, 0.0, 1.2, start_time=seconds(request.start))
+        self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
+
+    def fly(self, order):
+        self.orders.append(order)
+        self.flown, self.state, self.id = order.trajectory, ControllerState.TRACKING, order.id
+        self.contact = None if order.at_end == 0 else order.trajectory.start_time + order.trajectory.duration
+
+    def obey(self, command):
+        self.commands.append(Command(command.command))
+        assert command.stamp == self.stamp
+        states = {Command.ARM: ControllerState.ARMED, Command.ATTACHED: ControllerState.DISARMED, Command.DISARM: ControllerState.DISARMED,
+                  Command.HOVER: ControllerState.HOVERING}
+        self.state = states.get(self.commands[-1], self.state)
+
+    def tick(self):
+        time = seconds(self.stamp)
+        if self.flown is not None and time >= self.flown.start_time:
+            self.p = self.flown.sample(time - self.flown.start_time).p
+        if self.contact is not None and time >= self.contact:
+            self.q = tuple(Q_PERCH)
+        force = tuple(so3.quat_rotate(so3.quat_conjugate(np.array(self.q)), [0, 0, GRAVITY]).tolist())
+        for stamp in range(self.stamp - TICK + self.period, self.stamp + 1, self.period):
+            self.mission.on_imu(ImuSample(stamp, (0.0,) * 3, force))
+            if self.odometry:
+                self.mission.on_odometry(OdometryState(stamp, tuple(map(float, self.p)), self.q, (0.0,) * 3, (0.0,) * 3, NONE, NONE))
+        self.mission.on_status(ControllerStatus(self.stamp, int(self.state), "geometric", self.id, 0.0, 0.0, 0.0, 0.0, 1.0, "says so"))
+        self.mission.on_estimator(EstimatorHealth(self.stamp, 1, 0.0, 1, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""))
+        if self.sees:
+            self.mission.on_target(TargetPose(self.stamp - 30_000_000, SURFACE.p_WS, Q_PERCH, 1e-4 * np.eye(6)))
+        self.mission.on_tick(self.clock)
+        self.stamp, self.clock = self.stamp + TICK, self.clock + TICK
+
+    def run(self, limit=40.0, until=lambda world: False):
+        end = self.stamp + limit * 1e9
+        while self.goal.ending is None and self.stamp < end and not until(self):
+            self.tick()
+        return self
+
+    def send(self):
+        assert self.mission.on_perch(self.goal) == ""
+        return self
+
+    @property
+    def phase(self):
+        return self.goal.told[-1].phase if self.goal.told else ""
+
+    @property
+    def said(self):
+        return " | ".join(line.text for line in self.lines)
+
+
+@pytest.mark.parametrize("period", [1_000_000, 2_000_000, 5_000_000, 10_000_000])
+def test_a_perch_from_the_goal_to_its_result_at_any_imu_rate(period):
+    world = World(period=period).send().run()
+    result = world.goal.result
+    assert world.goal.ending == "succeeded" and result.success and result.error_code == 0
+    assert world.commands == [Command.ARM, Command.ATTACHED] and result.contact_time == pytest.approx(world.contact + 0.06, abs=0.05)
+    np.testing.assert_allclose(result.final_position, SURFACE.p_WS, atol=1e-9)
+    assert result.end_time == seconds(world.stamp - TICK)
+    assert [o.id for o in world.orders] == [1, 2] and world.orders[1].contact_time == 0.25
+    phases = list(dict.fromkeys(f.phase for f in world.goal.told))
+    assert phases == ["arming", "take_off", "searching", "planning", "tracking", "verifying", "perched"]
+    assert all(isinstance(order.trajectory.start_time, float) and round(order.trajectory.start_time * 1e9) % 1 == 0 for order in world.orders)
+
+
+def test_feedback_comes_at_changes_and_every_tenth_of_a_second():
+    world = World().send().run(1.0)
+    assert 10 <= len(world.goal.told) <= 14
+
+
+def test_a_second_goal_goes_on_with_other_numbers():
+    world = World().send().run()
+    world.goal, world.state, world.flown, world.contact, world.q, world.p = Sent(PerchGoal()), ControllerState.DISARMED, None, None, LEVEL, np.zeros(3)
+    world.send().run()
+    assert world.goal.ending == "succeeded" and [o.id for o in world.orders] == [1, 2, 3, 4]
+
+
+def test_an_answer_counts_from_its_due_time_on():
+    latency = MissionParameters().mission.planner_latency
+    world = World().send().run(until=lambda w: w.requests)
+    request, due = world.requests[0]
+    asked = world.stamp - TICK
+    assert due == asked + round(latency * 1e9) and world.phase == "planning"
+    orders = len(world.orders)
+    world.run(until=lambda w: len(w.orders) > orders)
+    assert world.stamp - TICK == due, "the answer was there at once"
+    assert seconds(request.start) == world.orders[-1].trajectory.start_time
+
+
+def test_a_late_answer_is_used_when_it_comes():
+    world = World(planner=lambda request: None).send().run(until=lambda w: w.requests)
+    world.run(0.5)
+    assert world.phase == "planning"
+    world.plan(world.requests[0][0])
+    world.run()
+    assert world.goal.ending == "succeeded"
+
+
+@pytest.mark.parametrize("answer, said", [
+    (Unavailable("service /plan_perch is not there"), "is not there"), (PerchPlan(success=False, message="thrust floor"), "thrust floor"),
+    (PerchPlan(success=True, message="forgot the trajectory"), "forgot")])
+def test_a_planner_that_is_missing_or_refuses_ends_the_goal(answer, said):
+    world = World()
+    world.planner = lambda request: world.mission.on_plan_perch(answer)
+    world.send().run()
+    assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.REFUSED) and said in world.goal.result.message
+
+
+def test_a_planner_that_never_answers_ends_the_goal():
+    world = World(planner=lambda request: None).send().run()
+    assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.TIMEOUT) and "planner" in world.goal.result.message
+
+
+def test_an_answer_to_an_earlier_goal_is_not_taken_for_this_ones():
+    world = World(planner=lambda request: None).send().run(until=lambda w: w.requests)
+    world.goal.cancel_requested = True
+    world.run()
+    assert world.goal.ending == "cancelled"
+    world.goal, world.state = Sent(PerchGoal()), ControllerState.HOVERING
+    world.send().run(until=lambda w: len(w.requests) == 2)
+    world.plan(world.requests[0][0])
+    world.run(0.5)
+    assert world.phase == "planning"
+    world.plan(world.requests[1][0])
+    world.run()
+    assert world.goal.ending == "succeeded"
+
+
+def test_an_unasked_answer_is_nothing():
+    world = World()
+    world.plan(type("Request", (), {"p": np.zeros(3), "start": 0}))
+    world.send().run()
+    assert world.goal.ending == "succeeded"
+
+
+@pytest.mark.parametrize("goal, word", [
+    ({"mode": 9}, "mode 9"), ({"mode": 2}, "waypoints"), ({"mode": 1, "perch_point": (NAN, 0.0, 0.0)}, "perch_point"),
+    ({"mode": 1, "perch_pitch": 4.0}, "perch_pitch"), ({"takeoff_height": -1.0}, "takeoff_height"), ({"takeoff_height": math.inf}, "takeoff_height"),
+    ({"search_timeout": 0.0}, "search_timeout"), ({"inclination_hint": 9.0}, "inclination_hint"), ({"search_frame": "odom"}, "'odom'"),
+    ({"search_frame": "map", "search_position": (NAN, 0.0, 1.0)}, "finite"), ({"search_frame": "map", "search_position": (0.0, 0.0, 0.1)}, "0.3 m"),
+    ({"search_frame": "map", "search_attitude": (0.0, 0.0, 0.0, 0.0)}, "norm 1")])
+def test_a_goal_that_cannot_be_flown_ends_with_the_reason(goal, word):
+    world = World(**goal)
+    assert world.mission.on_perch(world.goal) == ""
+    assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.BAD_GOAL) and word in world.goal.result.message
+    world.goal = Sent(PerchGoal())
+    world.send().run()
+    assert world.goal.ending == "succeeded", "the next one is flown"
+
+
+def test_one_goal_at_a_time():
+    world = World().send().run(2.0)
+    other = Sent(PerchGoal())
+    assert "another goal" in world.mission.on_perch(other) and other.ending is None
+
+
+@pytest.mark.parametrize("phase", ["arming", "take_off", "searching", "planning", "tracking"])
+def test_a_goal_is_cancelled_in_any_phase(phase):
+    world = World().send().run(until=lambda w: w.phase == phase)
+    world.goal.cancel_requested = True
+    world.run()
+    assert world.goal.ending == "cancelled" and world.goal.result.error_code == Result.CANCELLED
+
+
+def test_without_any_odometry_a_goal_is_cancelled_or_given_up():
+    for cancelled, ending, code in ((True, "cancelled", Result.CANCELLED), (False, "aborted", Result.TIMEOUT)):
+        world = World()
+        world.odometry = False
+        world.send().run(1.0)
+        assert world.goal.ending is None
+        world.goal.cancel_requested = cancelled
+        world.run()
+        assert (world.goal.ending, world.goal.result.error_code) == (ending, code)
+
+
+def test_where_odometry_stops_the_hosts_time_goes_on():
+    world = World().send().run(until=lambda w: w.phase == "searching")
+    world.odometry, world.sees = False, False
+    began = world.stamp
+    world.run(60.0)
+    assert world.goal.result is not None and world.goal.result.error_code == Result.NOT_FOUND
+    assert world.stamp - began < 15 * NANOSECONDS
+
+
+def test_ticks_without_new_odometry_do_nothing():
+    world = World().send().run(1.0)
+    told = len(world.goal.told)
+    for k in range(20):
+        world.mission.on_tick(world.clock - TICK + k * 1_000_000)
+    assert len(world.goal.told) == told
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("changes, word", [
+    ({"p_WS": np.full(3, NAN)}, "finite"), ({"q_WS": np.zeros(4)}, "norm"), ({"q_WS": np.full(4, NAN)}, "norm"), ({"p_WS": np.zeros(2)}, "sizes"),
+    ({"covariance": np.full((6, 6), NAN)}, "finite"), ({"covariance": -np.eye(6)}, "covariance"), ({"covariance": np.eye(3)}, "sizes"),
+    ({"stamp": 10**15}, "future"), ({"stamp": 1}, "older")])
+def test_a_foreign_target_is_refused_and_does_not_stop_the_flight(changes, word):
+    world = World().send().run(until=lambda w: w.phase == "searching")
+    foreign = TargetPose(world.stamp, np.array([9.0, 9.0, 9.0]), np.array(LEVEL), 1e-6 * np.eye(6))._replace(**changes)
+    while world.goal.ending is None:
+        world.mission.on_target(foreign)
+        world.tick()
+    assert world.goal.ending == "succeeded" and word in world.said
+    np.testing.assert_allclose(world.goal.result.final_position, SURFACE.p_WS, atol=1e-9)
+
+
+def test_a_target_before_any_odometry_is_not_believed():
+    world = World()
+    world.mission.on_target(TargetPose(10**15, SURFACE.p_WS, Q_PERCH, 1e-4 * np.eye(6)))
+    world.send().run()
+    assert world.goal.ending == "succeeded"
+
+
+@pytest.mark.parametrize("odometry", [
+    {"p_WB": (NAN, 0.0, 0.0)}, {"q_WB": (0.0,) * 4}, {"frame": "odom"}, {"v_B": (1e300, 0.0, 0.0)}, {"stamp": 10**17}, {"stamp": 0}])
+def test_foreign_odometry_imu_and_states_are_ignored(odometry):
+    world = World().send()
+    while world.goal.ending is None and world.stamp < 60 * NANOSECONDS:
+        state = OdometryState(world.stamp, (5.0, 5.0, 5.0), LEVEL, (0.0,) * 3, (0.0,) * 3, NONE, NONE)
+        if world.stamp > 6 * NANOSECONDS:
+            world.mission.on_odometry(state._replace(**odometry))
+            world.mission.on_imu(ImuSample(world.stamp, (0.0,) * 3, (NAN, 0.0, 0.0)))
+            world.mission.on_status(ControllerStatus(0, 6, "", 0, NAN, NAN, NAN, NAN, NAN, "failed long ago"))
+            world.mission.on_status(ControllerStatus(world.stamp, 200, "", 0, NAN, NAN, NAN, NAN, NAN, "no state"))
+            world.mission.on_estimator(EstimatorHealth(0, 3, NAN, 0, 0, NAN, (NAN,) * 3, (NAN,) * 3, NAN, NAN, ""))
+        world.tick()
+    assert world.goal.ending == "succeeded" and "ignored" in world.said
+
+
+def test_a_vehicle_that_was_started_again_ends_the_goal_and_takes_the_next():
+    world = World().send().run(3.0)
+    world.stamp, world.p, world.flown, world.state = NANOSECONDS, np.zeros(3), None, ControllerState.DISARMED
+    world.run(2.0)
+    assert world.goal.ending == "aborted" and "anew" in world.goal.result.message
+    world.goal = Sent(PerchGoal())
+    world.send().run()
+    assert world.goal.ending == "succeeded"
+
+
+# -- powerlines --------------------------------------------------------------------------------------------------------
+
+
+LINE = MappedPowerline(4, (4.0, -2.0, 4.25), (4.0, 2.0, 4.25), 0.01, 1e-4 * np.eye(3), 0.01, 30)
+
+
+class Wires(World):
+    """The same with a mapped wire in the place of the pad."""
+
+    def __init__(self, **goal):
+        super().__init__(mode=1, perch_point=(4.0, 0.0, 4.2), perch_pitch=1.4, takeoff_height=4.2, **goal)
+        self.sees, self.line = False, LINE
+
+    def plan(self, request):
+        t = np.linspace(0.0, 3.0, 60)
+        zero = np.zeros((60, 3))
+        q = np.tile([0.0, 0.0, 0.0, 1.0004], (60, 1))
+        sampled = SampledTrajectory(t, np.tile(request.p, (60, 1)), q, zero, zero, zero, zero, np.ones((60, 4)), seconds(request.start))
+        self.mission.on_plan_powerline(PowerlinePlan(
+            success=True, message="", trajectory=sampled, at_end=0 if request.recovery_only else 3, recovery_start=0.0 if request.recovery_only else 2.0,
+            perch_time=0.0 if request.recovery_only else 2.0, recovery_time=1.0))
+
+    def tick(self):
+        self.mission.on_powerlines(PowerlineMap(self.stamp - 40_000_000, (self.line,), False, ""))
+        super().tick()
+
+
+def test_a_wire_is_asked_for_flown_and_left_by_ways_out():
+    world = Wires(perception_aware=True).send().run(60.0, until=lambda w: len(w.requests) > 3)
+    first, way_out = world.requests[0][0], world.requests[1][0]
+    assert first.lines == (LINE,) and first.target_line == 4 and not first.recovery_only and first.perception_aware and first.with_recovery
+    assert first.rotor_thrust == () and first.perch_pitch == pytest.approx(1.4)
+    assert way_out.recovery_only and len(way_out.rotor_thrust) == 4 and np.linalg.norm(way_out.q) == pytest.approx(1.0)
+    perch = next(o for o in world.orders if o.at_end == 3)
+    assert perch.recovery_start == 2.0 and np.linalg.norm(perch.trajectory.q[0]) == pytest.approx(1.0004), "as planned: the controller normalises"
+    assert any(o.at_end == 0 and isinstance(o.trajectory, SampledTrajectory) and o.id == perch.id for o in world.orders), "a way out, of the same number"
+
+
+@pytest.mark.parametrize("line", [
+    LINE._replace(start=(NAN, 0.0, 0.0)), LINE._replace(end=LINE.start), LINE._replace(radius=-1.0), LINE._replace(covariance=np.full((3, 3), NAN)),
+    LINE._replace(covariance=np.eye(6)), LINE._replace(direction_sigma=NAN)])
+def test_a_map_with_a_line_that_is_none_is_refused(line):
+    world = Wires().send()
+    world.line = line
+    world.run(2.0)
+    assert "powerlines refused" in world.said
+    world.mission.on_powerlines(PowerlineMap(10**15, (LINE,), False, ""))
+    assert "future" in world.said
+
+
+def test_settings_change_in_flight():
+    world = World().send().run(until=lambda w: w.phase == "searching")
+    config = world.mission.config
+    world.mission.reconfigure(replace(config, mission=replace(config.mission, contact_time=0.4)))
+    world.run()
+    assert world.goal.ending == "succeeded" and world.orders[-1].contact_time == 0.4

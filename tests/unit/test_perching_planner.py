@@ -1,0 +1,243 @@
+"""Component `PerchingPlanner`: proved plans, a plan from a running one, and typed answers to nonsense, in process and isolated."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_core.component import Job
+from perch_core.errors import ConfigError
+from perch_core.isolated import IsolatedRunner
+from perch_core.surface import PerchSurface
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.values import PerchPlan, PerchPlanRequest
+from perch_planner import perching_planner
+from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
+from perch_planner.verifier import Requirements, verify
+
+WALL = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.4]), math.radians(90.0))
+
+
+def request(surface: PerchSurface = WALL, **changes: Any) -> PerchPlanRequest:
+    """A request with every option left to the planner's parameters."""
+    fields: dict[str, Any] = {"start": 12_500_000_000, "p": np.array([0.0, 0.0, 1.4]), "p_WS": surface.p_WS,
+                              "q_WS": so3.quat_from_matrix(surface.R_WS)}
+    return PerchPlanRequest(**fields | changes)
+
+
+class Asked:
+    """Asks a component; its jobs run at once or in a runner."""
+
+    def __init__(self, parameters: PerchingPlannerParameters, runner: IsolatedRunner | None = None) -> None:
+        self.component = PerchingPlanner(parameters)
+        self.lines: list[str] = []
+        self.component.log.receivers.append(lambda line: self.lines.append(line.text))
+        self.runner = runner
+        if runner is not None:
+            self.component.work = self._isolated
+
+    def _isolated(self, job: Job) -> None:
+        future = self.runner.submit(job)
+        job.then(future.exception(60.0) or future.result())
+
+    def __call__(self, asked: PerchPlanRequest) -> PerchPlan:
+        answers: list[PerchPlan] = []
+        self.component.on_plan_perch(asked, answers.append)
+        answer, = answers
+        return answer
+
+
+@pytest.fixture(scope="module")
+def ask() -> Asked:
+    return Asked(PerchingPlannerParameters())
+
+
+@pytest.fixture(scope="module")
+def isolated() -> Iterator[Asked]:
+    parameters = PerchingPlannerParameters(time_limit=10.0)
+    runner = IsolatedRunner(PerchingPlanner(parameters).preload())
+    assert runner.wait_ready()
+    yield Asked(parameters, runner)
+    runner.close()
+
+
+def test_the_error_codes_are_those_of_the_service() -> None:
+    from perch_msgs.srv import PlanPerch
+
+    assert all(getattr(PlanPerch.Response, code.name) == code for code in PerchPlanError)
+
+
+def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:
+    plan = ask(request())
+    assert plan.success and plan.error_code == PerchPlanError.OK
+    assert plan.trajectory.start_time == 12.5 and plan.contact_time > 0.0
+    assert all(c.holds for c in plan.certificates) and plan.iterations >= 1
+    limits = {c.quantity: (c.lower_limit, c.upper_limit) for c in plan.certificates}
+    rest = np.zeros(3)
+    need = Requirements(
+        start=np.array([[0.0, 0.0, 1.4], rest, rest, rest]), start_yaw=(0.0, 0.0), waypoints=np.zeros((0, 3)), p_S=WALL.p_WS,
+        s1=WALL.R_WS[:, 0], s2=WALL.R_WS[:, 1], s3=WALL.normal, v_S=rest, perch_offset=0.04, mass=0.25,
+        impact_acceleration=3.3, impact_speed=(0.4, 0.6), tangential_speed=0.3, tube=(0.15, 0.01, 0.1, 0.33),
+        thrust=limits["thrust"], body_rate=limits["body_rate"][1], speed=limits["speed"][1], height=limits["height"],
+        extension=0.15)
+    assert verify(plan.trajectory.durations, plan.trajectory.coefficients, need, step=1e-3) == []
+
+
+def test_options_of_a_request_replace_the_parameters(ask: Asked) -> None:
+    free, bounded = ask(request()), ask(request(thrust_max=3.8, objective=3))
+    thrust = {c.quantity: c for c in bounded.certificates}["thrust"]
+    assert bounded.success and thrust.upper_limit == 3.8 and thrust.maximum <= 3.8
+    assert {c.quantity: c for c in free.certificates}["thrust"].upper_limit > 3.8
+    assert ask(request(minimum_time=True)).trajectory.duration < free.trajectory.duration
+
+
+@pytest.mark.parametrize("inclination", [0.0, 15.0, 30.0, 45.0, 60.0, 90.0])
+def test_a_surface_that_faces_up_is_met_from_above(ask: Asked, inclination: float) -> None:
+    """The plate does not pass through the surface on its way to it."""
+    pad = PerchSurface.from_inclination(np.array([2.2, 0.0, 0.5]), math.radians(inclination))
+    plan = ask(request(pad))
+    assert plan.success, plan.message
+    t = np.linspace(0.0, plan.trajectory.duration, 2000)
+    samples = [plan.trajectory.sample(x) for x in t]
+    assert min((x.p - pad.p_WS) @ pad.normal for x in samples) > 0.04 - 1e-6
+
+
+def test_waypoints_motion_and_a_moving_target_are_taken(ask: Asked) -> None:
+    plan = ask(request(v=np.array([0.5, 0.1, 0.0]), yaw=0.3, waypoints=np.array([[0.6, 0.1, 1.3]]),
+                       target_velocity=np.array([0.3, 0.0, 0.0])))
+    flown = plan.trajectory
+    first, end = flown.sample(0.0), flown.sample(flown.duration)
+    assert first.v == pytest.approx([0.5, 0.1, 0.0]) and first.yaw == pytest.approx(0.3)
+    assert flown.sample(float(flown.durations[0])).p == pytest.approx([0.6, 0.1, 1.3], abs=1e-9)
+    assert end.p == pytest.approx(WALL.p_WS + [0.3 * flown.duration - 0.04, 0.0, 0.0], abs=1e-9)
+
+
+def test_a_running_trajectory_is_replaced_from_a_future_point(ask: Asked) -> None:
+    first = ask(request()).trajectory
+    moved = PerchSurface.from_inclination(np.array([1.75, 0.05, 1.4]), math.radians(85.0))
+    second = ask(request(moved, start=13_200_000_000, current=first))
+    assert second.success, second.message
+    before, after = first.sample(0.7), second.trajectory.sample(0.0)
+    for name in ("p", "v", "a", "j"):
+        assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-6)
+    late = ask(request(start=99_000_000_000, current=first))
+    assert late.error_code == PerchPlanError.BAD_INPUT and "outside" in late.message
+
+
+def test_isolated_plans_are_those_of_this_process_to_the_last_bit(ask: Asked, isolated: Asked) -> None:
+    for asked in (request(), request(waypoints=np.array([[0.6, 0.1, 1.3]])), request(impact_acceleration=40.0)):
+        here, there = ask(asked), isolated(asked)
+        for name in ("success", "error_code", "message", "iterations"):
+            assert getattr(here, name) == getattr(there, name)
+        assert here.certificates == there.certificates
+        if here.success:
+            assert here.trajectory.coefficients.tobytes() == there.trajectory.coefficients.tobytes()
+            assert here.trajectory.durations.tobytes() == there.trajectory.durations.tobytes()
+            assert here.trajectory.start_time == there.trajectory.start_time
+
+
+B, X = PerchPlanError.BAD_INPUT, PerchPlanError.BOX
+NAN, WILD = float("nan"), np.array([1e308, 0.0, 0.0])
+REST, LEVEL = np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
+SAMPLED = SampledTrajectory(np.array([0.0, 1.0]), REST, LEVEL, REST, REST, REST, REST, np.ones((2, 4)), 12.0)
+NONSENSE = [
+    ({"p": np.array([NAN, 0.0, 1.0])}, B, "p: nan is not finite"), ({"p": np.array([-1e9, 0.0, 1.0])}, B, "p: -1e.09 is outside"),
+    ({"p": np.zeros(2)}, B, "shape"), ({"v": WILD}, B, "v: 1e.308 is outside .-100, 100. m/s"), ({"j": WILD}, B, "j: "),
+    ({"a": np.array([0.0, np.inf, 0.0])}, B, "a: inf is not finite"), ({"yaw": NAN}, B, "yaw: nan"), ({"yaw_rate": 1e4}, B, "yaw_rate"),
+    ({"p_WS": np.array([1e20, 0.0, 1.0])}, B, "p_WS: 1e.20 is outside"), ({"target_velocity": WILD}, B, "target_velocity: 1e.308"),
+    ({"q_WS": np.zeros(4)}, B, "q_WS.*norm 0.0000"), ({"q_WS": np.array([0.0, 0.0, 0.0, NAN])}, B, "q_WS: nan"),
+    ({"q_WS": np.array([0.0, 0.0, 0.0, 2.0])}, B, "q_WS"),
+    ({"waypoints": np.ones((1000, 3))}, B, "waypoints: 1000 entries are more than 50"),
+    ({"waypoints": np.array([[1.0, NAN, 1.0]])}, B, "waypoints: nan"), ({"segment_times": (1.0, 2.0)}, B, "segment_times"),
+    ({"segment_times": (999.0,)}, B, "segment_times: 999 is outside"), ({"segment_times": (NAN,)}, B, "segment_times: nan"),
+    ({"segment_times": (300.0,)}, X, "duration_max 20 s"), ({"p": np.array([-1000.0, 0.0, 1.4])}, X, "duration_max 20 s"),
+    ({"impact_acceleration": -1.0}, B, "impact_acceleration"), ({"impact_acceleration": math.inf}, B, "impact_acceleration"),
+    ({"impact_speed_min": 2.0}, B, "impact_speed"), ({"thrust_max": 1e308}, B, "thrust_max"), ({"thrust_min": 900.0}, B, "empty"),
+    ({"objective": 2}, B, "objective"), ({"objective": 9}, B, "objective"), ({"start": -1}, B, "start"), ({"start": 10**30}, B, "start"),
+    ({"current": FlatTrajectory(np.array([2.0]), np.full((1, 4, 100), 1.0), 12.0)}, B, "degree 99"),
+    ({"current": FlatTrajectory(np.full(200, 0.1), np.ones((200, 4, 6)), 12.0)}, B, "200 entries"),
+    ({"current": FlatTrajectory(np.array([2.0]), np.full((1, 4, 6), 1e200), 12.0)}, B, "1e.200"),
+    ({"current": SAMPLED}, B, "samples"),
+    ({"impact_acceleration": 40.0}, PerchPlanError.UNREACHABLE_TILT, "m alpha"),
+    ({"thrust_max": 2.3}, PerchPlanError.THRUST_FLOOR, "hover"),
+    ({"p": np.array([3.0, 0.0, 1.4])}, X, "1.300 m behind the surface"), ({"v": np.array([50.0, 0.0, 0.0])}, X, "speed"),
+    ({"a": np.array([500.0, 0.0, 0.0])}, B, "thrust|asks for"), ({"waypoints": np.full((50, 3), [0.5, 0.0, 1.4])}, None, ""),
+    ({"j": np.array([1e5, 0.0, 0.0])}, None, ""),
+]
+
+
+@pytest.mark.parametrize(("changes", "code", "words"), NONSENSE)
+def test_nonsense_is_answered_with_a_typed_error_in_time_and_the_next_request_is_planned(isolated: Asked, changes: dict, code: int | None,
+                                                                                         words: str) -> None:
+    begin = time.monotonic()
+    plan = isolated(request(**changes))
+    assert time.monotonic() - begin < isolated.component.config.time_limit + 5.0
+    if code is None:
+        assert plan.success or plan.error_code != PerchPlanError.OK
+    else:
+        assert (plan.success, plan.error_code, plan.trajectory) == (False, code, None), plan.message
+        assert re.search(words, plan.message), plan.message
+        assert isolated.lines[-1] == f"no plan: {plan.message}"
+    assert isolated(request()).success
+
+
+def test_many_waypoints_do_not_outlast_the_longest_plan(ask: Asked) -> None:
+    waypoints = np.array([[-8.0 * (k % 2), 3.0 * (k % 3), 1.4] for k in range(50)])
+    plan = ask(request(waypoints=waypoints))
+    assert plan.error_code == X and "duration_max 20 s" in plan.message
+    enough = Asked(PerchingPlannerParameters(duration_max=1.0))(request())
+    assert enough.error_code == X and "duration_max 1 s" in enough.message
+
+
+def test_a_plan_that_takes_too_long_is_stopped(isolated: Asked) -> None:
+    slow = Asked(replace(isolated.component.config, time_limit=1e-4), isolated.runner)
+    plan = slow(request())
+    assert plan.error_code == PerchPlanError.TIME_LIMIT and "time_limit 0.0001 s" in plan.message
+    assert isolated(request()).success
+
+
+def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked) -> None:
+    waits = Asked(isolated.component.config, isolated.runner)
+    answers: list[PerchPlan] = []
+    futures = []
+    waits.component.work = lambda job: futures.append((job, isolated.runner.submit(replace(job, function=time.sleep, arguments=(60.0,)))))
+    waits.component.on_plan_perch(request(), answers.append)
+    (job, future), = futures
+    while not future.running():
+        time.sleep(0.01)
+    time.sleep(0.2)  # it has been taken up
+    os.kill(isolated.runner.pid, signal.SIGKILL)
+    job.then(future.exception(20.0))
+    assert answers[0].error_code == PerchPlanError.SOLVER and "ended" in answers[0].message
+    assert isolated(request()).success
+
+
+def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> None:
+        raise IndexError("list index out of range")
+
+    monkeypatch.setattr(perching_planner.planner, "plan", broken)
+    plan = ask(request())
+    assert plan.error_code == PerchPlanError.SOLVER and "IndexError: list index out of range" in plan.message
+
+
+def test_all_parameters_but_the_vehicle_may_change() -> None:
+    asked = Asked(PerchingPlannerParameters())
+    assert "vehicle" not in PerchingPlanner.changeable and "duration_max" in PerchingPlanner.changeable
+    asked.component.reconfigure(PerchingPlannerParameters(thrust_max=3.8, contact_time=0.7))
+    plan = asked(request())
+    assert plan.contact_time == 0.7 and {c.quantity: c for c in plan.certificates}["thrust"].upper_limit == 3.8
+
+
+def test_an_unknown_vehicle_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no_such"):
+        PerchingPlanner(PerchingPlannerParameters(vehicle="no_such"))

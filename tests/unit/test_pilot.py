@@ -1,0 +1,173 @@
+"""The pilot: sends the goal that a scenario describes, tells how it goes, and says who is waited for when time stands still."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import threading
+import time
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from perch_core.errors import PerchError
+from perch_eval.goal import goal_of
+from perch_eval.ros import pilot as pilot_module
+from perch_eval.ros.pilot import Pilot
+from perch_core.ros import topics
+from perch_core.ros.messages.mission import goal_value
+from perch_msgs.action import Perch
+from perch_msgs.srv import PlanPerch
+from perch_sim.scenario import load_scenario
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+
+SCENARIO = load_scenario("surface_90")
+
+
+class Mission:
+    """A mission, planner and vehicle that do what the test says, in a context and threads of their own."""
+
+    def __init__(self):
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context)
+        self.node = Node("mission", context=self.context)
+        group = ReentrantCallbackGroup()
+        self.clock = self.node.create_publisher(topics.message_type("/clock"), "/clock", topics.topic("/clock").qos.publish)
+        self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", topics.topic("/diagnostics").qos.publish)
+        self.goal, self.finish, self.cancelled = None, threading.Event(), threading.Event()
+        self.error_code, self.time = 0, 1.0
+        self.passes, self.begins, self.ended = threading.Event(), threading.Event(), threading.Event()
+        self.server = ActionServer(self.node, Perch, "perch", self._execute, cancel_callback=self._cancel, callback_group=group)
+        self.node.create_service(PlanPerch, "plan_perch", lambda request, response: response, callback_group=group)
+        self.node.create_timer(0.01, self._tick, callback_group=group)
+        self.node.create_timer(0.1, self._diagnose, callback_group=group)
+        self.executor = MultiThreadedExecutor(4, context=self.context)
+        self.executor.add_node(self.node)
+        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.thread.start()
+
+    def _tick(self):
+        if self.passes.is_set():
+            self.time += 0.02
+            self.clock.publish(topics.topic("/clock").to_message(round(self.time * 1e9)))
+
+    def _diagnose(self):
+        status = DiagnosticStatus(name="/vehicle", values=[KeyValue(key="waiting_for", value="estimator: odometry of 1.200 s")])
+        self.diagnostics.publish(DiagnosticArray(status=[status]))
+
+    def _cancel(self, _):
+        self.cancelled.set()
+        self.finish.set()
+        return CancelResponse.ACCEPT
+
+    def _execute(self, handle):
+        try:
+            return self._fly(handle)
+        finally:
+            self.ended.set()
+
+    def _fly(self, handle):
+        self.goal = handle.request
+        self.begins.set()
+        for phase in ("TAKEOFF", "SEARCH", "SEARCH"):
+            handle.publish_feedback(Perch.Feedback(phase=phase, message="on the way"))
+            time.sleep(0.05)
+        self.finish.wait(30.0)
+        if self.cancelled.is_set():
+            handle.canceled()
+        elif self.error_code:
+            handle.abort()
+        else:
+            handle.succeed()
+        return Perch.Result(success=not self.error_code, error_code=5 if self.cancelled.is_set() else self.error_code, message="done", end_time=0.0)
+
+    def close(self):
+        self.finish.set()
+        if self.begins.is_set():
+            self.ended.wait(30.0)
+        self.executor.shutdown(timeout_sec=5.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def mission(ros_domain):
+    found = Mission()
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def pilot(mission):
+    found = Pilot()
+    yield found
+    found.close()
+
+
+def finish_when(mission, *phases):
+    """Feedback for `fly` that ends the goal once all these phases were told."""
+    told = []
+
+    def on_phase(t, phase, message):
+        told.append((phase, message))
+        if set(phases) <= {p for p, _ in told}:
+            mission.finish.set()
+
+    return told, on_phase
+
+
+def test_the_goal_is_the_scenario_s_and_time_is_counted_from_when_it_passes(mission, pilot):
+    told = []
+    threading.Thread(target=lambda: (mission.begins.wait(30.0), mission.passes.set()), daemon=True).start()  # lockstep: time begins with the goal
+
+    def wait_for_time():
+        if pilot.time > 1.2 and {"TAKEOFF", "SEARCH"} <= {p for p, _ in told}:
+            mission.finish.set()
+
+    result = pilot.fly(SCENARIO, lambda t, p, m: told.append((p, m)), wait_for_time)
+    expected = goal_of(SCENARIO)
+    sent = goal_value(mission.goal)
+    assert (sent.mode, sent.takeoff_height, sent.search_timeout, sent.attempts) == (
+        expected.mode, expected.takeoff_height, expected.search_timeout, expected.attempts)
+    assert [p for p, _ in told if p.isupper()] == ["TAKEOFF", "SEARCH"]  # a phase is told when it changes
+    assert result.outcome == "perched" and 1.0 < result.start_time < result.end_time
+
+
+def test_a_failure_has_its_name(mission, pilot):
+    mission.passes.set()
+    mission.error_code = 3
+    _, on_phase = finish_when(mission, "SEARCH")
+    assert pilot.fly(SCENARIO, on_phase).outcome == "missed"
+
+
+def test_who_is_waited_for_is_told_when_time_stands_still(mission, pilot, monkeypatch):
+    monkeypatch.setattr(pilot_module, "NAMED", 0.5)
+    told, on_phase = finish_when(mission, "waiting")
+    mission.passes.set()
+    threading.Thread(target=lambda: (mission.begins.wait(30.0), mission.passes.clear()), daemon=True).start()
+    assert pilot.fly(SCENARIO, on_phase).outcome == "perched"
+    waiting = [message for phase, message in told if phase == "waiting"]
+    assert waiting == ["simulation time stands still: waiting for estimator: odometry of 1.200 s"]
+
+
+def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot):
+    mission.passes.set()
+    threading.Thread(target=lambda: (mission.begins.wait(30.0), time.sleep(0.3), mission.passes.clear()), daemon=True).start()
+    with pytest.raises(PerchError, match=r"stood still at .* waiting for estimator: odometry of 1.200 s"):
+        pilot.fly(SCENARIO, stall=1.0)
+
+
+def test_a_flight_past_its_time_limit_is_cancelled(mission, pilot):
+    mission.passes.set()
+    result = pilot.fly(dataclasses.replace(SCENARIO, time_limit=1.5))
+    assert mission.cancelled.is_set() and result.outcome == "timeout"
+
+
+def test_ctrl_c_ends_the_wait(mission, pilot):
+    threading.Thread(target=lambda: (mission.begins.wait(30.0), os.kill(os.getpid(), signal.SIGINT)), daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        pilot.fly(SCENARIO)

@@ -1,0 +1,113 @@
+"""Parameters of nodes as `ros2 param` sees them: over the services that every node offers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import rclpy
+from perch_core.component import Component
+from perch_core.config import choice, quantity, text
+from perch_core.errors import ConfigError
+from perch_core.ros.node import node
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+DOUBLE, INTEGER, STRING, DOUBLES = (Parameter.Type[name].value for name in ("DOUBLE", "INTEGER", "STRING", "DOUBLE_ARRAY"))
+
+
+@dataclass(frozen=True)
+class Config:
+    gain: float = quantity(2.0, unit="1/s", above=0.0, high=10.0, doc="of position")
+    count: int = quantity(3, low=1, high=9, doc="tries")
+    law: str = choice("slow", options=("slow", "fast"), doc="which")
+    weights: tuple[float, ...] = quantity((1.0, 2.0), unit="kg", low=0.0, high=5.0, doc="of the parts")
+    vehicle: str = text("rpg", doc="whose")
+
+
+class Tuned(Component[Config]):
+    config_type = Config
+    changeable = ("gain", "count", "law", "weights")
+
+    def reconfigure(self, config):
+        if config.gain == 7.0:
+            raise ConfigError("", "gain", "7 shakes the frame")
+        super().reconfigure(config)
+
+
+class Graph:
+    """The node and a client of its parameters."""
+
+    def __init__(self):
+        self.context = Context()
+        rclpy.init(args=[], context=self.context)
+        self.tuned = node("tuned", Tuned).create(context=self.context, use_global_arguments=False)
+        self.asker = Node("asker", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.tuned), self.executor.add_node(self.asker)
+        self.client = AsyncParameterClient(self.asker, "tuned")
+        while not self.client.services_are_ready():
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def answer(self, future):
+        self.executor.spin_until_future_complete(future)
+        return future.result()
+
+    def describe(self, name):
+        return self.answer(self.client.describe_parameters([name])).descriptors[0]
+
+    def get(self, name):
+        return self.tuned.get_parameter(name).value
+
+    def set(self, name, value):
+        return self.answer(self.client.set_parameters([Parameter(name, value=value)])).results[0]
+
+    def close(self):
+        self.tuned.close()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def graph(ros_domain):
+    one = Graph()
+    yield one
+    one.close()
+
+
+def test_types_ranges_units_and_what_is_fixed_are_described(graph):
+    gain, count, law, weights, vehicle = map(graph.describe, ("gain", "count", "law", "weights", "vehicle"))
+    assert [d.type for d in (gain, count, law, weights, vehicle)] == [DOUBLE, INTEGER, STRING, DOUBLES, STRING]
+    assert (gain.description, gain.floating_point_range[0].to_value) == ("of position", 10.0)
+    assert 0.0 < gain.floating_point_range[0].from_value < 1e-300 and "[1/s]" in gain.additional_constraints
+    assert (count.integer_range[0].from_value, count.integer_range[0].to_value) == (1, 9)
+    assert "one of slow, fast" in law.additional_constraints and "[kg]" in weights.additional_constraints
+    assert [d.read_only for d in (gain, count, law, weights, vehicle)] == [False] * 4 + [True]
+    assert not any(d.dynamic_typing for d in (gain, count, law, weights, vehicle))
+
+
+@pytest.mark.parametrize("name, value, words", [
+    ("gain", 11.0, "10"), ("gain", 0.0, "gain"), ("gain", 7.0, "7 shakes the frame"), ("gain", "much", "gain"), ("gain", float("nan"), "gain"),
+    ("count", 10, "9"), ("count", 2.5, "count"), ("law", "middling", "'middling' is not one of slow, fast"), ("weights", [1.0, -1.0], "weights"),
+    ("weights", ["heavy"], "weights"), ("vehicle", "snapdragon", "vehicle"), ("no_such_gain", 1.0, "no_such_gain")])
+def test_a_refused_value_changes_nothing_and_says_why(graph, name, value, words):
+    known = name != "no_such_gain"
+    before = (graph.describe(name), graph.get(name)) if known else None
+    result = graph.set(name, value)
+    assert not result.successful and words in result.reason, result
+    if known:
+        assert (graph.describe(name), graph.get(name)) == before
+        assert graph.tuned.component.config == Config()
+
+
+@pytest.mark.parametrize("name, value, got", [("gain", 4.5, 4.5), ("gain", 5, 5.0), ("weights", [3, 4], [3.0, 4.0]), ("weights", [0.5], [0.5]),
+                                              ("count", 4, 4), ("law", "fast", "fast")])
+def test_an_accepted_value_counts_at_once_whole_numbers_for_real_ones_too(graph, name, value, got):
+    result = graph.set(name, value)
+    assert result.successful, result.reason
+    shown = graph.get(name)
+    assert (list(shown) if isinstance(got, list) else shown) == got
+    config = getattr(graph.tuned.component.config, name)
+    assert (list(config) if isinstance(got, list) else config) == got

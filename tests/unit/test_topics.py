@@ -1,0 +1,79 @@
+"""Every channel's value survives its way through the message and back to the last bit; fast messages are those of rclpy."""
+
+import importlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from perch_core.component import Action, Client, Component, Input, Output, Service, ports
+from perch_core.errors import PerchError
+from perch_core.ros import topics
+from perch_core.values import ImuSample, MotorCommand, OdometryState
+from perch_eval.node_launch import NODES
+from rclpy.serialization import deserialize_message, serialize_message
+
+RNG = np.random.default_rng(3)
+
+
+def _floats(n):
+    return tuple(RNG.standard_normal(n).tolist())
+
+
+def _odometry(frame="map"):
+    return OdometryState(5_000_000_123, _floats(3), _floats(4), _floats(3), _floats(3), RNG.standard_normal((6, 6)), RNG.standard_normal((6, 6)), frame)
+
+
+FAST = [("imu/data_raw", ImuSample(1_234_567_891, _floats(3), _floats(3), frame)) for frame in ("imu_link", "", "a", "abcdefgh")]
+FAST += [("odometry", _odometry(frame)) for frame in ("map", "odom", "x")]
+FAST += [("motor_command", MotorCommand(77, armed, _floats(4))) for armed in (True, False)]
+
+
+def same(a, b):
+    """Equal to the last bit."""
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b))
+    return a == b
+
+
+@pytest.mark.parametrize("channel, value", FAST)
+def test_fast_messages_are_those_of_rclpy(channel, value):
+    row = topics.topic(channel)
+    by_rclpy = serialize_message(row.to_message(value))
+    assert deserialize_message(row.pack(value), row.message) == deserialize_message(by_rclpy, row.message)
+    assert same(row.unpack(by_rclpy), row.to_value(deserialize_message(by_rclpy, row.message)))
+    assert same(topics.decode(channel, topics.encode(channel, value)), value)
+
+
+@pytest.mark.parametrize("channel, value", FAST)
+def test_a_message_that_is_cut_short_is_refused(channel, value):
+    data = topics.encode(channel, value)
+    for length in (0, 3, 5, 11, len(data) // 2):
+        with pytest.raises(PerchError):
+            topics.decode(channel, data[:length])
+
+
+def test_cameras_share_a_row():
+    assert topics.topic("camera_front/image_raw") is topics.topic("camera_down/image_raw")
+    assert topics.topic("camera_front/image_raw/compressed").message.__name__ == "CompressedImage"
+    with pytest.raises(PerchError):
+        topics.topic("no/such/topic")
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_every_port_of_every_node_has_its_row(name):
+    """What a message is and how it becomes a value is found in the table, and the table says it once."""
+    component = importlib.import_module(f"{NODES[name].package}.{name}_node").NODE.component
+    stand_in = SimpleNamespace(config=component.config_type())
+    rows = {Input: topics.topic, Output: topics.topic, Service: topics.service, Client: topics.service, Action: topics.action}
+    for kind, row in rows.items():
+        for port in ports(component, kind):
+            if port not in (Component.log, Component.diagnostics):
+                assert row(port.channel(stand_in)), port.name
+
+
+@pytest.mark.parametrize("rows", [topics.TOPICS, topics.SERVICES, topics.ACTIONS])
+def test_no_channel_has_two_rows(rows):
+    channels = [row.channel for row in rows]
+    assert len(set(channels)) == len(channels)

@@ -1,0 +1,89 @@
+"""Rest in any attitude with no word from VIO: the covariance is bounded and honest, the biases are followed, a departure is noticed."""
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_perception.ukf.stillness import still
+from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
+
+CONFIG, RATE, SIGMA = UkfConfig(), 100.0, (0.03, 0.01)
+PERIOD = round(1e9 / RATE)
+ATTITUDES = {"ground": np.zeros(3), "wall": np.array([0.3, -1.4, 0.5]), "upside down": np.array([3.0, 0.2, 0.0])}
+
+
+class Resting:
+    """An estimator on a vehicle that rests: one pose, then the IMU alone, whose biases walk."""
+
+    def __init__(self, seed=1, attitude="wall"):
+        self.rng, imu, self.k = np.random.default_rng(seed), CONFIG.imu, 0
+        self.q, self.p = so3.quat_exp(ATTITUDES[attitude]), np.array([1.0, 2.0, 1.2])
+        self.up_B = so3.quat_to_matrix(self.q).T @ [0.0, 0.0, 9.81]
+        self.bias = self.rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
+        self.walk = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(RATE)
+        self.noise = np.repeat([imu.gyro_noise, imu.accel_noise], 3)
+        self.estimator = Estimator(CONFIG)
+        self.run(0.5)
+        e = self.rng.normal(0.0, np.repeat(SIGMA, 3))
+        self.estimator.add_vio(VioPose((self.k - 2) * PERIOD, self.p + e[:3], so3.quat_multiply(so3.quat_exp(e[3:]), self.q),
+                                       np.diag(np.repeat(SIGMA, 3) ** 2)))
+
+    def run(self, duration, force=np.zeros(3)):
+        for walk, noise in self.rng.normal(size=(round(duration * RATE), 2, 6)):
+            self.bias = self.bias + self.walk * walk
+            read = self.bias + self.noise * noise
+            self.k += 1
+            self.estimator.add_imu(ImuSample(self.k * PERIOD, tuple(read[:3]), tuple(read[3:] + self.up_B + force)))
+        return self
+
+    @property
+    def error(self):
+        e = self.estimator.estimate
+        return np.concatenate([self.p - e.p_WB, -e.v_WB, so3.quat_log(so3.quat_multiply(so3.quat_conjugate(e.q_WB), self.q)),
+                               self.bias[:3] - e.gyro_bias, self.bias[3:] - e.accel_bias])
+
+    @property
+    def sigma(self):
+        return np.sqrt(np.diag(self.estimator.estimate.P))
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES)
+def test_the_covariance_does_not_grow_and_is_honest(attitude):
+    """Ten minutes; what does not grow in ten does not grow in sixty (an hour was run once: docs/estimation.md)."""
+    resting = Resting(attitude=attitude).run(10.0)
+    before = resting.sigma
+    resting.run(590.0)
+    np.testing.assert_allclose(resting.sigma[:9], before[:9], rtol=0.02)
+    assert resting.sigma[9:12].max() < 0.001 and resting.sigma[:3].max() < 0.031
+    assert np.linalg.norm(resting.error[:3]) < 0.12 and np.abs(resting.error[9:12]).max() < 0.003  # the gyro's bias walked by 0.005
+    assert resting.error @ np.linalg.solve(resting.estimator.estimate.P, resting.error) < 37.7  # chi2, 15, 99.9 %
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    flights = [Resting(seed).run(10.0) for seed in range(20)]
+    nees = [f.error @ np.linalg.solve(f.estimator.estimate.P, f.error) for f in flights]
+    assert 11.2 < np.mean(nees) < 19.4  # chi2, 15 x 20, 99.9 %, about
+
+
+def test_a_departure_is_not_held_back():
+    resting = Resting(attitude="ground").run(5.0)
+    resting.run(0.5, force=np.array([0.0, 0.0, 3.0]))
+    assert resting.estimator.estimate.v_WB[2] == pytest.approx(1.5, abs=0.1)
+    assert resting.estimator.estimate.p_WB[2] - resting.p[2] == pytest.approx(0.375, abs=0.13)
+
+
+def test_flight_fall_and_turning_are_not_rest():
+    rng, n, imu = np.random.default_rng(1), 100, CONFIG.imu
+
+    def steps(gyro, accel):
+        rows = np.zeros((n, 9))
+        rows[:, 0] = 0.002
+        rows[:, 1:4], rows[:, 4:7] = gyro + rng.normal(0.0, imu.gyro_noise, (n, 3)), accel + rng.normal(0.0, imu.accel_noise, (n, 3))
+        return rows
+
+    up, t, axis = np.array([0.0, 0.0, 9.81]), 0.002 * np.arange(n), np.array([0.0, 1.0, 0.0])
+    assert still(CONFIG.rest, imu, steps(0.0, up)) and still(CONFIG.rest, imu, steps(0.004, -up), np.full(3, 0.004))
+    assert not still(CONFIG.rest, imu, steps(0.0, 0.0 * up))                                    # it falls
+    assert not still(CONFIG.rest, imu, steps(0.05 * np.sin(20.0 * t)[:, None] * axis, up))      # held up by rotors
+    assert not still(CONFIG.rest, imu, steps(0.05 * axis, up), np.zeros(3))                     # it turns steadily
+    assert not still(CONFIG.rest, imu, steps(0.0, 1.2 * up))                                    # it climbs
+    assert not still(CONFIG.rest, imu, steps(0.0, up)[:50])                                     # too short to say
