@@ -86,7 +86,8 @@ class Stack:
                 raise StackError(f"{program.name} cannot be started: there is no executable {program.command[0]}")
             log = self._log_dir / f"{program.name}.log"
             try:
-                self._started[program.name] = RunningProgram(program, log, self._environment, self._on_line)
+                with _deferred_signals():  # an interrupt within Popen would leave a program that nobody stops
+                    self._started[program.name] = RunningProgram(program, log, self._environment, self._on_line)
             except OSError as error:
                 raise StackError(f"{program.name} cannot be started: {error}") from None
 
@@ -164,10 +165,29 @@ class Stack:
 @contextmanager
 def _undisturbed() -> Iterator[None]:
     """Ignore what would interrupt."""
+    with _handled_by(signal.SIG_IGN):
+        yield
+
+
+@contextmanager
+def _deferred_signals() -> Iterator[None]:
+    """Let what would interrupt wait until the block has ended."""
+    received: list[int] = []
+    try:
+        with _handled_by(lambda number, _: received.append(number)):
+            yield
+    finally:
+        for number in received[:1]:
+            signal.raise_signal(number)
+
+
+@contextmanager
+def _handled_by(handler: Any) -> Iterator[None]:
+    """Give SIGINT and SIGTERM to `handler`, where this is the main thread: no other one is interrupted."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
