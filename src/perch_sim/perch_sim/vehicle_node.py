@@ -3,5 +3,5 @@
 from perch_core.ros.node import node
 from perch_sim.simulated_vehicle import SimulatedVehicle
 
-NODE = node("vehicle", SimulatedVehicle, lockstep="perch_sim.ros.vehicle_node:VehicleNode")
+NODE = node("vehicle", SimulatedVehicle, deadline="imu", lockstep="perch_sim.ros.vehicle_node:VehicleNode")
 create, main = NODE.create, NODE.main
