@@ -10,6 +10,7 @@ import pytest
 from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, PlanAnswer, State, Target
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.requests import flown_order
+from perch_control.smooth_position import BEFORE
 from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd
@@ -135,6 +136,12 @@ def test_the_plan_moves_with_the_wire(time):
     (START + 0.1, 5.03, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
 def test_the_plan_stays_for_millimetres_for_another_wire_at_the_end_before_its_start_and_unasked(time, x, goal):
     assert running().moved(time, target(10.0, x=x), goal) is None
+
+
+def test_the_plan_moves_until_the_controller_flies_on_the_velocity():
+    """One instant for both: before it the plan follows the map's corrections, after it the controller leaves them out."""
+    for sooner, moves in ((0.01, True), (-0.01, False)):
+        assert (running().moved(START + LENGTH - BEFORE - sooner, target(10.0, x=5.03), GOAL) is not None) == moves
 
 
 def test_a_plan_that_was_moved_is_ordered_from_its_states():

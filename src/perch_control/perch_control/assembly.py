@@ -51,7 +51,7 @@ class Assembly:
             ConfigError: there is no such law.
         """
         self._params, self.vehicle = params, vehicle
-        self._failed: dict[str, str] = {}
+        self._failed: dict[str, tuple[str, Callable[[], None]]] = {}  # why, and how to try it again
         self._segments: Sequence[Segment] = ()
         choice = params.controller
         self.laws: dict[str, Law] = {choice.type: build_law(choice.type, vehicle, params)}
@@ -89,18 +89,18 @@ class Assembly:
 
     def _prepared(self, name: str, params: ControllerParameters, work: Callable[[Job], None], say: Callable[[str], None],
                   law: Law | Exception) -> None:
-        if isinstance(law, Exception):
-            self._failed[name] = str(law)
-            say(f"{name} could not be built: {law}")
-            return
         if params is not self._params:  # gains were changed in the meantime
             try:
-                law = law.retuned(self._params)
+                law = None if isinstance(law, Exception) else law.retuned(self._params)
             except ConfigError:
                 law = None
             if law is None:
                 self._prepare(name, work, say)
                 return
+        if isinstance(law, Exception):
+            self._failed[name] = str(law), partial(self._prepare, name, work, say)
+            say(f"{name} could not be built: {law}")
+            return
         self.laws[name] = law
         self._show_lines(law)
 
@@ -113,8 +113,7 @@ class Assembly:
         """
         if type not in self.laws:
             if law_class(type).slow:
-                raise LawNotReady(f"{type} could not be built: {self._failed[type]}" if type in self._failed else
-                                  f"{type} is not ready: it is being built, or controller.standby is false")
+                raise LawNotReady(self._absent(type))
             self.laws[type] = build_law(type, self.vehicle, self._params)
         flight = self.flight
         if not adaptive:
@@ -132,7 +131,7 @@ class Assembly:
         flight, old = self.flight, self._params
         choice, flown = params.controller, self.flown
         if choice.type != old.controller.type and choice.type not in self.laws and law_class(choice.type).slow:
-            raise ConfigError("", "controller.type", f"{choice.type} is not ready")
+            raise ConfigError("", "controller.type", self._absent(choice.type))
         changed = {name: law.retuned(params) for name, law in self.laws.items()}
         if changed[flown] is None:
             changed[flown] = build_law(flown, self.vehicle, params)
@@ -144,6 +143,14 @@ class Assembly:
             self.choose(choice.type, choice.adaptive)
         else:
             flight.use(self.laws[flown], params.gain_set(self.vehicle.name), params.flight)
+        failed, self._failed = self._failed, {}
+        for _, again in failed.values():
+            again()
+
+    def _absent(self, name: str) -> str:
+        """Why a law that takes long to build is not there."""
+        return (f"{name} could not be built: {self._failed[name][0]}" if name in self._failed else
+                f"{name} is not ready: it is being built, or controller.standby is false")
 
     # -- what is flown -----------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from perch_control.admission import AtEnd, Order
 from perch_core.vector3 import axpy, norm
 
-BEFORE = 0.15     # begins so long before the contact, when the plan no longer moves with the map [s]
+BEFORE = 0.15     # begins so long before the contact; until then a mission moves its plan with the map [s]
 AFTER = 0.25      # and corrections so long after it still are left out [s]
 FARTHEST = 0.15   # odometry that is corrected by more was wrong altogether [m]
 _ZERO = (0.0, 0.0, 0.0)

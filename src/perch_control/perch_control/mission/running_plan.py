@@ -20,6 +20,7 @@ from perch_core.trajectory import StateSample
 from perch_core.values import AtEnd
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import TICK, Goal, PlanAnswer, PlanQuery, State, Target
+from perch_control.smooth_position import BEFORE
 
 _AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
 _DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
@@ -109,7 +110,7 @@ class RunningPlan:
         s = self._settings
         if not goal.replan or target is None or not self._seen_better(target):
             return None
-        if not self.plan.start_time + _DECISION < time < self.end - s.shift_until:
+        if not self.plan.start_time + _DECISION < time < self.end - BEFORE:
             return None
         offset = target.p_WS - self.target.p_WS
         if not s.shift_distance < float(np.linalg.norm(offset)) < s.shift_max:

@@ -36,7 +36,6 @@ class MissionSettings:
                                     doc="closer to the contact the plan's own recovery is the way out")
     powerline_replan_period: float = quantity(0.35, unit="s", above=0.0, high=5.0)
     powerline_replan_until: float = quantity(0.5, unit="s", low=0.0, high=5.0, doc="no new plan starts closer than this to the contact")
-    shift_until: float = quantity(0.15, unit="s", low=0.0, high=5.0, doc="a powerline plan moves with the wire until so shortly before the contact")
     shift_distance: float = quantity(0.004, unit="m", low=0.0, high=1.0, doc="... where the wire has moved by more than this ...")
     shift_max: float = quantity(0.15, unit="m", above=0.0, high=1.0, doc="... and less than this; beyond it the rest is planned again")
     replan_shift: float = quantity(0.3, unit="s", above=0.0, high=5.0, doc="a new plan whose contact is earlier or later by more is not flown")
