@@ -38,9 +38,7 @@ class SharedMemory:
         """
         if not self._seen:
             return []
-        used: set[str] = set()
-        for process in self._proc.glob("[0-9]*"):
-            used |= self._used_by(process)
+        used = self.used()
         removed = []
         for segment in sorted(self._seen - used):
             for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl")):
@@ -51,6 +49,10 @@ class SharedMemory:
                     continue
         self._seen &= used
         return removed
+
+    def used(self) -> set[str]:
+        """The segments that any process uses now."""
+        return {segment for process in self._proc.glob("[0-9]*") for segment in self._used_by(process)}
 
     @staticmethod
     def _used_by(process: Path) -> set[str]:

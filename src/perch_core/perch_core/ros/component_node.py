@@ -8,6 +8,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -24,6 +25,7 @@ from perch_core.ros.messages.diagnostics import diagnostics_message
 from perch_core.ros.parameters import Parameters
 from perch_core.ros.wiring import Publication, Wiring
 from rclpy.action import GoalResponse
+from rclpy.clock import Clock, ClockType
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -33,6 +35,7 @@ from rclpy.subscription import Subscription
 LOUD = ("log", "diagnostics")  # outputs that are no topics of their own
 FEW = 300                      # calls whose durations are kept
 MOST_SAID = 100                # kinds of lines whose times are kept
+HEARTBEAT = 1.0                # a node whose component has nothing to report says all the same so often that it is there [s]
 LONGEST = 300                  # characters of a line that is no error of this program
 _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
 
@@ -73,6 +76,8 @@ class ComponentNode(Node):
         self.component.log.receivers.append(self._log)
         self._diagnostics = self.create_publisher(topics.message_type("/diagnostics"), "/diagnostics", topics.topic("/diagnostics").qos.publish)
         self.component.diagnostics.receivers.append(self._publish_diagnostics)
+        self._reported, self._report = 0.0, Diagnostics(0)
+        self.create_timer(HEARTBEAT, self._beat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._publish_outputs()
         self.component.warm_up()
 
@@ -240,7 +245,13 @@ class ComponentNode(Node):
             self._warned.add(text)
             self.get_logger().warning(text)
 
+    def _beat(self) -> None:
+        """Whoever looks at `/diagnostics` tells by it a node that hangs from one with nothing to do."""
+        if time.monotonic() - self._reported >= HEARTBEAT:
+            self._publish_diagnostics(replace(self._report, stamp=self.get_clock().now().nanoseconds))
+
     def _publish_diagnostics(self, diagnostics: Diagnostics) -> None:
+        self._reported, self._report = time.monotonic(), diagnostics
         values = dict(diagnostics.values) | self.host_figures()
         for name, durations in self._durations.items():
             values |= durations_us(name, durations)

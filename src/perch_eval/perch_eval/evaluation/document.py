@@ -17,7 +17,7 @@ _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", MISSING: "*not available*"}
 def write(sections: Sequence[Section], folder: Path, mode: str, duration: float) -> None:
     """Write `README.md` and `results.json` into the folder of the figures."""
     (folder / "README.md").write_text(_page(sections, mode, duration))
-    content = {"mode": mode, "duration_s": duration, "machine": _machine(), "sections": [
+    content = {"mode": mode, "duration_s": duration, "machine": machine(), "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
     (folder / "results.json").write_text(json.dumps(finite(content), indent=1) + "\n")
@@ -41,7 +41,8 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _machine() -> str:
+def machine() -> str:
+    """What this runs on."""
     import os
 
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
@@ -50,7 +51,7 @@ def _machine() -> str:
 def _page(sections: Sequence[Section], mode: str, duration: float) -> str:
     found = counts(sections)
     lines = ["# Results", "",
-             f"Made by `python3 scripts/evaluate.py --{mode}` in {duration / 60:.0f} min on {_machine()}; this page is generated, edit nothing here.", "",
+             f"Made by `python3 scripts/evaluate.py --{mode}` in {duration / 60:.0f} min on {machine()}; this page is generated, edit nothing here.", "",
              f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail; {found.get('better', 0)} further values are better than the paper's, "
              f"{found.get('worse', 0)} worse; {found.get(MISSING, 0)} rows are not available.", "",
              "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "

@@ -84,7 +84,7 @@ class ModelledSight:
             if exposed - self._searched < 1.0 / settings.search_rate - 1e-3:
                 return Localization(None, message="waiting for the next search")
             self._searched = exposed
-        pixels, ids, side = self._visible(self._truth.at(self._middle(exposed)), self._pad())
+        pixels, ids, side = self._visible(self._truth.at(self.middle(exposed)), self._pad())
         if not ids:
             return Localization(None, message="no tag of the board found")
         sigma = np.repeat(corner_sigma(side)[:, None], 4, axis=1)
@@ -102,7 +102,7 @@ class ModelledSight:
         average = average_board(self._mount.camera, corners_S, rays, ids) if self._averaging and complete else None
         return Localization(pose, average, complete)
 
-    def _middle(self, exposed: float) -> int:
+    def middle(self, exposed: float) -> int:
         """True middle of the exposure [ns] that the calibrated stamp offset puts at `exposed` [s]."""
         stamp = round((exposed + self._mount.stamp_offset) * NANOSECONDS)
         return stamp - round(self._true.stamp_offset * NANOSECONDS)

@@ -17,6 +17,7 @@ from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
 
 from perch_core.errors import PerchError
 from perch_core.ros import topics
@@ -29,6 +30,7 @@ SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerli
 START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
 LOOK = 0.5              # between looks whether the mission that took the goal is still there [s]
 NAMED = 5.0             # time that stands still for so long is explained [s]
+SILENT = 3.0            # a node of which `/diagnostics` has brought nothing for so long is named [s]
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ class Pilot:
         self._client = ActionClient(self._node, Perch, "perch")
         self._vehicle = self._node.get_namespace().rstrip("/") + "/vehicle"
         self._time, self._waiting_for, self._looked = 0.0, "", 0.0
+        self._heard: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self._interrupted, self._handler = False, None
         if threading.current_thread() is threading.main_thread():
             self._handler = signal.signal(signal.SIGINT, self._interrupt)
@@ -117,6 +120,22 @@ class Pilot:
         """Who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody."""
         return self._waiting_for
 
+    @property
+    def node(self) -> Node:
+        """Its node, for further subscriptions."""
+        return self._node
+
+    def listen(self, timeout: float) -> None:
+        """Run what has come, or comes in time [s]."""
+        self._spin(timeout)
+
+    def silent(self) -> set[str]:
+        """Nodes of which nothing is heard any more, though others are: they hang, or have ended."""
+        now = time.monotonic()
+        if now - max(self._heard.values(), default=0.0) > 0.5 * SILENT:
+            return set()
+        return {name for name, heard in self._heard.items() if now - heard > SILENT}
+
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
         self._spin(0.02)
@@ -124,12 +143,12 @@ class Pilot:
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
             check: Callable[[], None] = lambda: None, stall: float = 60.0) -> FlightResult:
-        """Send the goal and wait for its end; past the scenario's time limit it is cancelled.
+        """Send the goal and wait for its end; when it has been under way for the scenario's time limit it is cancelled.
 
         Args:
             scenario: what to fly.
-            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, and who is waited for when
-                simulation time stands still.
+            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, when a node falls silent, and
+                who is waited for when simulation time stands still.
             check: called often; may raise to end the wait (a node that died).
             stall: wall-clock time without progress of simulation time after which the flight has failed [s].
 
@@ -157,17 +176,20 @@ class Pilot:
         if not handle.accepted:
             raise PerchError("the mission refused the goal: it is flying another one")
         result = handle.get_result_async()
-        cancelled, servers = False, self._servers()
+        cancelled, servers, silent = False, self._servers(), set()
         while not result.done():
             self._spin(0.05)
             check()
+            silent, before = self.silent(), silent
+            for name in sorted(silent - before):
+                on_phase(self._time, seen[0], f"{name} has been silent for {SILENT:g} s")
             self._check_server(servers)
             still = progress.look(self._time)
             if progress.explain():
                 on_phase(self._time, "waiting", f"simulation time stands still: {self._whom()}")
             if still > (stall if self._time > 0.0 else START_PATIENCE):
                 raise PerchError(f"simulation time has stood still at {self._time:.3f} s for {still:.0f} s: {self._whom()}")
-            if self._time > scenario.time_limit and not cancelled:
+            if self._time - progress.start > scenario.time_limit and not cancelled:
                 cancelled = True
                 on_phase(self._time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
                 handle.cancel_goal_async()
@@ -176,6 +198,28 @@ class Pilot:
         if cancelled and outcome == "cancelled":
             outcome = "timeout"
         return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - progress.began, progress.start)
+
+    def depart(self, check: Callable[[], None] = lambda: None, stall: float = 60.0) -> tuple[bool, str]:
+        """Have a perched vehicle leave for a hover.
+
+        Args:
+            check: called often; may raise to end the wait.
+            stall: wall-clock time without an answer after which it has failed [s].
+
+        Returns:
+            Whether it hovers, and the mission's words.
+
+        Raises:
+            PerchError: the mission does not answer.
+        """
+        client = self._node.create_client(Trigger, "depart")
+        try:
+            self._spin_until(client.service_is_ready, check, stall, "the mission does not offer depart")
+            answer = client.call_async(Trigger.Request())
+            self._spin_until(answer.done, check, stall, "the mission does not answer to depart")
+            return answer.result().success, answer.result().message
+        finally:
+            self._node.destroy_client(client)
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
@@ -223,5 +267,6 @@ class Pilot:
 
     def _receive_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
+            self._heard[status.name] = time.monotonic()
             if status.name == self._vehicle:
                 self._waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")

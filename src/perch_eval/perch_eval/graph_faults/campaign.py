@@ -1,0 +1,171 @@
+"""The campaign of faults on the real graph: flies what has not been flown yet, and writes the page."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from perch_core.errors import PerchError
+from perch_eval.arguments import count, output_folder
+from perch_eval.campaign.progress import Progress
+from perch_eval.evaluation.document import machine
+from perch_eval.graph_faults.cases import FAULTS, MODES, NAMED, PHASES, PROCESS, SAFE, TALKERS, Case, cases
+
+EXAMPLES = """examples:
+  python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on
+  python3 scripts/faults.py --most 20                          so many more
+  python3 scripts/faults.py --only "kill estimator"            cases with these words in their names
+  python3 scripts/faults.py --again --only "stop controller"   fly them once more
+  python3 scripts/faults.py --page                             write the page of what has been flown
+
+exit code: 0 every flight ended safely and said so, 1 one did not, 2 the caller's mistake, 130 interrupted"""
+ROWS = "rows.jsonl"
+MODULES = tuple(f"perch_{package}.{name}_node" for package, name in (
+    ("sim", "vehicle"), ("sim", "vio_model"), ("perception", "estimator"), ("planner", "perching_planner"), ("control", "controller"),
+    ("control", "mission"), ("core", "description"), ("eval", "modelled_sight"), ("eval.graph_faults", "relay")))
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="faults.py", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    out.add_argument("--out", type=Path, default=Path("docs/results/faults"), metavar="DIR", help="rows and page (default: %(default)s)")
+    out.add_argument("--logs", type=Path, default=Path("out/faults"), metavar="DIR", help="logs of flights that are not good (default: %(default)s)")
+    out.add_argument("--only", default="", metavar="WORDS", help="cases with all of these words in their names")
+    out.add_argument("--most", type=count, metavar="N", help="fly at most so many")
+    out.add_argument("--again", action="store_true", help="fly what has been flown, too")
+    out.add_argument("--page", action="store_true", help="fly nothing")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    try:
+        output_folder(args.out), output_folder(args.logs)
+        chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
+        if not chosen:
+            raise PerchError(f"--only {args.only}: no case has these words in its name")
+        rows = load(args.out / ROWS)
+        missing = [] if args.page else [case for case in chosen if args.again or case not in rows][:args.most]
+        if missing:
+            fly_all(missing, args.out / ROWS, args.logs, rows)
+        known = [rows[case] for case in cases() if case in rows]
+        (args.out / "README.md").write_text(page(known))
+    except KeyboardInterrupt:
+        print("\ninterrupted; what has been flown is kept, the same command goes on", file=sys.stderr)
+        return 130
+    except (PerchError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    bad = [row for row in known if problems(row)]
+    print(f"{args.out / 'README.md'}: {len(known)} of {len(cases())} flown, {len(known) - len(bad)} good")
+    return 1 if bad else 0
+
+
+def load(file: Path) -> dict[Case, dict[str, Any]]:
+    """The rows flown so far, the last of each case; a line that was cut off does not count."""
+    found = {}
+    for line in file.read_text().splitlines() if file.exists() else ():
+        try:
+            row = json.loads(line)
+            found[Case(row["fault"], row["node"], row["phase"], row["mode"])] = row
+        except (ValueError, KeyError, TypeError):
+            continue
+    return found
+
+
+def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]]) -> None:
+    """Fly cases one after the other; each is kept when it has been flown."""
+    from perch_eval.graph_faults.flight import fly
+    from perch_eval.nursery import Nursery
+
+    nursery, progress = Nursery(MODULES, ("surface_90",)), Progress(len(missing), what="flights")
+    try:
+        for case in missing:
+            folder = logs / case.name.replace(", ", "_").replace(" ", "_")
+            for old in folder.glob("*.log"):
+                old.unlink()
+            try:
+                row = fly(case, nursery, folder, commit()).as_json()
+            except PerchError as error:
+                print(f"\n{case.name}: not flown: {error}", file=sys.stderr)
+                continue
+            rows[case] = row
+            with file.open("a") as out:
+                out.write(json.dumps(row) + "\n")
+            if problems(row):
+                print(f"\n{case.name}: {'; '.join(problems(row))}", file=sys.stderr, flush=True)
+            progress.add(not problems(row))
+    finally:
+        progress.close()
+        nursery.close()
+
+
+def commit() -> str:
+    """Of the code, with a plus sign where the sources have changed since."""
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], capture_output=True, text=True, check=False).stdout.strip()
+
+    return git("rev-parse", "--short", "HEAD") + "+" * bool(git("status", "--porcelain", "--untracked-files=no", "src", "config"))
+
+
+def problems(row: dict[str, Any]) -> list[str]:
+    """What is not as it should be in a flight."""
+    if row["struck"] is None:
+        return [f"the flight ended before the fault: {row['goal']}"]
+    found = [] if row["end"] in SAFE else [f"ended {row['end']}"]
+    if row["named"] is None or row["named"] > NAMED:
+        found.append("not named" if row["named"] is None else f"named after {row['named']:.1f} s")
+    found += [f"{name} ended, too" for name in row["ended"]] + [f"left: {one}" for one in row["left"]]
+    return found
+
+
+def _ends(rows: Sequence[dict[str, Any]]) -> str:
+    counts = Counter(row["end"] if row["struck"] is not None else "not struck" for row in rows)
+    return ", ".join(f"{counts[end]} {end}" for end in sorted(counts, key=lambda end: (end not in SAFE, -counts[end])))
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """The page of what has been flown."""
+    struck = [row for row in rows if row["struck"] is not None]
+    safe = [row for row in struck if row["end"] in SAFE]
+    told = [row for row in struck if row["named"] is not None and row["named"] <= NAMED]
+    clean = [row for row in rows if not row["left"]]
+    commits = Counter(row["commit"] for row in rows)
+    text = ["# Faults on the real graph", "",
+            "Made by `python3 scripts/faults.py`; edit nothing here. Rows: [rows.jsonl](rows.jsonl).", "",
+            f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
+            + f" on {machine()}.", "",
+            f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
+            f"* **{len(told)} of {len(struck)} are named within {NAMED:g} s** of the wall clock: a node, or who sent the goal, says who or "
+            "whose messages are missing. The node that was struck is no witness, and what starts the processes is none.",
+            f"* **{len(clean)} of {len(rows)} leave nothing**: no process, no socket of the lockstep, no shared memory after all were stopped.",
+            f"* In {sum(bool(row['ended']) for row in rows)} flights a node that was not struck ended.",
+            "", "Every node is a process of its own; cameras are off, VIO and tags are replaced by their error models (`perch_eval.modelled_sight_node`). "
+            "Processes are forked from one that has loaded the code, so that a restart takes a tenth of a second instead of seconds. In lockstep a "
+            "node that hangs is waited for 8 s instead of 60. The end is judged by the truth, for a hover by the controller's state, too, when it has "
+            "lasted for 4 s. *motors off*: on the ground after a fall, or lying tilted; without a controller nobody else can hold the vehicle.", "",
+            "| fault | what happens |", "| --- | --- |", *(f"| {name} | {about} |" for name, about in FAULTS.items()), "",
+            "Messages are disturbed by a relay between publisher and subscribers, which lockstep does not have (its batches go over sockets of "
+            "their own): in real time only. Phases: " + ", ".join(PHASES) + "; messages are disturbed in search and approach, from then on.", ""]
+    for mode in MODES:
+        nodes = list(dict.fromkeys(case.node for case in cases() if case.mode == mode))
+        text += [f"## Ends, {mode}", "", "| fault | " + " | ".join(nodes) + " |", "| --- " * (len(nodes) + 1) + "|"]
+        for fault in FAULTS:
+            own = {node: [row for row in rows if (row["fault"], row["node"], row["mode"]) == (fault, node, mode)] for node in nodes}
+            if any(own.values()):
+                text.append(f"| {fault} | " + " | ".join(_ends(own[node]) for node in nodes) + " |")
+        text.append("")
+    times = sorted(row["named"] for row in struck if row["named"] is not None)
+    if times:
+        text += [f"Named after: median {times[len(times) // 2]:.1f} s, worst {times[-1]:.1f} s.", ""]
+    text += ["## Flights that are not good", "", *([] if all(not problems(row) for row in rows) else [
+        f"* **{row['fault']} {row['node']}, {row['phase']}, {row['mode']}** (seed {row['seed']}): {'; '.join(problems(row))}. Goal: {row['goal']}"
+        for row in rows if problems(row)] or []), *(["None."] if all(not problems(row) for row in rows) else [])]
+    return "\n".join(text) + "\n"

@@ -1,0 +1,132 @@
+"""Which faults strike which node when, and what counts as a safe and named end."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable
+from itertools import product
+from typing import NamedTuple
+
+PROCESS = {
+    "kill": "SIGKILL; the node stays away",
+    "stop": "SIGSTOP; the node hangs until the flight has ended",
+    "restart": "SIGKILL, and the node is started again at once",
+}
+TRAFFIC = {
+    "delay": "what the node publishes comes 0.2 s later",
+    "drop": "half of what the node publishes is lost, at random",
+    "duplicate": "what the node publishes comes twice",
+    "reorder": "of two messages that the node publishes the second comes first",
+}
+FAULTS = PROCESS | TRAFFIC
+NODES = ("vio_model", "estimator", "target_localizer", "perching_planner", "controller", "mission")
+TALKERS = {
+    "vehicle": ("imu/data_raw",),
+    "vio_model": ("vio/state", "vio/odometry"),
+    "estimator": ("odometry", "estimator/status"),
+    "target_localizer": ("target/pose",),
+    "controller": ("motor_command", "controller/status"),
+    "mission": ("trajectory", "controller/command"),
+}
+"""Whose messages are disturbed, in real time: node -> channels. The planner answers requests, it publishes nothing that others take."""
+PHASES = ("climb", "search", "approach", "contact", "perched")
+LOCKSTEP, REAL_TIME = "lockstep", "real time"
+MODES = (LOCKSTEP, REAL_TIME)
+SAFE = ("hovering", "landed", "perched", "motors off")
+"""Ends that are safe; `motors off`: on the ground, after a fall or lying there."""
+NAMED = 5.0  # wall-clock time from the fault within which it is named [s]
+
+WORDS = {
+    "vehicle": r"imu",
+    "vio_model": r"vio",
+    "estimator": r"estimator|odometry",
+    "target_localizer": r"target",
+    "perching_planner": r"plan_perch|planner",
+    "controller": r"controller|motor_command|disarmed",
+    "mission": r"mission|trajectory|order",
+}
+"""What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
+_TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|restarted|back)\b", re.IGNORECASE)
+_STAMP = re.compile(r"\[(?P<time>\d{9,}\.\d+)\]")
+
+
+class Case(NamedTuple):
+    """One fault."""
+
+    fault: str
+    node: str
+    phase: str
+    mode: str
+
+    @property
+    def name(self) -> str:
+        """For files and people."""
+        return f"{self.fault} {self.node}, {self.phase}, {self.mode}"
+
+    @property
+    def seed(self) -> int:
+        """Of the flight, and of the moment within the phase."""
+        return int(self._digest[:7], 16)
+
+    @property
+    def _digest(self) -> str:
+        return hashlib.sha256(self.name.encode()).hexdigest()
+
+
+def cases() -> list[Case]:
+    """All of them, so mixed that the first n are a sample of all."""
+    found = [Case(*one) for one in product(PROCESS, NODES, PHASES, MODES)]
+    found += [Case(fault, node, phase, REAL_TIME) for fault, node, phase in product(TRAFFIC, TALKERS, ("search", "approach"))]
+    return sorted(found, key=lambda case: case._digest)
+
+
+class Situation(NamedTuple):
+    """The vehicle at one moment, by the truth.
+
+    Attributes:
+        height: of the centre of mass above where it stood before the flight [m].
+        speed: [m/s].
+        tilt: [deg].
+        rotors: of the fastest one [rad/s].
+        held: velcro or gripper holds.
+        hovers: the controller says so.
+    """
+
+    height: float
+    speed: float
+    tilt: float
+    rotors: float
+    held: bool
+    hovers: bool
+
+
+def ending(now: Situation) -> str:
+    """How a flight has ended, by the truth; for a hover the controller's word is needed, too."""
+    if now.held and now.speed < 0.1 and now.rotors < 50.0:
+        return "perched"
+    if now.rotors < 50.0 and now.height < 0.15 and now.speed < 0.1:
+        return "landed" if now.tilt < 20.0 else "motors off"
+    if now.hovers and now.speed < 0.5 and now.tilt < 20.0 and now.height > 0.2:
+        return "hovering"
+    return "held with running motors" if now.held else "on the ground with running motors" if now.height < 0.15 else "in flight"
+
+
+def named(case: Case, struck: float, lines: Iterable[tuple[str, str]], said: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
+    """When after the fault [s], and by which words, who and what it is was said; None: never.
+
+    Args:
+        case: the fault; the node that it strikes is no witness.
+        struck: when, seconds since the epoch.
+        lines: (node, line of its log, stamped with seconds since the epoch).
+        said: (seconds since the epoch, words) of who sent the goal.
+    """
+    words = re.compile(WORDS[case.node], re.IGNORECASE)
+    found = [(time - struck, f"pilot: {text}") for time, text in said if time >= struck and words.search(text)]
+    for node, line in lines:
+        stamp = _STAMP.search(line)
+        if stamp and node != case.node and float(stamp["time"]) >= struck:
+            text = line[stamp.end():].replace(f"[{node}]: ", "").strip()
+            if words.search(text) and (_TROUBLE.search(text) or line.startswith(("[WARN", "[ERROR"))):
+                found.append((float(stamp["time"]) - struck, f"{node}: {text}"))
+    return min(found, default=None)

@@ -1,0 +1,325 @@
+"""One flight on the real graph with one fault: a process for every node, no cameras, a pilot that sends the goal."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from perch_core.errors import PerchError
+from perch_eval.domain import reserved_domain
+from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, SAFE, TALKERS, Case, Situation, ending, named
+from perch_eval.graph_faults.relay_node import DIRECT
+from perch_eval.graph_faults.ros.watcher import Watcher
+from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS, blind_launches
+from perch_eval.node_launch import NodeLaunch
+from perch_eval.nodes import ros_arguments
+from perch_eval.nursery import Nursery, alive, session
+from perch_eval.ros.pilot import Pilot
+from perch_eval.shared_memory import SharedMemory
+from perch_sim import seeding
+from perch_sim.contact_event import ContactState
+from perch_sim.obstacles import pad_surface
+from perch_sim.scenario import load_scenario
+
+SCENARIO = """
+extends: {base}
+name: {base}_blind
+nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
+parameters: {{perching_planner: {{time_limit: 20.0}}, vehicle: {{lockstep_timeout: 8.0}}}}
+"""
+"""What is flown: without images. A busy machine may take its time to plan; the lockstep goes on without a node that hangs after 8 s instead of 60."""
+DOMAINS = range(43, 70)
+READY = 60.0     # for the nodes to come up [s]
+STALL = 30.0     # simulation time may stand still for so long [s]
+SETTLE = 4.0     # an end that lasts so long is one, in simulation time [s]
+LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
+STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
+NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
+
+
+@dataclass(frozen=True)
+class Row:
+    """How a flight went.
+
+    Attributes:
+        fault, node, phase, mode, seed: what was done.
+        commit: of the code.
+        struck: simulation time of the fault [s]; None: the flight ended before.
+        before: height [m], speed [m/s] and tilt [deg] then.
+        end: hovering, landed, perched, motors off; anything else is not safe.
+        named: after so many seconds of wall-clock time the fault was named; None: never.
+        words: by whom, and how.
+        goal: the mission's result, or what the pilot knows of it.
+        impact: fastest touch of the floor or a wall after the fault [m/s].
+        ended: other nodes that ended by themselves.
+        left: processes, sockets, shared memory that were left when all had been stopped.
+        duration: wall clock [s].
+    """
+
+    fault: str
+    node: str
+    phase: str
+    mode: str
+    seed: int
+    commit: str
+    struck: float | None
+    before: tuple[float, float, float]
+    end: str
+    named: float | None
+    words: str
+    goal: str
+    impact: float
+    ended: tuple[str, ...]
+    left: tuple[str, ...]
+    duration: float
+
+    def as_json(self) -> dict[str, Any]:
+        """For a line of a file."""
+        return asdict(self)
+
+
+class Group:
+    """The processes of one flight.
+
+    Attributes:
+        pids: node -> process id of the present one.
+    """
+
+    def __init__(self, nursery: Nursery, launches: tuple[NodeLaunch, ...], relayed: str, folder: Path, domain: int) -> None:
+        """
+        Args:
+            nursery: starts them.
+            launches: the nodes.
+            relayed: the node whose messages pass the relay; empty: none.
+            folder: receives parameters and logs.
+            domain: ROS domain.
+        """
+        self._nursery, self._folder, self._domain = nursery, folder, domain
+        self._commands = {one.name: (self._place(one), ros_arguments(one, folder)) for one in launches}
+        channels = TALKERS.get(relayed, ())
+        if channels:
+            self._commands[relayed][1][1:1] = [text for channel in channels for text in ("-r", f"{channel}:={DIRECT}/{channel}")]
+            self._commands["relay"] = "perch_eval.graph_faults.relay_node:Relay", [*channels, "--ros-args"]
+        self.pids: dict[str, int] = {}
+        self._sessions: list[int] = []
+        self._memory, self._since = SharedMemory(), time.time()
+
+    @staticmethod
+    def _place(one: NodeLaunch) -> str:
+        return f"{MODULE}:{one.name.upper()}" if one.name in SIGHTS else f"{one.module}:NODE"
+
+    def start(self, name: str) -> None:
+        """Start a node, for the first time or again."""
+        what, arguments = self._commands[name]
+        pid = self._nursery.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)})
+        self.pids[name] = pid
+        self._sessions.append(pid)
+
+    def start_all(self) -> None:
+        """Start all nodes."""
+        for name in self._commands:
+            self.start(name)
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a node."""
+        self._memory.observe(self.pids.values())
+        os.kill(self.pids[name], number)
+
+    def ended(self) -> tuple[str, ...]:
+        """Nodes whose processes have ended."""
+        return tuple(name for name, pid in self.pids.items() if not alive(pid))
+
+    def lines(self) -> Iterator[tuple[str, str]]:
+        """(node, line) of everything that was written."""
+        for name in self._commands:
+            for line in (self._folder / f"{name}.log").read_text(errors="replace").splitlines():
+                yield name, line
+
+    def stop(self) -> tuple[str, ...]:
+        """End everything.
+
+        Returns:
+            What is left all the same, in words.
+        """
+        self._memory.observe(self.pids.values())
+        running = [pid for pid in self.pids.values() if alive(pid)]
+        for number, patience in zip((signal.SIGINT, signal.SIGKILL), STOPPING):
+            for pid in running:
+                for one in (signal.SIGCONT, number):
+                    try:
+                        os.kill(pid, one)
+                    except ProcessLookupError:
+                        pass
+            end = time.monotonic() + patience
+            while time.monotonic() < end and (running := [pid for pid in running if alive(pid)]):
+                time.sleep(0.02)
+        end = time.monotonic() + STOPPING[1]
+        while (found := [pid for leader in self._sessions for pid in session(leader)]) and time.monotonic() < end:
+            time.sleep(0.05)
+        self._memory.clean()
+        return (*(f"process {pid}" for pid in found), *self._sockets(), *self._shared_memory())
+
+    def _sockets(self) -> list[str]:
+        mine = f"perch-lockstep-{os.getuid()}-{self._domain}-"
+        return [f"socket {line.split()[-1]}" for line in Path("/proc/net/unix").read_text().splitlines() if mine in line]
+
+    def _shared_memory(self) -> list[str]:
+        """Segments of the middleware that have come since the start and that no process uses."""
+        found = {file for file in Path("/dev/shm").glob("fast*") if _since(file) >= self._since}
+        used = {Path(name.removesuffix("_el").removesuffix("_sl")) for name in SharedMemory().used()}
+        return [f"shared memory {file.name}" for file in found if Path(str(file).removesuffix("_el").removesuffix("_sl")) not in used]
+
+
+def _since(file: Path) -> float:
+    try:
+        return file.stat().st_mtime
+    except OSError:  # gone meanwhile
+        return -1.0
+
+
+class _Director:
+    """Waits for the moment, and makes the fault happen.
+
+    Attributes:
+        struck: when, seconds since the epoch; None: not yet.
+        at: the same in simulation time [s].
+        before: the situation then.
+    """
+
+    def __init__(self, case: Case, group: Group, watcher: Watcher, takeoff_height: float, pad: Any) -> None:
+        self._case, self._group, self._watcher = case, group, watcher
+        self._share = float(seeding.stream(case.seed, "moment").uniform(0.2, 0.9))
+        self._height, self._pad = takeoff_height, pad
+        self._phase, self._since, self._duration = "", 0.0, 0.0
+        self.said: list[tuple[float, str]] = []
+        self.struck: float | None = None
+        self.at: float | None = None
+        self.before = Situation(0.0, 0.0, 0.0, 0.0, False, False)
+
+    def on_phase(self, t: float, phase: str, message: str) -> None:
+        """Of the mission's feedback; what is said otherwise is kept, too."""
+        self.said.append((time.time(), message))
+        if phase != self._phase and phase not in ("waiting", "cancelling"):
+            self._phase, self._since = phase, self._watcher.time
+            planned = re.match(r"perching, ([\d.]+) s", message)
+            self._duration = float(planned[1]) if planned else self._duration
+
+    def look(self) -> None:
+        """Strike, if it is time."""
+        if self.struck is None and self._now():
+            self.strike()
+
+    def _now(self) -> bool:
+        phase, elapsed, watcher = self._phase, self._watcher.time - self._since, self._watcher
+        if self._case.phase == "climb":
+            return phase == "take_off" and watcher.height > self._share * self._height
+        if self._case.phase == "search":
+            return phase == "searching" and elapsed > 0.5 * self._share
+        if self._case.phase == "approach":
+            return phase == "tracking" and elapsed > self._share * (self._duration - 0.2)
+        if self._case.phase == "contact":
+            return phase in ("tracking", "verifying") and (self._pad.normal @ (watcher.position - self._pad.p_WS)) < NEAR
+        return phase == "perched" and elapsed > 0.5 * self._share
+
+    def strike(self) -> None:
+        """Make it happen."""
+        case, group = self._case, self._group
+        self.before = self._watcher.situation() or self.before
+        self.at, self.struck = self._watcher.time, time.time()
+        if case.fault not in PROCESS:
+            self._watcher.disturb(case.fault)
+        elif case.fault == "stop":
+            group.signal(case.node, signal.SIGSTOP)
+        else:
+            group.signal(case.node, signal.SIGKILL)
+            if case.fault == "restart":
+                while alive(group.pids[case.node]):
+                    time.sleep(0.001)
+                group.start(case.node)
+
+
+@contextmanager
+def _in_domain(domain: int) -> Iterator[None]:
+    before = os.environ.get("ROS_DOMAIN_ID")
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
+    try:
+        yield
+    finally:
+        os.environ.pop("ROS_DOMAIN_ID") if before is None else os.environ.update(ROS_DOMAIN_ID=before)
+
+
+def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
+    """Fly one case.
+
+    Args:
+        case: what happens.
+        nursery: has loaded the nodes.
+        folder: receives scenario, parameters and logs.
+        commit: of the code, for the row.
+
+    Raises:
+        PerchError: the nodes do not come up.
+    """
+    began = time.monotonic()
+    folder.mkdir(parents=True, exist_ok=True)
+    source = folder / "flown.yaml"
+    source.write_text(SCENARIO.format(base="surface_90"))
+    scenario, lockstep = load_scenario(source), case.mode == LOCKSTEP
+    launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides={"mission": {"lockstep_hold": "perch"}} if lockstep else None)
+    with reserved_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain, _in_domain(domain):
+        group = Group(nursery, launches, case.node if case.fault not in PROCESS else "", folder, domain)
+        pilot = Pilot()
+        left: tuple[str, ...] = ()
+        try:
+            watcher = Watcher(pilot)
+            director = _Director(case, group, watcher, scenario.mission.takeoff_height, pad_surface(scenario, 0.0))
+            group.start_all()
+            wanted = {f"/{name}" for name in group.pids}
+            limit = time.monotonic() + READY
+            while not wanted <= pilot.visible_nodes():
+                if time.monotonic() > limit or group.ended():
+                    raise PerchError(f"not ready: {', '.join(group.ended() or sorted(wanted - pilot.visible_nodes()))}; logs: {folder}")
+            try:
+                result = pilot.fly(scenario, director.on_phase, director.look, stall=STALL)
+                goal = f"{result.outcome}: {result.message}"
+            except PerchError as error:
+                goal = str(error)
+            director.said.append((time.time(), goal))
+            end = _settled(pilot, watcher, director)
+            ended = tuple(name for name in group.ended() if name != case.node or case.fault == "restart" or case.fault not in PROCESS)
+        finally:
+            left = group.stop()
+            pilot.close()
+    found = named(case, director.struck, group.lines(), director.said) if director.struck is not None else None
+    touched = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
+               and director.at is not None and 1e-9 * c.stamp >= director.at]
+    return Row(*case, case.seed, commit, director.at, director.before[:3], end, None if found is None else round(found[0], 2),
+               "" if found is None else found[1][:300], goal[:300], round(max(touched, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
+
+
+def _settled(pilot: Pilot, watcher: Watcher, director: _Director) -> str:
+    """Wait until an end lasts, and the fault has had its time to be named."""
+    limit, since, last, named_silent = time.monotonic() + LIMIT, watcher.time, "", set()
+    while time.monotonic() < limit:
+        pilot.listen(0.05)
+        director.look()
+        for name in sorted(pilot.silent() - named_silent):
+            named_silent.add(name)
+            director.said.append((time.time(), f"{name} is silent"))
+        now = watcher.situation()
+        if now is None:
+            continue
+        found = ending(now)
+        if found != last:
+            last, since = found, watcher.time
+        waited = director.struck is None or time.time() - director.struck > 5.5
+        if found in SAFE and watcher.time - since > SETTLE and waited:
+            return found
+    return last

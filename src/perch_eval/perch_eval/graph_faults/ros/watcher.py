@@ -1,0 +1,78 @@
+"""What the campaign sees of a flight: the truth, the rotors, contacts, and what the controller says."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+from std_msgs.msg import String
+
+from perch_core import so3
+from perch_core.ros import topics
+from perch_core.values import seconds
+from perch_eval.graph_faults.cases import Situation
+from perch_eval.ros.pilot import Pilot
+from perch_sim.contact_event import ContactState
+
+HOVERING = 3  # perch_msgs/ControllerStatus
+CHANNELS = ("ground_truth/odometry", "rotor_state", "contact", "controller/status")
+
+
+class Watcher:
+    """Subscribes with a pilot's node; only the newest message of each channel is looked at, and only when it is asked for.
+
+    Attributes:
+        contacts: all of them, in order.
+    """
+
+    def __init__(self, pilot: Pilot) -> None:
+        self._newest: dict[str, bytes] = {}
+        self.contacts: list[Any] = []
+        self._start: tuple[float, ...] | None = None
+        node = pilot.node
+        for channel in CHANNELS:
+            row = topics.topic(channel)
+            node.create_subscription(row.message, channel, partial(self._take, channel), row.qos.subscribe, raw=True)
+        self._fault = node.create_publisher(String, "relay/fault", topics.topic("trajectory").qos.publish)
+
+    def _take(self, channel: str, message: bytes) -> None:
+        self._newest[channel] = message
+        if channel == "contact":
+            self.contacts.append(topics.decode(channel, message))
+        elif channel == "ground_truth/odometry" and self._start is None:
+            self._start = topics.decode(channel, message).p_WB
+
+    def disturb(self, fault: str) -> None:
+        """Have the relay do something to what it passes on."""
+        self._fault.publish(String(data=fault))
+
+    @property
+    def position(self) -> tuple[float, ...] | None:
+        """True position of the centre of mass in W [m]; None: nothing has come yet."""
+        newest = self._newest.get("ground_truth/odometry")
+        return None if newest is None else topics.decode("ground_truth/odometry", newest).p_WB
+
+    @property
+    def height(self) -> float:
+        """Above where the vehicle stood before the flight [m]."""
+        p = self.position
+        return 0.0 if p is None else p[2] - self._start[2]
+
+    @property
+    def time(self) -> float:
+        """Stamp of the newest true state [s]; 0: nothing has come yet."""
+        newest = self._newest.get("ground_truth/odometry")
+        return 0.0 if newest is None else seconds(topics.decode("ground_truth/odometry", newest).stamp)
+
+    def situation(self) -> Situation | None:
+        """As it is now; None: not all has come yet."""
+        if not {"ground_truth/odometry", "rotor_state"} <= set(self._newest):
+            return None
+        state, rotors = (topics.decode(channel, self._newest[channel]) for channel in ("ground_truth/odometry", "rotor_state"))
+        status = self._newest.get("controller/status")
+        up = so3.quat_to_matrix(state.q_WB)[2, 2]
+        held = next((c.state for c in reversed(self.contacts) if c.state in (ContactState.NONE, ContactState.ATTACHED)), None) == ContactState.ATTACHED
+        hovers = status is not None and topics.decode("controller/status", status).state == HOVERING
+        return Situation(self.height, math.dist(state.v_WB, (0.0,) * 3), math.degrees(math.acos(min(max(up, -1.0), 1.0))),
+                         max(rotors.speed), held, hovers)

@@ -1,0 +1,141 @@
+"""The nodes `target_localizer` and `powerline_mapper` without images: what they see is made from the truth, by the error models of
+flights in process. For campaigns over ROS that do not render.
+
+    python3 -m perch_eval.modelled_sight_node target_localizer --ros-args -p scenario:=surface_90 -p seed:=3
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from perch_core.component import Input
+from perch_core.config import quantity, text
+from perch_core.ros.node import node
+from perch_core.tag_board import load_board
+from perch_core.values import CameraImage, CameraModel, OdometryState
+from perch_core.vehicle import load_vehicle
+from perch_eval.in_process.modelled_sight import ModelledSight
+from perch_eval.in_process.stand_ins import MappedWorld
+from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
+from perch_eval.program import Program
+from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
+from perch_sim import seeding
+from perch_sim.calibration import true_mounts
+from perch_sim.lockstep import START
+from perch_sim.obstacles import pad_surface
+from perch_sim.scenario import Scenario, load_scenario
+from perch_sim.state_history import StateHistory, TrueState
+
+MEMORY = 1000  # true states kept: 2 s, as images wait for the odometry
+
+
+@dataclass(frozen=True)
+class SightParameters(TargetLocalizerConfig):
+    """Those of the localiser, and whose truth it looks at."""
+
+    scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
+
+
+@dataclass(frozen=True)
+class MapParameters:
+    """Whose cables are mapped, and when."""
+
+    scenario: str = text("line_80", doc="config/scenarios/<name>.yaml, or a file")
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
+    camera: str = text("front", doc="camera whose frames start the map")
+
+
+class ModelledLocalizer(TargetLocalizer):
+    """The target localiser with its sightings made from the truth: a frame's `camera_info` takes the place of its image."""
+
+    config_type = SightParameters
+
+    image = None
+    truth = Input(OdometryState, "ground_truth/odometry")
+
+    def __init__(self, config: SightParameters) -> None:
+        """
+        Raises:
+            ConfigError: no such scenario, vehicle, camera or board.
+        """
+        scenario = load_scenario(config.scenario)
+        mount = load_vehicle(scenario.vehicle).mounts[config.camera]
+        true = true_mounts(scenario, {config.camera: mount}, config.seed)[config.camera]
+        self._truth, self._newest = StateHistory(MEMORY), 0
+        self._sight = ModelledSight(
+            load_board(config.board), mount, true, config.localizer, seeding.stream(config.seed, "tag_corners"), self._truth,
+            lambda: pad_surface(scenario, (self._newest - START) * 1e-9), averaging=config.mode == "average", calibration=config.calibration)
+        super().__init__(config, self._sight)
+
+    def _channel(self, port: str) -> str:
+        return f"camera_{self.config.camera}/camera_info"
+
+    def on_truth(self, state: OdometryState) -> None:
+        """A true state; frames may have waited for it."""
+        if state.stamp > self._newest:
+            self._newest = state.stamp
+            self._truth.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
+        self.advance()
+
+    def on_camera_info(self, model: CameraModel) -> None:
+        """A frame."""
+        super().on_camera_info(model)
+        self.on_image(CameraImage(model.stamp, model.frame, model.camera.width, model.camera.height, "mono8", lambda *_: None))
+
+    def covers(self, image: CameraImage) -> bool:
+        """As of an image, and the truth has passed its exposure, too."""
+        return super().covers(image) and self._sight.middle(self._exposed(image)) <= self._newest
+
+
+class ModelledMapper(MappedWorld):
+    """The map of a scenario's cables with the mapper's error."""
+
+    config_type = MapParameters
+
+    def __init__(self, config: MapParameters) -> None:
+        """
+        Raises:
+            ConfigError: no such scenario.
+            PerchError: a cable sags.
+        """
+        super().__init__(replace(MappedWorld.of(load_scenario(config.scenario), config.seed).config, camera=config.camera))
+        self.config = config
+
+
+TARGET_LOCALIZER = node("target_localizer", ModelledLocalizer)
+POWERLINE_MAPPER = node("powerline_mapper", ModelledMapper)
+NODES = {one.name: one for one in (TARGET_LOCALIZER, POWERLINE_MAPPER)}
+MODULE = "perch_eval.modelled_sight_node"
+
+
+def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, **options: Any) -> tuple[NodeLaunch, ...]:
+    """The nodes that fly a scenario without images, with their parameters.
+
+    Args:
+        scenario, seed, source: what is flown, its random numbers, its name or file.
+        lockstep: as in `node_launch.node_launches`.
+        options: further ones of `node_launch.node_launches`.
+    """
+    nodes = ["vio_model" if name == "vio" else name for name in choose_nodes(scenario)]
+    own: dict[str, Any] = {"scenario": source, "seed": seed}
+    changed = {"vehicle": lambda p: {**p, "cameras": "none"}, "target_localizer": lambda p: {**p, **own}, "powerline_mapper": lambda p: own}
+    launches = node_launches(scenario, nodes, seed=seed, scenario_source=source, lockstep=lockstep, **options)
+    return tuple(NodeLaunch(one.name, changed.get(one.name, dict)(one.parameters), one.host) for one in launches)
+
+
+def blind_programs(programs: Sequence[Program]) -> tuple[Program, ...]:
+    """Programs whose nodes that look at images are those of this module."""
+    return tuple(Program(one.name, (sys.executable, "-m", MODULE, one.name, *one.command[1:]), one.nodes) if one.name in NODES else one
+                 for one in programs)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in NODES:
+        sys.exit(f"usage: python3 -m {MODULE} {' | '.join(NODES)} --ros-args ...")
+    NODES[sys.argv.pop(1)].main()

@@ -1,0 +1,258 @@
+"""The stack for hours: perch, depart, perch again, in one run; memory, descriptors, threads and shared memory of every process."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perch_core import config
+from perch_core.errors import PerchError
+from perch_eval.arguments import count, output_folder
+from perch_eval.campaign.progress import Progress
+from perch_eval.domain import reserved_domain
+from perch_eval.evaluation.document import machine
+from perch_eval.graph_faults.campaign import commit
+from perch_eval.modelled_sight_node import blind_launches, blind_programs
+from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
+from perch_eval.ros.pilot import Pilot
+from perch_eval.stack import Stack, StackError
+from perch_sim.scenario import load_scenario
+
+EXAMPLES = """examples:
+  python3 scripts/soak.py                                       an hour of flight, without cameras
+  python3 scripts/soak.py --scenario line_80 --flights 10
+  python3 scripts/soak.py --cameras --hours 0.1 --name cameras
+
+exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 the caller's mistake"""
+SETTLED = 50          # flights after which memory must not grow any more
+BAR = 1.0             # growth of a process per 100 flights [MB]
+READY = 180.0         # [s]
+IN_A_ROW = 5          # failures after which it ends
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One process at one moment.
+
+    Attributes:
+        rss: resident memory [MB].
+        descriptors, threads: how many.
+    """
+
+    rss: float
+    descriptors: int
+    threads: int
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One perch and what came after it.
+
+    Attributes:
+        time: simulation time at its end [s].
+        outcome: of the goal, `perched` where it is good.
+        departed: the vehicle has left for a hover.
+        words: of what went wrong; empty: nothing.
+        processes: name -> its sample.
+        shared: in /dev/shm, of everybody on this machine [MB].
+    """
+
+    time: float
+    outcome: str
+    departed: bool
+    words: str
+    processes: Mapping[str, Sample]
+    shared: float
+
+
+def sample(pid: int) -> Sample:
+    """A process as it is now."""
+    folder = Path("/proc") / str(pid)
+    rss = int((folder / "statm").read_text().split()[1]) * PAGE / 1e6
+    return Sample(round(rss, 3), len(os.listdir(folder / "fd")), len(os.listdir(folder / "task")))
+
+
+def slope(values: Sequence[float], settled: int = SETTLED) -> float | None:
+    """Growth per 100 flights after the first ones, by least squares; None: too few to tell."""
+    rest = np.asarray(values[settled:], float)
+    return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
+
+
+def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: float, flights: int | None, folder: Path) -> list[Flight]:
+    """Fly until there has been so much simulated time, or so many flights.
+
+    Args:
+        name: of the scenario.
+        seed: of every random number.
+        cameras: look at images; otherwise they are replaced by error models.
+        composed: nodes that share a process.
+        hours: of simulated time.
+        flights: at most so many; None: as time allows.
+        folder: receives logs and parameters.
+
+    Raises:
+        PerchError: the stack does not come up, or breaks.
+    """
+    source = config.find("scenarios", name)
+    scenario, found = load_scenario(source), []
+    if cameras:
+        started = programs(scenario, seed, scenario_source=str(source), composed=composed, folder=folder)
+    else:
+        started = blind_programs(node_programs(blind_launches(scenario, seed, str(source), True), folder, composed=composed))
+    with reserved_domain(range(43, 70)) as domain:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        progress, pilot = Progress(flights or 0, what="flights"), Pilot()
+        try:
+            with Stack(started, folder) as stack:
+                stack.wait_until_ready(pilot.visible_nodes, READY)
+                while pilot.time < 3600.0 * hours and (flights is None or len(found) < flights):
+                    found.append(_once(pilot, scenario, stack))
+                    progress.add(found[-1].departed)
+                    if len(found) >= IN_A_ROW and not any(flight.departed for flight in found[-IN_A_ROW:]):
+                        print(f"\n{IN_A_ROW} failures in a row: {found[-1].words}", file=sys.stderr)
+                        break
+        except StackError as error:
+            print(f"\n{error}", file=sys.stderr)
+        finally:
+            progress.close()
+            pilot.close()
+    return found
+
+
+def _once(pilot: Pilot, scenario: Any, stack: Stack) -> Flight:
+    outcome, words, departed = "failed", "", False
+    try:
+        result = pilot.fly(scenario, check=stack.raise_if_ended)
+        outcome, words = result.outcome, "" if result.outcome == "perched" else result.message
+        if outcome in ("perched", "perched_already"):
+            departed, said = pilot.depart(stack.raise_if_ended)
+            words = words or ("" if departed else said)
+    except StackError:
+        raise
+    except PerchError as error:
+        words = str(error)
+    shared = sum(file.stat().st_size for file in Path("/dev/shm").glob("*") if file.is_file()) / 1e6
+    return Flight(round(pilot.time, 3), outcome, departed, words, {name: sample(pid) for name, pid in stack.pids.items()}, round(shared, 3))
+
+
+def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
+    """What each process does: its slope [MB per 100 flights], and the range of descriptors and threads after the first flights."""
+    found = {}
+    for name in flights[0].processes:
+        own = [flight.processes[name] for flight in flights]
+        rest = own[min(SETTLED, len(own) // 2):]
+        found[name] = {"rss_first_MB": own[0].rss, "rss_last_MB": own[-1].rss, "slope_MB_per_100": slope([one.rss for one in own]),
+                       "descriptors": [min(one.descriptors for one in rest), max(one.descriptors for one in rest)],
+                       "threads": [min(one.threads for one in rest), max(one.threads for one in rest)]}
+    return found
+
+
+def verdicts(flights: Sequence[Flight]) -> list[str]:
+    """What is not as it should be."""
+    found = [f"flight {k + 1}: {flight.outcome}{'' if flight.departed else ', no departure'}: {flight.words}"
+             for k, flight in enumerate(flights) if not flight.departed or flight.outcome != "perched"]
+    for name, of in growth(flights).items():
+        if of["slope_MB_per_100"] is not None and of["slope_MB_per_100"] > BAR:
+            found.append(f"{name}: memory grows by {of['slope_MB_per_100']:.2f} MB per 100 flights")
+        found += [f"{name}: {what} between {of[what][0]} and {of[what][1]}" for what in ("descriptors", "threads") if of[what][0] != of[what][1]]
+    return found
+
+
+def plot(flights: Sequence[Flight], file: Path) -> None:
+    """Memory, descriptors and threads of each process, and shared memory, by flight."""
+    import matplotlib
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(4, 1, figsize=(7.0, 8.0), sharex=True)
+    x = np.arange(1, len(flights) + 1)
+    for name in flights[0].processes:
+        own = [flight.processes[name] for flight in flights]
+        axes[0].plot(x, [one.rss - own[0].rss for one in own], label=name)
+        axes[1].plot(x, [one.descriptors for one in own])
+        axes[2].plot(x, [one.threads for one in own])
+    axes[3].plot(x, [flight.shared for flight in flights], "k")
+    for ax, label in zip(axes, ("memory since the\nfirst flight [MB]", "descriptors", "threads", "/dev/shm [MB]")):
+        ax.set_ylabel(label)
+    axes[3].set_xlabel("flight")
+    axes[0].legend(fontsize=7, ncol=2)
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def page(folder: Path) -> str:
+    """The page of all soaks whose figures lie in a folder."""
+    text = ["# Soak", "", "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart, perch "
+            f"again. Growth of memory by least squares over the flights after the first {SETTLED}; bar: {BAR:g} MB per 100 flights, descriptors and "
+            "threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
+    for file in sorted(folder.glob("*.json")):
+        run = json.loads(file.read_text())
+        good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
+        sight = "with cameras" if run["cameras"] else "without cameras (error models in their place)"
+        text += ["", f"## {file.stem}", "", f"`{run['scenario']}`, seed {run['seed']}, {sight}; {run['commit']}, {run['machine']}; "
+                 f"{good} of {len(run['flights'])} flights perched and departed, {run['flights'][-1]['time'] / 60.0:.1f} min of simulated time in "
+                 f"{run['wall_s'] / 60.0:.1f} min.", "",
+                 "| process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads |", "| --- | --- | --- | --- | --- | --- |"]
+        for name, of in run["growth"].items():
+            rate = "too few flights" if of["slope_MB_per_100"] is None else f"{of['slope_MB_per_100']:+.2f}"
+            text.append(f"| {name} | {of['rss_first_MB']:.1f} | {of['rss_last_MB']:.1f} | {rate} | " + " | ".join(
+                f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])) + " |")
+        shared = [flight["shared"] for flight in run["flights"]]
+        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB. " + ("Not as it should be:" if run["problems"] else "All as it should be."),
+                 *([""] if run["problems"] else []), *(f"* {problem}" for problem in run["problems"]), "", f"![{file.stem}]({file.stem}.png)"]
+    return "\n".join(text) + "\n"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="soak.py", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    out.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a file (default: %(default)s)")
+    out.add_argument("--seed", type=int, default=1, help="of every random number (default: %(default)s)")
+    out.add_argument("--hours", type=float, default=1.0, help="of simulated time (default: %(default)s)")
+    out.add_argument("--flights", type=count, metavar="N", help="at most so many")
+    out.add_argument("--cameras", action="store_true", help="render and look at images, too")
+    out.add_argument("--composed", nargs="*", metavar="NODE", help="nodes that share a process; all without names (default: " + ", ".join(FAST_NODES) + ")")
+    out.add_argument("--name", help="of the run's files (default: the scenario's)")
+    out.add_argument("--out", type=Path, default=Path("docs/results/soak"), metavar="DIR", help="folder of figures and page (default: %(default)s)")
+    out.add_argument("--logs", type=Path, default=Path("out/soak"), metavar="DIR", help="folder of logs (default: %(default)s)")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    began = time.monotonic()
+    try:
+        if not 0.0 < args.hours <= 1000.0:
+            raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
+        output_folder(args.out), output_folder(args.logs)
+        code = commit()
+        flights = fly(args.scenario, args.seed, args.cameras, sharing(args.composed, otherwise=FAST_NODES), args.hours, args.flights, args.logs)
+        if not flights:
+            raise PerchError(f"no flight was flown; logs: {args.logs}")
+    except (PerchError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    name, problems = args.name or Path(args.scenario).stem, verdicts(flights)
+    plot(flights, args.out / f"{name}.png")
+    (args.out / f"{name}.json").write_text(json.dumps({
+        "scenario": args.scenario, "seed": args.seed, "cameras": args.cameras, "commit": code, "machine": machine(),
+        "wall_s": round(time.monotonic() - began, 1), "problems": problems, "growth": growth(flights),
+        "flights": [asdict(flight) for flight in flights]}, separators=(",", ":")) + "\n")
+    (args.out / "README.md").write_text(page(args.out))
+    print(f"{args.out / 'README.md'}: {len(flights)} flights", *problems, sep="\n  ")
+    return 1 if problems else 0

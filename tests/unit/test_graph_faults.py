@@ -1,0 +1,115 @@
+"""The campaign of faults on the real graph: its judgement, its witnesses, its processes, and what a killed campaign keeps."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from perch_eval.graph_faults import campaign
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named
+from perch_eval.graph_faults.relay_node import DELAY, Disturbance
+from perch_eval.nursery import Nursery, alive, session
+
+CASE = Case("kill", "estimator", "climb", LOCKSTEP)
+
+
+def test_every_node_is_struck_by_every_fault_in_every_phase_and_mode():
+    found = cases()
+    assert len(found) == len(set(found)) >= 200
+    process = [case for case in found if case.fault in PROCESS]
+    assert {case[:4] for case in process} == {(f, n, p, m) for f in PROCESS for n in NODES for p in PHASES for m in MODES}
+    assert all(case.mode == REAL_TIME for case in found if case.fault not in PROCESS)
+    assert {case.fault for case in found} == set(FAULTS) and {case.node for case in found} <= set(WORDS)
+    assert max(Counter(case.fault for case in found[:40]).values()) < 20  # the first ones are a sample of all
+
+
+@pytest.mark.parametrize("situation, end", [
+    (Situation(1.2, 0.0, 90.0, 0.0, True, False), "perched"),
+    (Situation(1.2, 0.0, 90.0, 900.0, True, False), "held with running motors"),
+    (Situation(0.0, 0.0, 1.0, 0.0, False, False), "landed"),
+    (Situation(0.05, 0.0, 175.0, 0.0, False, False), "motors off"),
+    (Situation(0.05, 0.0, 175.0, 300.0, False, True), "on the ground with running motors"),
+    (Situation(1.2, 0.1, 2.0, 800.0, False, True), "hovering"),
+    (Situation(1.2, 0.1, 2.0, 800.0, False, False), "in flight"),
+    (Situation(1.2, 2.0, 2.0, 800.0, False, True), "in flight"),
+    (Situation(1.2, 3.0, 2.0, 0.0, False, False), "in flight"),
+])
+def test_ends(situation, end):
+    assert ending(situation) == end
+
+
+def test_a_node_is_no_witness_of_itself_and_routine_names_nobody():
+    lines = [("estimator", "[ERROR] [1000000101.0] [estimator]: odometry lost"), ("mission", "[INFO] [1000000101.0] [mission]: odometry is good"),
+             ("controller", "[INFO] [1000000102.5] [controller]: descent without position: no odometry"),
+             ("vehicle", "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator is gone"), ("vehicle", "Traceback: estimator")]
+    assert named(CASE, 1000000100.0, lines, []) == (2.5, "controller: descent without position: no odometry")
+    assert named(CASE, 1000000100.0, lines[:2], []) is None
+    assert named(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has been silent for 3 s")])[0] == 1.5
+
+
+def test_disturbances():
+    def passed(fault: str) -> list[int]:
+        one = Disturbance()
+        one.fault = fault
+        found = [m for k in range(100) for m in one.passed(k, 0.0)]
+        return found + one.due(DELAY - 0.01) + [-1] + one.due(DELAY + 0.01)
+
+    assert passed("") == [*range(100), -1]
+    assert passed("delay") == [-1, *range(100)]
+    assert 20 < len(passed("drop")) < 80 and passed("drop") == sorted(passed("drop")[:-1]) + [-1]
+    assert passed("duplicate") == [k for k in range(100) for _ in range(2)] + [-1]
+    assert passed("reorder")[:4] == [1, 0, 3, 2]
+
+
+def row(**changes) -> dict:
+    return {**CASE._asdict(), "seed": 1, "commit": "abc", "struck": 3.0, "before": [1.0, 0.0, 0.0], "end": "landed", "named": 0.5, "words": "w",
+            "goal": "g", "impact": 0.0, "ended": [], "left": [], "duration": 9.0} | changes
+
+
+@pytest.mark.parametrize("changes, problem", [
+    ({}, []), ({"end": "in flight"}, ["ended in flight"]), ({"named": None}, ["not named"]), ({"named": 7.0}, ["named after 7.0 s"]),
+    ({"left": ["process 7"]}, ["left: process 7"]), ({"ended": ["mission"]}, ["mission ended, too"]),
+    ({"struck": None}, ["the flight ended before the fault: g"])])
+def test_what_is_not_as_it_should_be_is_said(changes, problem):
+    assert campaign.problems(row(**changes)) == problem
+    assert all(word in campaign.page([row(**changes)]) for word in problem)
+
+
+def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
+    file = tmp_path / campaign.ROWS
+    file.write_text(json.dumps(row()) + "\n" + json.dumps(row(node="mission"))[:50])
+    assert list(campaign.load(file)) == [CASE]
+    flown = []
+    monkeypatch.setattr(campaign, "fly_all", lambda missing, *_: flown.extend(missing))
+    assert campaign.main(["--out", str(tmp_path), "--logs", str(tmp_path), "--only", "kill estimator climb"]) == 0
+    assert flown == [CASE._replace(mode=REAL_TIME)]
+    assert "1 of " in (tmp_path / "README.md").read_text() and set(SAFE) >= {"landed"}
+
+
+def test_processes_of_a_nursery_are_their_own_and_end_with_it(tmp_path, monkeypatch):
+    (tmp_path / "sleeper.py").write_text(
+        "import os, subprocess, sys, time\nclass Sleeper:\n    @staticmethod\n    def main():\n        print(sys.argv[1], os.environ['WORD'], flush=True)\n"
+        "        subprocess.Popen(['sleep', '60'])\n        time.sleep(60)\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    nursery = Nursery(("sleeper",))
+    pids = [nursery.start("sleeper:Sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}) for k in range(2)]
+    until(lambda: all(len(session(pid)) == 2 for pid in pids))
+    assert [Path(tmp_path / f"{k}.log").read_text() for k in range(2)] == ["number 0 heard\n", "number 1 heard\n"]
+    os.kill(pids[0], signal.SIGKILL)
+    until(lambda: not alive(pids[0]))
+    assert len(session(pids[0])) == 1  # what it has started is still found
+    os.killpg(pids[0], signal.SIGKILL), nursery.close()
+    until(lambda: not alive(pids[1]))
+    os.killpg(pids[1], signal.SIGKILL)
+
+
+def until(done, patience=30.0):
+    end = time.monotonic() + patience
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.01)

@@ -1,0 +1,31 @@
+"""What a soak takes for growth."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from perch_eval import soak
+
+
+def flights(memory, descriptors=lambda k: 10, good=lambda k: True):
+    return [soak.Flight(float(k), "perched" if good(k) else "missed", good(k), "", {"all": soak.Sample(memory(k), descriptors(k), 5)}, 1.0) for k in range(150)]
+
+
+def test_what_grows_is_found():
+    assert soak.verdicts(flights(lambda k: 100.0 + min(k, 50))) == []  # what grows at first only
+    assert soak.verdicts(flights(lambda k: 100.0 + 0.02 * k)) == ["all: memory grows by 2.00 MB per 100 flights"]
+    assert soak.verdicts(flights(lambda k: 100.0, lambda k: 10 + (k > 140))) == ["all: descriptors between 10 and 11"]
+    assert soak.verdicts(flights(lambda k: 100.0, good=lambda k: k != 7)) == ["flight 8: missed, no departure: "]
+
+
+def test_a_slope_needs_flights():
+    assert soak.slope([1.0] * 60) is None
+    assert soak.slope([0.5 * k for k in range(200)]) == pytest.approx(50.0)
+
+
+def test_a_process_is_sampled():
+    before = soak.sample(os.getpid())
+    with open(os.devnull):
+        after = soak.sample(os.getpid())
+    assert after.descriptors == before.descriptors + 1 and before.rss > 1.0 and before.threads >= 1
