@@ -1,4 +1,4 @@
-"""The controller: odometry in, rotor speeds out, one command per sample; trajectories, commands, services."""
+"""The controller: odometry in, one command per sample out, of the kind that the vehicle takes; trajectories, commands, services."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from math import isnan
 from perch_core.component import Component, Diagnostics, Input, Output, Service, Wake
 from perch_core.errors import ConfigError, PerchError
 from perch_core.values import (
-    NANOSECONDS, Ask, AtEnd, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample, LawChosen,
-    MotorCommand, OdometryState, PowerlineMap, TrajectoryOrder, nanoseconds, seconds)
+    NANOSECONDS, Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample,
+    LawChosen, MotorCommand, OdometryState, PowerlineMap, RatesThrust, TrajectoryOrder, nanoseconds, seconds)
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
+from perch_control.inner_loop import flown, led
 from perch_control.modes import Command, State, StepResult
 from perch_control.parameters import ControllerParameters
 from perch_control.stamp_guard import Stamp, StampGuard
@@ -30,7 +31,7 @@ _WORDS = 200                      # characters of a reason that are passed on
 
 
 class Controller(Component[ControllerParameters]):
-    """Answers every odometry sample with a motor command; what is not as planned leads to a hover, a recovery or a descent.
+    """Answers every odometry sample with a command to the vehicle; what is not as planned leads to a hover, a recovery or a descent.
 
     Silence: where odometry stops and the IMU goes on, IMU samples are answered by a descent without position; where both stop, the
     watchdog goes on with it.
@@ -50,6 +51,8 @@ class Controller(Component[ControllerParameters]):
     powerlines = Input(PowerlineMap, "powerlines")
     estimator = Input(EstimatorHealth, "estimator/status")
     motor_command = Output(MotorCommand, "motor_command")
+    rates_thrust = Output(RatesThrust, "rates_thrust_command")
+    attitude_thrust = Output(AttitudeThrust, "attitude_thrust_command")
     status = Output(ControllerStatus, "controller/status")
     reference = Output(ControlReference, "controller/reference")
     set_controller = Service(ChooseLaw, LawChosen, "set_controller")
@@ -62,7 +65,9 @@ class Controller(Component[ControllerParameters]):
             ConfigError: there is no such vehicle or law.
         """
         super().__init__(config)
-        self._assembly = Assembly(config, load_vehicle(config.vehicle))
+        vehicle = load_vehicle(config.vehicle)
+        self._takes_rates = vehicle.actuation.type == "rates_and_thrust"
+        self._assembly = Assembly(config, vehicle)
         self._stamps = StampGuard()
         self._spoken: int | None = None   # the host's time at which an input was last known to have come [ns]
         self._spoke, self._gone = False, False
@@ -224,8 +229,14 @@ class Controller(Component[ControllerParameters]):
     # -- outputs -----------------------------------------------------------------------------------------------------
 
     def _answer(self, stamp: int, result: StepResult) -> None:
-        """The motor command first; what people and the mission want to know at its own times, on one grid from the first answer on."""
-        self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
+        """The command to the vehicle first; what people and the mission want to know at its own times, on one grid from the first answer on."""
+        loop = result.loop
+        if loop is None:
+            self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
+        elif self._takes_rates:
+            self.rates_thrust(RatesThrust(stamp, result.armed, loop.w_B, loop.thrust))
+        else:
+            self.attitude_thrust(AttitudeThrust(stamp, result.armed, loop.q_WB, loop.w_B, loop.thrust))
         self._steps += 1
         if result.event:
             self.info(result.event)
@@ -271,5 +282,6 @@ class Controller(Component[ControllerParameters]):
 @lru_cache(maxsize=4)
 def _rehearse(params: ControllerParameters) -> None:
     """`dry_run`, once in a process: it loads what all controllers share."""
-    vehicle = load_vehicle(params.vehicle)
+    vehicle = flown(load_vehicle(params.vehicle))
+    params = led(params, vehicle)
     dry_run(vehicle, params.gain_set(vehicle.name), params.flight, params.l1)

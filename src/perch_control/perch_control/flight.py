@@ -18,7 +18,7 @@ from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.rotor_health import RotorHealth
-from perch_control.rotor_lag import RotorEstimate, thrusts
+from perch_control.rotor_lag import thrusts
 from perch_control.schedule import Schedule
 from perch_control.settings import GeometricGains
 from perch_control.smooth_position import SmoothPosition
@@ -26,6 +26,7 @@ from perch_control.supervisor import Supervisor
 from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 
 _SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
+_NOWHERE = (0.0,) * 6        # position and velocity of a descent that knows neither
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
@@ -143,7 +144,7 @@ class FlightController:
         if axes_of(m.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
         m.enter(State.ARMED, "armed")
-        m.rotors = RotorEstimate.at_idle(self.vehicle)
+        m.rotors = m.rotors.turning(self.vehicle.speed_min)
         m.ground = m.belief[2]
 
     def follow(self, order: Order) -> None:
@@ -259,15 +260,16 @@ class FlightController:
         setpoint = m.setpoint()
         self.position_error = norm(axpy(-1.0, setpoint.p, m.belief[0:3]))
         contact = m.time_to_contact
+        m.rotors = m.rotors.at(m.belief, self.vehicle)
         out = self.law.control(m.belief, m, m.rotors, self._compensation(contact), contact)
-        m.rotors = m.rotors.following(out.rotor_speed)
+        m.rotors = m.rotors.following(out.rotor_speed, out.w_C)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
         self._spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (self.margin - self._spare) if m.state is State.HOVERING else 0.0
         if self.supervisor.landed(setpoint):
             m.motors_off(self._lying, "landed, motors off")
             return self._idle()
-        return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event())
+        return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event(), m.rotors.sent)
 
     def _compensation(self, contact: float) -> tuple[float, ...]:
         """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
@@ -286,10 +288,11 @@ class FlightController:
         if m.blind.landed:
             m.motors_off(self._lying, "landed without position, motors off")
             return self._idle()
+        m.rotors = m.rotors.at((*_NOWHERE, *m.blind.attitude.q, *m.blind.attitude.w), self.vehicle)
         speed, thrust = m.blind.rotors(m.rotors.speed)
         m.rotors = m.rotors.following(speed)
         self.margin = (self.vehicle.thrust_max - max(thrust)) / self.vehicle.thrust_max
-        return StepResult(True, speed, wrench=m.blind.wanted(), margin=self.margin, event=self._event())
+        return StepResult(True, speed, wrench=m.blind.wanted(), margin=self.margin, event=self._event(), loop=m.rotors.sent)
 
     @property
     def _lying(self) -> State:
@@ -302,7 +305,7 @@ class FlightController:
         speed = (self.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
         m.rotors = m.rotors.following(speed)
         self.margin, self.position_error = 1.0, 0.0
-        return StepResult(armed, speed, event=self._event())
+        return StepResult(armed, speed, event=self._event(), loop=m.rotors.sent)
 
     def _event(self) -> str:
         text = "; ".join(self.maneuvers.events)

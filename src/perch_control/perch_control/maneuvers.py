@@ -12,11 +12,11 @@ from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import BRAKE_PEAK, Hold, brake
+from perch_control.inner_loop import stopped
 from perch_control.modes import FLYING, State
 from perch_control.monitors import reference_tilt_deg
 from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint, peak_thrust
-from perch_control.rotor_lag import RotorEstimate
 from perch_control.settings import GeometricGains
 from perch_control.weak_landing import WeakLanding
 
@@ -37,7 +37,7 @@ class Maneuvers:
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
         seen: stamp [s] and state of the last odometry sample that was accepted.
         unseen: IMU samples since then: time [s], rates [rad/s], specific force [m/s^2].
-        rotors: rotor speeds as the lag model has them.
+        rotors: rotor speeds, or the inner loop, as the lag model has them.
         source, start: running reference and the time at which it began [s].
         order, trajectory_id: trajectory that is being tracked; the id stays until another one or the motors' stop.
         attached_to: normal of the surface that carries the vehicle, None: none does.
@@ -54,7 +54,7 @@ class Maneuvers:
         self.belief: tuple[float, ...] = ()
         self.seen: tuple[float, tuple[float, ...]] = (0.0, ())
         self.unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=250)
-        self.rotors = RotorEstimate((0.0,) * 4, (0.0,) * 4)
+        self.rotors = stopped(vehicle)
         self.source: Any = Hold(Setpoint(_ZERO))
         self.start = 0.0
         self._asked: tuple[Any, float, Setpoint] = (None, 0.0, Setpoint(_ZERO))
@@ -110,7 +110,7 @@ class Maneuvers:
         """Stop the motors."""
         self.enter(state, message)
         self.blind, self.trajectory_id = None, 0
-        self.rotors = RotorEstimate((0.0,) * 4, (0.0,) * 4)
+        self.rotors = self.rotors.turning(0.0)
 
     def attach(self, message: str) -> None:
         """Stop the motors on a surface that carries the vehicle."""

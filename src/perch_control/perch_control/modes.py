@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
+from perch_control.inner_loop import LoopCommand
 from perch_control.reference import Setpoint
 from perch_core.errors import PerchError
 
@@ -51,6 +52,7 @@ class StepResult(NamedTuple):
         wrench: wanted thrust [N] and moments [N m], 4 floats.
         margin: (max - commanded) / max of the most loaded rotor.
         event: something happened in this step that people should read; empty: nothing.
+        loop: command to the vehicle's inner loop, None: it has none and takes rotor speeds.
     """
 
     armed: bool
@@ -62,3 +64,4 @@ class StepResult(NamedTuple):
     wrench: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     margin: float = 1.0
     event: str = ""
+    loop: LoopCommand | None = None

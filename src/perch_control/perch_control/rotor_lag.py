@@ -89,6 +89,19 @@ class RotorEstimate(NamedTuple):
         share = 1.0 if time_constant <= 0.0 else 1.0 - exp(-duration / time_constant)
         return RotorEstimate(approached(self.speed, self.command, share), self.command)
 
-    def following(self, command: tuple[float, float, float, float]) -> RotorEstimate:
+    def following(self, command: tuple[float, float, float, float], w_C: tuple[float, ...] = ()) -> RotorEstimate:
         """The same rotors with a new command."""
         return RotorEstimate(self.speed, command)
+
+    def turning(self, speed: float) -> RotorEstimate:
+        """All at one speed [rad/s]."""
+        return RotorEstimate((speed,) * 4, (speed,) * 4)
+
+    def at(self, state: tuple[float, ...], vehicle: Vehicle) -> RotorEstimate:
+        """The same rotors on a vehicle in some state, which does not matter to them."""
+        return self
+
+    @property
+    def sent(self) -> None:
+        """The command to an inner loop: rotors have none."""
+        return None

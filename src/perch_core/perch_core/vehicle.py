@@ -10,8 +10,9 @@ import numpy as np
 
 from perch_core import config, so3
 from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
-from perch_core.config import LARGEST, choice, label, quantity, text
+from perch_core.config import LARGEST, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
+from perch_core.extends import extended_mapping
 
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
@@ -77,6 +78,24 @@ class ImuConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Actuation:
+    """What the vehicle takes from the controller, and how what stands between that and the rotors answers.
+
+    An inner loop is modelled by `w' = (rate_gain w_cmd - w) / rate_lag` on each axis and `T' = (thrust_gain T_cmd - T) / thrust_lag`, on commands
+    that are `delay` old; an attitude loop asks it for the rates that are fed forward + attitude error / `attitude_lag`.
+    """
+
+    type: str = choice("rotor_speeds", options=("rotor_speeds", "rates_and_thrust", "attitude_and_thrust"))
+    delay: float = quantity(0.004, unit="s", low=0.0, high=0.1, doc="from a command's stamp to when the inner loop acts on it")
+    rate_lag: Vector3 = quantity((0.03, 0.03, 0.06), unit="s", above=0.0, high=1.0, doc="axes of B")
+    rate_gain: Vector3 = quantity((1.0, 1.0, 1.0), unit="-", above=0.1, high=10.0, doc="rate that is reached / commanded, axes of B")
+    rate_max: float = quantity(20.0, unit="rad/s", above=0.0, high=100.0, doc="greatest rate that may be commanded about an axis")
+    thrust_lag: float = quantity(0.03, unit="s", above=0.0, high=1.0)
+    thrust_gain: float = quantity(1.0, unit="-", above=0.1, high=10.0, doc="thrust that is reached / commanded")
+    attitude_lag: float = quantity(0.08, unit="s", above=0.0, high=1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Vehicle:
     """A quadrotor. Rotors in the order front-left, rear-left, rear-right, front-right unless the file says otherwise."""
 
@@ -101,6 +120,7 @@ class Vehicle:
     propeller_radius: float = quantity(0.0, unit="m", low=0.0, high=2.0)
     cameras: dict[str, CameraConfig] = text()
     imu: ImuConfig = text()
+    actuation: Actuation = part(Actuation, doc="what it takes: rotor speeds, or the set points of an inner loop")
 
     def __post_init__(self) -> None:
         least, middle, most = sorted(self.inertia)
@@ -163,9 +183,9 @@ class Vehicle:
 
 
 def load_vehicle(name_or_path: str | Path) -> Vehicle:
-    """The vehicle of `config/vehicles/<name>.yaml`, or of a file.
+    """The vehicle of `config/vehicles/<name>.yaml`, or of a file, with all that it extends.
 
     Raises:
         ConfigError: no such vehicle, or a value that is refused.
     """
-    return config.load(Vehicle, config.find("vehicles", name_or_path))
+    return config.from_mapping(Vehicle, extended_mapping("vehicles", name_or_path), str(config.find("vehicles", name_or_path)))

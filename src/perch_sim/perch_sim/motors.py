@@ -54,6 +54,10 @@ class Motors:
         if armed:
             self._speeds = np.array([min(max(s, self._low), self._high) for s in values])
 
+    def aim(self, speeds: np.ndarray) -> None:
+        """Speeds of an inner loop, within the armed range (4,) [rad/s]: they count as long as its last command does."""
+        self._speeds = speeds
+
     def target(self, now: int) -> np.ndarray:
         """Speeds that the rotors aim at, (4,) [rad/s]."""
         if self._armed and now - self._received > self.timeout:

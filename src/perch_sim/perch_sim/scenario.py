@@ -98,6 +98,7 @@ class Disturbance:
     inertia_factor: float = quantity(1.0, low=0.3, high=3.0)
     rotor_thrust_factor: Vector4 = quantity((1.0, 1.0, 1.0, 1.0), low=0.0, high=1.5)
     motor_lag_factor: float = quantity(1.0, low=0.1, high=5.0)
+    loop_lag_factor: float = quantity(1.0, low=0.1, high=5.0, doc="of the inner loop, where the vehicle has one")
     surface_effect: bool = quantity(False, doc="ground and wall effect near surfaces")
 
 

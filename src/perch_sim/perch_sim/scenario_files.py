@@ -1,56 +1,13 @@
-"""Scenario files that build on each other: `extends: line_80` takes over what the file itself does not say."""
+"""Scenario files, which may build on each other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from perch_core import config
-from perch_core.errors import ConfigError
-
-EXTENDS = "extends"
-LONGEST_CHAIN = 10
+from perch_core.extends import extended_mapping
 
 
 def scenario_mapping(name_or_path: str | Path) -> dict[str, Any]:
-    """What a scenario says with all that it extends: mappings are merged key by key, everything else is replaced.
-
-    Args:
-        name_or_path: a name in `config/scenarios`, or a file. So is the value of `extends`; a file is found from the folder of the
-            one that extends it.
-
-    Raises:
-        ConfigError: no such file, one that is no mapping, or files that extend each other in a circle; with the chain of files.
-    """
-    return _merged(config.find("scenarios", name_or_path), ())
-
-
-def _merged(path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
-    source = " extends ".join(str(file) for file in (*chain, path))
-    if path.resolve() in (file.resolve() for file in chain):
-        raise ConfigError(source, EXTENDS, "the files extend each other in a circle")
-    if len(chain) == LONGEST_CHAIN:
-        raise ConfigError(source, EXTENDS, f"more than {LONGEST_CHAIN} files extend each other")
-    content = config.read_yaml(path) or {}
-    if not isinstance(content, dict):
-        raise ConfigError(source, "", f"{content!r} is not a mapping")
-    if EXTENDS not in content:
-        return content
-    base = content.pop(EXTENDS)
-    if not isinstance(base, str):
-        raise ConfigError(source, EXTENDS, f"{base!r} is neither a name in config/scenarios nor a file")
-    try:
-        found = config.find("scenarios", path.parent / base if base.endswith((".yaml", ".yml")) else base)
-    except ConfigError as error:
-        raise ConfigError(source, EXTENDS, str(error)) from None
-    return _over(_merged(found, (*chain, path)), content)
-
-
-def _over(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
-    """`content` over `base`."""
-    out = dict(base)
-    for key, value in content.items():
-        below = out.get(key)
-        out[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
-    return out
+    """What a scenario (a name in `config/scenarios`, or a file) says with all that it extends; see `extended_mapping`."""
+    return extended_mapping("scenarios", name_or_path)

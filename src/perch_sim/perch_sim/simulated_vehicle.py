@@ -1,8 +1,9 @@
-"""The simulated vehicle as a component: motor commands in; IMU, cameras, truth and contact out. It owns simulation time."""
+"""The simulated vehicle as a component: commands to its motors or its inner loop in; IMU, cameras, truth and contact out. It owns simulation time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +14,8 @@ from perch_core.errors import ConfigError
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
-    NANOSECONDS, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RotorState, Transform,
-    nanoseconds, rotated)
+    NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
+    Transform, nanoseconds, rotated)
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing, DrawnInProcesses
@@ -46,6 +47,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
     config_type = VehicleParameters
 
     motor_command = Input(MotorCommand, "motor_command")
+    rates_thrust = Input(RatesThrust, "rates_thrust_command")
+    attitude_thrust = Input(AttitudeThrust, "attitude_thrust_command")
     pace = Wake(CONTROL_PERIOD)
     imu = Output(ImuSample, "imu/data_raw")
     truth = Output(OdometryState, "ground_truth/odometry")
@@ -102,8 +105,27 @@ class SimulatedVehicle(Component[VehicleParameters]):
 
     def on_motor_command(self, command: MotorCommand) -> None:
         """Speeds that count from the next step on."""
+        self._take("rotor_speeds", command, command.rotor_speed)
+
+    def on_rates_thrust(self, command: RatesThrust) -> None:
+        """Body rates and thrust for the inner loop."""
+        self._take("rates_and_thrust", command, command.w_B, command.thrust)
+
+    def on_attitude_thrust(self, command: AttitudeThrust) -> None:
+        """Attitude and thrust for the inner loop."""
+        self._take("attitude_and_thrust", command, command.w_B, command.thrust, command.q_WB)
+
+    def _take(self, kind: str, command: MotorCommand | RatesThrust | AttitudeThrust, *content: Any) -> None:
+        """Hand a command to the motors or to the inner loop, or say why not."""
+        simulation = self.simulation
         try:
-            self.simulation.motors.command(self.time, command.armed, command.rotor_speed)
+            if kind != simulation.vehicle.actuation.type:
+                raise MotorCommandError(f"{simulation.vehicle.name} takes {simulation.vehicle.actuation.type}, not {kind}: ignored")
+            if simulation.loop is None:
+                simulation.motors.command(self.time, command.armed, *content)
+            else:
+                simulation.loop.command(self.time, *content)
+                simulation.motors.command(self.time, command.armed, simulation.plant.rotor_speed)
         except MotorCommandError as error:
             self._counts["commands_refused"] += 1
             self.log(LogLine("error", str(error), 1.0))

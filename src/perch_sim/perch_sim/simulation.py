@@ -27,6 +27,7 @@ from perch_sim.camera_timing import CameraTiming
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing
 from perch_sim.imu import Imu, ImuSample
+from perch_sim.inner_loop import InnerLoop
 from perch_sim.lockstep.tasks import START
 from perch_sim.motors import Motors
 from perch_sim.obstacles import pad_surface
@@ -71,6 +72,7 @@ class Simulation:
                               f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout), 0
+        self.loop = None if self.vehicle.actuation.type == "rotor_speeds" else InnerLoop(self.vehicle, scenario.disturbance.loop_lag_factor)
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
@@ -106,6 +108,8 @@ class Simulation:
         if self.motors.starts != self._starts:
             self._starts = self.motors.starts
             self.plant.release()
+        if self.loop is not None:
+            self.motors.aim(self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed))
         result = self.plant.advance(self.motors.target(self.time))
         for state in result.states:
             self._history.append(state)

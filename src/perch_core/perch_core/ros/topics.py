@@ -25,8 +25,8 @@ from perch_core.ros.qos import Qos
 from perch_core.values import NANOSECONDS
 from perch_msgs.action import Perch
 from perch_msgs.msg import (
-    Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RotorState,
-    TargetDetection, Trajectory, VioState)
+    AttitudeThrust, Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RatesThrust,
+    RotorState, TargetDetection, Trajectory, VioState)
 from perch_msgs.srv import PlanPerch, PlanPowerline, SetController
 from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
@@ -91,6 +91,9 @@ TOPICS = (
     Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
     Topic("motor_command", MotorCommand, qos.SENSOR, flight.motor_message, flight.motor_value,
           fast.pack_motor, fast.unpack_motor),
+    Topic("rates_thrust_command", RatesThrust, qos.SENSOR, flight.rates_message, flight.rates_value, fast.pack_rates, fast.unpack_rates),
+    Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, flight.attitude_message, flight.attitude_value,
+          fast.pack_attitude, fast.unpack_attitude),
     Topic("rotor_state", RotorState, qos.SENSOR, states.rotors_message, states.rotors_value, observed=True),
     Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
     Topic("ground_truth/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,

@@ -1,7 +1,8 @@
 """Values that cross ports, each with frames, units and shapes. They are immutable: whoever receives one may keep it."""
 
 from perch_core.values.flight import (
-    Ask, AtEnd, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, LawChosen, MotorCommand, TrajectoryOrder)
+    Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, LawChosen, MotorCommand, RatesThrust,
+    TrajectoryOrder)
 from perch_core.values.markers import Marker, Markers, Shape
 from perch_core.values.mission import PerchFeedback, PerchGoal, PerchResult
 from perch_core.values.perching import MappedPowerline, PowerlineMap, TargetPose, TargetSighting
@@ -11,10 +12,10 @@ from perch_core.values.stamps import NANOSECONDS, nanoseconds, seconds
 from perch_core.values.state import Contact, EstimatorHealth, InertialState, OdometryState, PoseStamped, RotorState, rotated
 
 __all__ = [
-    "NANOSECONDS", "Ask", "AtEnd", "CameraImage", "CameraModel", "Certificate", "ChooseLaw", "CompressedPixels", "Contact",
+    "NANOSECONDS", "Ask", "AtEnd", "AttitudeThrust", "CameraImage", "CameraModel", "Certificate", "ChooseLaw", "CompressedPixels", "Contact",
     "ControlReference", "ControllerCommand", "ControllerStatus", "Done", "EstimatorHealth", "ImuSample", "InertialState", "LawChosen",
     "MappedPowerline", "Marker", "Markers", "MotorCommand", "OdometryState", "PerchFeedback", "PerchGoal", "PerchPlan",
-    "PerchPlanRequest", "PerchResult", "PoseStamped", "PowerlineMap", "PowerlinePlan", "PowerlinePlanRequest", "RotorState",
+    "PerchPlanRequest", "PerchResult", "PoseStamped", "PowerlineMap", "PowerlinePlan", "PowerlinePlanRequest", "RatesThrust", "RotorState",
     "Serialized", "Shape", "StampedTransform", "TargetPose", "TargetSighting", "TrajectoryOrder", "Transform", "nanoseconds", "rotated",
     "seconds",
 ]

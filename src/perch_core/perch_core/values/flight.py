@@ -64,6 +64,26 @@ class MotorCommand(NamedTuple):
     rotor_speed: Floats
 
 
+class RatesThrust(NamedTuple):
+    """Body rates [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner rate loop, for the step with this stamp [ns]."""
+
+    stamp: int
+    armed: bool
+    w_B: Floats
+    thrust: float
+
+
+class AttitudeThrust(NamedTuple):
+    """Attitude xyzw, 4 floats, body rates to feed forward [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner attitude loop,
+    for the step with this stamp [ns]."""
+
+    stamp: int
+    armed: bool
+    q_WB: Floats
+    w_B: Floats
+    thrust: float
+
+
 class ControllerStatus(NamedTuple):
     """State of the controller and its supervisor; fields as in perch_msgs/ControllerStatus."""
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from nav_msgs.msg import Odometry
 from perch_core.ros.cdr import Layout
-from perch_core.values import NANOSECONDS, ImuSample, MotorCommand, OdometryState
+from perch_core.values import NANOSECONDS, AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
+from perch_msgs.msg import AttitudeThrust as AttitudeMessage
 from perch_msgs.msg import MotorCommand as MotorMessage
+from perch_msgs.msg import RatesThrust as RatesMessage
 from sensor_msgs.msg import Imu
 
-_IMU, _ODOMETRY, _MOTOR = Layout(Imu), Layout(Odometry), Layout(MotorMessage)
+_IMU, _ODOMETRY, _MOTOR, _RATES, _ATTITUDE = map(Layout, (Imu, Odometry, MotorMessage, RatesMessage, AttitudeMessage))
 _NO_ORIENTATION = np.r_[0.0, 0.0, 0.0, 1.0, -1.0, np.zeros(8)].tobytes()  # attitude and its covariance, which says that there is none
 _NO_COVARIANCE = np.zeros(9).tobytes()
 
@@ -54,3 +56,25 @@ def unpack_motor(data: bytes) -> MotorCommand:
     """The command of a `perch_msgs/MotorCommand`."""
     (sec,), (nanosec,), _, (armed,), speeds = _MOTOR.unpack(data)
     return MotorCommand(sec * NANOSECONDS + nanosec, armed, tuple(speeds.tolist()))
+
+
+def pack_rates(command: RatesThrust) -> bytes:
+    """`perch_msgs/RatesThrust` of a command."""
+    return _RATES.pack(*_stamp(command.stamp), "base_link", (command.armed,), (*map(float, command.w_B), float(command.thrust)))
+
+
+def unpack_rates(data: bytes) -> RatesThrust:
+    """The command of a `perch_msgs/RatesThrust`."""
+    (sec,), (nanosec,), _, (armed,), x = _RATES.unpack(data)
+    return RatesThrust(sec * NANOSECONDS + nanosec, armed, tuple(x[:3].tolist()), float(x[3]))
+
+
+def pack_attitude(command: AttitudeThrust) -> bytes:
+    """`perch_msgs/AttitudeThrust` of a command."""
+    return _ATTITUDE.pack(*_stamp(command.stamp), "map", (command.armed,), (*map(float, command.q_WB), *map(float, command.w_B), float(command.thrust)))
+
+
+def unpack_attitude(data: bytes) -> AttitudeThrust:
+    """The command of a `perch_msgs/AttitudeThrust`."""
+    (sec,), (nanosec,), _, (armed,), x = _ATTITUDE.unpack(data)
+    return AttitudeThrust(sec * NANOSECONDS + nanosec, armed, tuple(x[:4].tolist()), tuple(x[4:7].tolist()), float(x[7]))

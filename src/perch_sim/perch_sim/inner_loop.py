@@ -1,0 +1,128 @@
+"""An ideal rate or attitude loop in front of the rotors: first-order lags on the true state, and a mixer that saturates.
+
+It knows the vehicle as its file says, its own rotors' speeds and the true rates, and leads its rotors so far that moment and thrust are there
+after a control period wherever the rotors can reach them. Written apart from `perch_control.inner_loop`, which only has a model of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from perch_core.jit import compiled
+from perch_core.timing import CONTROL_PERIOD
+from perch_core.vehicle import Vehicle
+from perch_sim.motors import MotorCommandError
+
+
+@compiled
+def mixed(thrust, moment, mixing, low, high):
+    """Rotor thrusts within their bounds: roll and pitch are scaled together, then yaw, then the collective thrust gives way.
+
+    Args:
+        thrust: collective [N].
+        moment: in B [N m], (3,).
+        mixing: (thrust, moments) to rotor thrusts, (4, 4).
+        low, high: of a rotor [N].
+
+    Returns:
+        (4,) [N].
+    """
+    tilt = mixing[:, 1] * moment[0] + mixing[:, 2] * moment[1]
+    span = tilt.max() - tilt.min()
+    if span > high - low:
+        tilt *= (high - low) / span
+    yaw, share = mixing[:, 3] * moment[2], 1.0
+    for i in range(4):
+        for j in range(4):
+            if yaw[i] - yaw[j] > 1e-12:
+                share = min(share, max((high - low - tilt[i] + tilt[j]) / (yaw[i] - yaw[j]), 0.0))
+    turn = tilt + share * yaw
+    least, most = ((low - turn) / mixing[:, 0]).max(), ((high - turn) / mixing[:, 0]).min()
+    return np.minimum(np.maximum(turn + mixing[:, 0] * min(max(thrust, least), most), low), high)
+
+
+@compiled
+def rates_of_attitude(q, wanted, rates, lag):
+    """Body rates that an attitude loop asks for: those fed forward, and the rotation to the wanted attitude over `lag`, (3,) [rad/s]."""
+    # conj(q) * wanted, on the short way round.
+    w = q[3] * wanted[3] + q[0] * wanted[0] + q[1] * wanted[1] + q[2] * wanted[2]
+    x = q[3] * wanted[0] - q[0] * wanted[3] - q[1] * wanted[2] + q[2] * wanted[1]
+    y = q[3] * wanted[1] - q[1] * wanted[3] - q[2] * wanted[0] + q[0] * wanted[2]
+    z = q[3] * wanted[2] - q[2] * wanted[3] - q[0] * wanted[1] + q[1] * wanted[0]
+    length = math.sqrt(x * x + y * y + z * z)
+    k = 2.0 * math.atan2(length, abs(w)) / max(length, 1e-12) * (1.0 if w >= 0.0 else -1.0) / lag
+    return rates + k * np.array((x, y, z))
+
+
+@compiled
+def targets(w, speeds, rates, thrust, J, mixing, coefficient, low, high, motor_lag, lags, period):
+    """Speeds that the motors aim at, (4,) [rad/s].
+
+    Args:
+        w: body rates (3,) [rad/s].
+        speeds: of the rotors (4,) [rad/s].
+        rates, thrust: wanted (3,) [rad/s], collective [N].
+        J: principal moments of inertia (3,) [kg m^2].
+        mixing, coefficient, low, high: of the rotors; speeds [rad/s].
+        motor_lag: time constant of the rotors [s].
+        lags: of the rates and the thrust (4,) [s].
+        period: between two calls [s].
+    """
+    moment = J * (rates - w) / lags[:3]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        moment[i] += (J[k] - J[j]) * w[j] * w[k]
+    now = coefficient * (speeds * speeds).sum()
+    f = mixed(now + (thrust - now) * (1.0 - math.exp(-period / lags[3])), moment, mixing, coefficient * low * low, coefficient * high * high)
+    wanted = np.sqrt(f / coefficient)
+    if motor_lag > 0.0:
+        wanted = speeds + (wanted - speeds) / (1.0 - math.exp(-period / motor_lag))
+    return np.minimum(np.maximum(wanted, low), high)
+
+
+class InnerLoop:
+    """Takes body rates, or attitudes, with thrust; says what the motors aim at."""
+
+    def __init__(self, vehicle: Vehicle, lag_factor: float = 1.0) -> None:
+        """
+        Args:
+            vehicle: its file, with the loop that it has.
+            lag_factor: how much slower the real loop is than the file says.
+        """
+        a = vehicle.actuation
+        self._delay, self._lags = round(a.delay * 1e9), lag_factor * np.array([*a.rate_lag, a.thrust_lag])
+        self._gain, self._rate_max, self._attitude_lag = np.array([*a.rate_gain, a.thrust_gain]), a.rate_max, lag_factor * a.attitude_lag
+        self._mass = vehicle.mass
+        self._rotors = (np.array(vehicle.inertia), np.linalg.inv(vehicle.allocation), vehicle.thrust_coefficient, vehicle.speed_min,
+                        vehicle.speed_max, vehicle.motor_time_constant)
+        self._coming: deque[tuple[int, np.ndarray, np.ndarray | None]] = deque()
+        self._rates, self._attitude = np.zeros(4), None
+
+    def command(self, now: int, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
+        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop.
+
+        Raises:
+            MotorCommandError: not finite, or no attitude.
+        """
+        values = np.array([*rates, max(thrust, 0.0) * self._mass], float)
+        if not np.isfinite(values).all() or attitude is not None and not abs(np.linalg.norm(attitude) - 1.0) < 1e-2:
+            raise MotorCommandError(f"inner loop: rates {list(rates)}, thrust {thrust}, attitude {attitude} are no command: ignored")
+        self._coming.append((now + self._delay, values, None if attitude is None else np.array(attitude, float)))
+
+    def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+        """What the motors aim at in the period that begins now [ns], (4,) [rad/s].
+
+        Args:
+            now: [ns].
+            x: true state (13,), see `dynamics`.
+            speeds: of the rotors (4,) [rad/s].
+        """
+        while self._coming and self._coming[0][0] <= now:
+            _, self._rates, self._attitude = self._coming.popleft()
+        rates = self._rates[:3] if self._attitude is None else rates_of_attitude(x[3:7], self._attitude, self._rates[:3], self._attitude_lag)
+        rates = self._gain[:3] * np.clip(rates, -self._rate_max, self._rate_max)
+        return targets(x[10:13], speeds, rates, self._gain[3] * self._rates[3], *self._rotors, self._lags, CONTROL_PERIOD)
