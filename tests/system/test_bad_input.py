@@ -194,13 +194,13 @@ def test_the_mission_refuses_goals_that_are_none(asker):
     asker.wait(client.server_is_ready)
     powerline = {"mode": Perch.Goal.MODE_POWERLINE}
     for fields, path, value, words in (
-            ({}, "mode", 9, "mode 9 is none of SURFACE"), ({}, "takeoff_height", math.inf, "takeoff_height inf m is outside [0.3, 10]"),
-            ({}, "takeoff_height", 0.1, "takeoff_height 0.1 m"), ({}, "search_timeout", -1.0, "search_timeout -1 s is outside (0, 300]"),
-            ({}, "inclination_hint", 7.0, "inclination_hint 7 rad is outside [0, pi]"),
-            ({}, "search_pose.pose.position.x", math.nan, "search_pose: position is not finite"),
-            ({}, "search_pose.pose.orientation.w", 0.2, "search_pose: position is not finite, or the quaternion"),
-            ({}, "search_pose.header.frame_id", "odom", "frame_id 'odom' is not 'map'"),
-            (powerline, "perch_point.z", math.nan, "perch_point is not finite"), (powerline, "perch_pitch", math.nan, "perch_pitch nan rad")):
+            ({}, "mode", 9, "mode 9 is none of SURFACE"), ({}, "takeoff_height", math.inf, "takeoff_height: inf is outside [0.3, 10] m"),
+            ({}, "takeoff_height", 0.1, "takeoff_height: 0.1 is outside"), ({}, "search_timeout", -1.0, "search_timeout: -1 is outside [0.001, 300] s"),
+            ({}, "inclination_hint", 7.0, "inclination_hint: 7 is outside [0, 3.14159] rad"),
+            ({}, "search_pose.pose.position.x", math.nan, "search_position: nan is not finite"),
+            ({}, "search_pose.pose.orientation.w", 0.2, "search_attitude: norm 0.2000 is not 1"),
+            ({}, "search_pose.header.frame_id", "odom", "search_frame: 'odom' is not 'map'"),
+            (powerline, "perch_point.z", math.nan, "perch_point: nan is not finite"), (powerline, "perch_pitch", math.nan, "perch_pitch: nan is")):
         goal = Perch.Goal(takeoff_height=math.nan, search_timeout=math.nan, inclination_hint=math.nan, **fields)
         if path.startswith("search_pose"):
             goal.search_pose.header.frame_id = "map"

@@ -302,14 +302,14 @@ def too_long(flight):
 
 @pytest.mark.parametrize("make, changes, word", [
     (None, {"contact_time": NAN}, "contact_time"), (None, {"contact_time": -1.0}, "contact_time"), (None, {"recovery_start": NAN}, "recovery_start"),
-    (None, {"recovery_start": 1e9}, "recovery_start"), (None, {"at_end": 9}, "at_end 9"), (None, {"id": -3}, "id -3"),
-    (many_coefficients, {}, "degree 1099"), (with_rates, {}, "w of 1e+09"), (far_away, {}, "position"), (in_no_time, {}, "velocity"),
-    (too_long, {}, "lasts"), (lambda f: samples(f, q=np.tile([0.0, 0.0, 0.0, 0.9], (40, 1))), {}, "norm 0.9"),
-    (lambda f: samples(f, rotor_thrust=np.full((40, 4), 1e6)), {}, "rotor thrust"),
-    (lambda f: samples(f, times=np.linspace(-1.0, 1.0, 40)), {}, "before its start"),
-    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=NAN), {}, "start time"),
-    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=1e12), {}, "future"),
-    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=-1e12), {}, "past"),
+    (None, {"recovery_start": 1e9}, "recovery_start"), (None, {"at_end": 9}, "at_end: 9"), (None, {"id": -3}, "id: -3"),
+    (many_coefficients, {}, "degree: 1099"), (with_rates, {}, "w: 1e+09"), (far_away, {}, "position"), (in_no_time, {}, "durations"),
+    (too_long, {}, "duration"), (lambda f: samples(f, q=np.tile([0.0, 0.0, 0.0, 0.9], (40, 1))), {}, "norm 0.9"),
+    (lambda f: samples(f, rotor_thrust=np.full((40, 4), 1e6)), {}, "rotor_thrust"),
+    (lambda f: samples(f, times=np.linspace(-1.0, 1.0, 40)), {}, "times: -1"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=NAN), {}, "start_time"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=1e12), {}, "start_time"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=-1e12), {}, "start_time"),
     (lambda f: f.path((2, 0, 0.6), (3, 0, 0.6), 2.0), {}, "away"),
 ])
 def test_nonsense_on_trajectory_is_refused_and_said(make, changes, word):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
 
 import numpy as np
 
@@ -12,15 +11,11 @@ from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_core import bernstein
 from perch_core.errors import PerchError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.values import AtEnd, TrajectoryOrder
+from perch_core.values import AtEnd, TrajectoryOrder, limits
 from perch_core.vehicle import Vehicle
 
-_PARTS, _DEGREE, _SAMPLES = 1000, 20, 100_000  # as many segments, of this degree, or samples, as a trajectory may have
-_LONGEST, _LONGEST_PERCH = 3600.0, 120.0       # [s]; the way to a contact is rehearsed, period by period
-_LONGEST_CONTACT = 60.0                        # a contact is awaited for so long at most [s]
-_EARLIEST = 60.0                               # a trajectory is not kept for longer before its start [s]
-_FAR = 1e5                                     # [m]
-_FAST = {"v": 1e3, "a": 1e4, "w": 100.0, "dw": 1e5}  # more of the velocity [m/s], acceleration [m/s^2], ... is nonsense
+_LONGEST_PERCH = 120.0  # the way to a contact is rehearsed, period by period [s]
+_EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
 
 
 class TrajectoryRefused(PerchError):
@@ -59,19 +54,10 @@ def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
         TrajectoryRefused: with the value and what is allowed.
     """
     trajectory, duration = order.trajectory, order.trajectory.duration
-    try:
-        at_end = AtEnd(order.at_end)
-    except ValueError:
-        raise TrajectoryRefused(f"at_end {order.at_end} is not one of 0..3") from None
-    if not 0 <= order.id < 2**32:
-        raise TrajectoryRefused(f"id {order.id} is outside [0, 2^32)")
-    if not isfinite(trajectory.start_time):
-        raise TrajectoryRefused(f"start time {trajectory.start_time} is not finite")
-    longest = _LONGEST_PERCH if at_end is AtEnd.CONTACT else _LONGEST
-    if not 0.0 < duration <= longest:
-        raise TrajectoryRefused(f"lasts {duration:g} s; at most {longest:g} s is allowed")
-    if not 0.0 <= order.contact_time <= _LONGEST_CONTACT:
-        raise TrajectoryRefused(f"contact_time {order.contact_time} s is outside [0, {_LONGEST_CONTACT:g}]")
+    if said := limits.problem(order):
+        raise TrajectoryRefused(said)
+    if order.at_end == AtEnd.CONTACT and duration > _LONGEST_PERCH:
+        raise TrajectoryRefused(f"lasts {duration:g} s; at most {_LONGEST_PERCH:g} s is allowed")
     if not order.recovery_start <= duration + 1e-6:
         raise TrajectoryRefused(f"recovery_start {order.recovery_start} s is not within the trajectory's {duration:.3f} s")
     if isinstance(trajectory, FlatTrajectory):
@@ -81,29 +67,21 @@ def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
 
 
 def _check_polynomials(trajectory: FlatTrajectory) -> None:
-    """Refuse too many or too high polynomials, and places, speeds and accelerations that nothing flies at."""
+    """Refuse places, speeds and accelerations that nothing flies at."""
     c, T = trajectory.coefficients, trajectory.durations[:, None, None]
-    if len(c) > _PARTS or trajectory.degree > _DEGREE:
-        raise TrajectoryRefused(f"{len(c)} segments of degree {trajectory.degree}; at most {_PARTS} of degree {_DEGREE} are allowed")
+    _check_size("position", c, limits.POSITION.high)
     rate = bernstein.derivative(c) / T if trajectory.degree else np.zeros(1)
     second = bernstein.derivative(rate) / T if trajectory.degree > 1 else np.zeros(1)
-    for name, values, limit in (("position", c, _FAR), ("velocity", rate, _FAST["v"]), ("acceleration", second, _FAST["a"])):
-        _check_size(name, values, limit)
+    for name, values, limit in (("velocity", rate, limits.VELOCITY), ("acceleration", second, limits.ACCELERATION)):
+        _check_size(name, values, limit.high)
 
 
 def _check_samples(trajectory: SampledTrajectory, vehicle: Vehicle) -> None:
-    """Refuse too many samples, no attitudes, and states that nothing flies in."""
-    if len(trajectory.times) > _SAMPLES:
-        raise TrajectoryRefused(f"{len(trajectory.times)} samples; at most {_SAMPLES} are allowed")
-    if trajectory.times[0] < 0.0:
-        raise TrajectoryRefused(f"begins {-trajectory.times[0]:g} s before its start")
+    """Refuse no attitudes, and thrusts that the vehicle does not have."""
     norms = np.linalg.norm(trajectory.q, axis=-1)
     if not np.abs(norms - 1.0).max() <= 1e-3:
         k = int(np.abs(norms - 1.0).argmax())
         raise TrajectoryRefused(f"quaternion of sample {k} has norm {norms[k]:.4f}, not 1")
-    _check_size("position", trajectory.p, _FAR)
-    for name, limit in _FAST.items():
-        _check_size(name, getattr(trajectory, name), limit)
     _check_size("rotor thrust", trajectory.rotor_thrust, 2.0 * vehicle.thrust_max)
 
 

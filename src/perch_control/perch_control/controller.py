@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import fields
 from functools import lru_cache
-from math import isnan
 
 from perch_core.component import Component, Diagnostics, Input, Output, Service, Wake
 from perch_core.errors import ConfigError, PerchError
@@ -26,7 +25,6 @@ DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
 FRAMES = ("imu_link", "base_link", "")  # whose axes are those of B
 STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
 GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
-_ABSURD = 1e8                     # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
 _WORDS = 200                      # characters of a reason that are passed on
 
 
@@ -44,10 +42,10 @@ class Controller(Component[ControllerParameters]):
     changeable = tuple(field.name for field in fields(ControllerParameters) if field.name != "vehicle")
 
     imu = Input(ImuSample, "imu/data_raw")
-    odometry = Input(OdometryState, "odometry")
-    trajectory = Input(TrajectoryOrder, "trajectory")
-    recovery = Input(TrajectoryOrder, "recovery")
-    command = Input(ControllerCommand, "controller/command")
+    odometry = Input(OdometryState, "odometry", answered=True)
+    trajectory = Input(TrajectoryOrder, "trajectory", answered=True)
+    recovery = Input(TrajectoryOrder, "recovery", answered=True)
+    command = Input(ControllerCommand, "controller/command", answered=True)
     powerlines = Input(PowerlineMap, "powerlines")
     estimator = Input(EstimatorHealth, "estimator/status")
     motor_command = Output(MotorCommand, "motor_command")
@@ -100,10 +98,6 @@ class Controller(Component[ControllerParameters]):
         """Known to the flight; answered where odometry has stopped."""
         if sample.frame not in FRAMES:
             self.warn(f"imu/data_raw: frame {sample.frame!r} is none of imu_link, base_link: ignored", every=1.0)
-            return
-        (a, b, c), (x, y, z) = sample.w_B, sample.f_B
-        if not a * a + b * b + c * c + x * x + y * y + z * z < _ABSURD:
-            self.warn("imu/data_raw: not finite, or beyond any sensor's range: ignored", every=1.0)
             return
         if not self._believed(sample.stamp, "imu/data_raw"):
             return
@@ -204,8 +198,8 @@ class Controller(Component[ControllerParameters]):
     def on_estimator(self, health: EstimatorHealth) -> None:
         """An estimator that is not well ends what is flown."""
         newest = self._stamps.newest
-        if not 0 <= health.state <= 3 or isnan(health.vio_age) or (newest is not None and abs(newest - health.stamp) > STALE):
-            self.warn(f"estimator/status: state {health.state} at {seconds(health.stamp):.3f} s: ignored", every=1.0)
+        if newest is not None and abs(newest - health.stamp) > STALE:
+            self.warn(f"estimator/status: of {seconds(health.stamp):.3f} s, not of the present ({seconds(newest):.3f} s): ignored", every=1.0)
             return
         self.flight.supervisor.estimator(health.state, float(health.vio_age), health.message[:_WORDS])
 

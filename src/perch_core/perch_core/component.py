@@ -16,6 +16,9 @@ components, and a component cannot tell which one it has:
             ...
             self.odometry(state)
 
+What is beyond the limits of its type (`perch_core.values.limits`) never reaches `on_<name>`: it is refused at the door, with one
+warning that names channel, field, value and range, whichever host brings it.
+
 A port's *channel* is the topic's relative name. `{name}` in it stands for the parameter `name` of the component. Which ROS
 message a channel carries, with which QoS, and how it becomes a value, is written once per channel in `perch_core.ros.topics`.
 """
@@ -24,9 +27,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import wraps
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from perch_core.errors import PerchError
+from perch_core.values.limits import LIMITS, problem
 
 C = TypeVar("C")
 V = TypeVar("V")
@@ -57,16 +62,17 @@ class _Port:
 class Input(_Port, Generic[V]):
     """Values that the component takes by `on_<name>(value)`, in the order in which the host has them."""
 
-    def __init__(self, value: type[V], channel: str, *, lazy: bool = False) -> None:
+    def __init__(self, value: type[V], channel: str, *, lazy: bool = False, answered: bool = False) -> None:
         """
         Args:
             value: type of the values.
             channel: relative name of the topic.
             lazy: values need not be delivered when they arrive, only before the next input that is not lazy, and every few
                 hundredths of a second: a message that wakes a process costs 50 to 100 us, one that is taken with another 5.
+            answered: the component refuses nonsense itself, because it answers it.
         """
         super().__init__(channel)
-        self.value, self.lazy = value, lazy
+        self.value, self.lazy, self.answered = value, lazy, answered
 
 
 class Output(_Port, Generic[V]):
@@ -241,6 +247,14 @@ class Component(Generic[C]):
     log = Output(LogLine, "rosout")
     diagnostics = Output(Diagnostics, "/diagnostics")
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Put a door before each handler of values that have limits."""
+        super().__init_subclass__(**kwargs)
+        for port in ports(cls, Input):
+            take = vars(cls).get(f"on_{port.name}")
+            if take is not None and port.value in LIMITS and not port.answered:
+                setattr(cls, f"on_{port.name}", _behind_a_door(port, take))
+
     def __init__(self, config: C) -> None:
         """
         Raises:
@@ -282,6 +296,17 @@ class Component(Generic[C]):
     def warn(self, text: str, every: float = 0.0) -> None:
         """Log a warning, at most one of its kind in `every` seconds."""
         self.log(LogLine("warning", text, every))
+
+
+def _behind_a_door(port: Input[V], take: Callable[[Any, V], None]) -> Callable[[Any, V], None]:
+    @wraps(take)
+    def taken(self: Component[Any], value: V) -> None:
+        if said := problem(value):
+            self.warn(f"{port.channel(self)}: {said}: refused", every=1.0)
+        else:
+            take(self, value)
+
+    return taken
 
 
 P = TypeVar("P", bound=_Port)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite
 
 from perch_core.component import Component, Input, Output, Wake
 from perch_core.config import quantity, text
@@ -64,26 +62,13 @@ class Description(Component[DescriptionParameters]):
         if state.frame not in (MAP, ODOM):
             self.warn(f"odometry in frame {state.frame!r} is not used: neither {MAP} nor {ODOM}", every=1.0)
             return
-        q = _unit(state.q_WB)
-        if q is None or not all(map(isfinite, state.p_WB)):
-            self.warn("odometry without a pose (not finite, or a quaternion of another norm than 1) is not used", every=1.0)
-            return
         late = self._next >= 0 and state.stamp < self._next + self._period
         self._next = (self._next if late else state.stamp) + self._period
-        self.frames(StampedTransform(state.stamp, ODOM, BASE, tuple(state.p_WB), q))
+        self.frames(StampedTransform(state.stamp, ODOM, BASE, tuple(state.p_WB), tuple(state.q_WB)))
 
     def on_target(self, pose: TargetPose) -> None:
         """The target, whenever it is believed to be elsewhere."""
-        p, q = tuple(map(float, pose.p_WS)), _unit(tuple(map(float, pose.q_WS)))
-        if q is None or not all(map(isfinite, p)):
-            self.warn("target/pose without a pose (not finite, or a quaternion of another norm than 1) is not used", every=1.0)
-            return
+        p, q = tuple(map(float, pose.p_WS)), tuple(map(float, pose.q_WS))
         if (p, q) != self._target:
             self._target = p, q
             self.frames(StampedTransform(pose.stamp, MAP, TARGET, p, q))
-
-
-def _unit(q: Sequence[float]) -> tuple[float, ...] | None:
-    """A quaternion whose norm is 1 but for rounding, or None."""
-    squares = sum(x * x for x in q)
-    return tuple(q) if abs(squares - 1.0) < 2e-3 else None

@@ -17,9 +17,9 @@ from perch_core.config import quantity, text
 from perch_core.errors import ConfigError, PerchError
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
-from perch_core.values import PerchPlan, PerchPlanRequest, seconds
+from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
-from perch_planner import planner, refusals, request_limits
+from perch_planner import planner, refusals
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.refusals import PerchRefusal
 
@@ -71,7 +71,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         limit = self.config.time_limit
         answer = partial(self._answer, request, reply, limit)
         try:
-            request_limits.check("request", request, request_limits.PERCH_PLAN)
+            limits.check("request", request)
             problem = perch_problem(request)
             arguments = (problem, perch_settings(request, self.config, problem.surface), self._vehicle)
         except PerchError as error:
@@ -86,7 +86,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         else:
             answer = refused(found, limit)
             self.warn(f"no plan: {answer.message}")
-        self.diagnostics(Diagnostics(request_limits.stamp_of(request), {
+        self.diagnostics(Diagnostics(limits.stamp_of(request), {
             "success": answer.success, "error_code": int(answer.error_code), "iterations": answer.iterations,
             "solve_ms": 1e3 * answer.solve_time}))
         reply(answer)
@@ -119,23 +119,18 @@ def perch_problem(request: PerchPlanRequest) -> PerchProblem:
     """The problem of a request.
 
     Raises:
-        ConfigError: a quaternion that is none, or a start outside `current`.
+        ConfigError: a start outside `current`.
     """
-    norm = float(np.linalg.norm(request.q_WS))
-    if not abs(norm - 1.0) < 1e-3:
-        raise ConfigError("request", "q_WS", f"target.orientation: norm {norm:.4f} is not 1")
-    # What is normalised already stays as it is to the last bit.
+    norm = float(np.linalg.norm(request.q_WS))  # what is normalised already stays as it is to the last bit
     q_WS = np.asarray(request.q_WS, float) / (norm if abs(norm - 1.0) > 1e-9 else 1.0)
     surface = PerchSurface(np.asarray(request.p_WS, float), so3.quat_to_matrix(q_WS), (1.0, 1.0))
     if request.current is not None:
         current = request.current
         if not isinstance(current, FlatTrajectory):
             raise ConfigError("request", "current", "carries samples; a start needs polynomial segments")
-        if current.degree > request_limits.DEGREE:
-            raise ConfigError("request", "current", f"degree {current.degree} is above {request_limits.DEGREE}")
-        request_limits.check("request: current", current, request_limits.CURRENT)
+        limits.check("request: current", current, limits.CURRENT)
         start = StartState.on(current, seconds(request.start) - current.start_time)
-        request_limits.check("request: current", start, request_limits.STATE)
+        limits.check("request: current", start, limits.STATE)
     else:
         start = StartState(request.p, request.v, request.a, request.j, request.yaw, request.yaw_rate)
     return PerchProblem(start, surface, tuple(Waypoint(p) for p in request.waypoints), request.target_velocity,

@@ -12,9 +12,8 @@ from perch_core.component import Component, Diagnostics, Job, JobStopped, Servic
 from perch_core.config import quantity, text
 from perch_core.errors import ConfigError, PerchError, PlanningRefusal
 from perch_core.rotor_model import RotorModel
-from perch_core.values import PowerlinePlan, PowerlinePlanRequest
+from perch_core.values import PowerlinePlan, PowerlinePlanRequest, limits
 from perch_core.vehicle import load_vehicle
-from perch_planner import request_limits
 from perch_planner.powerline import service
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PowerlineRequest
@@ -121,7 +120,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         else:
             answer = service.refused(found)
             self.warn(f"no plan: {answer.message}")
-        self.diagnostics(Diagnostics(request_limits.stamp_of(request), {
+        self.diagnostics(Diagnostics(limits.stamp_of(request), {
             "success": answer.success, "error_code": int(answer.error_code), "iterations": answer.iterations,
             "solve_ms": 1e3 * answer.solve_time, "recovery_solve_ms": 1e3 * answer.recovery_solve_time, "solver": answer.solver}))
         reply(answer)

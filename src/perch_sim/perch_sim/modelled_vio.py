@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 
 import numpy as np
@@ -65,15 +64,11 @@ class ModelledVio(Component[VioModelParameters]):
         if not self._warned:
             self._warned = True
             self.warn("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
-        x = (*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B)
-        if not math.isfinite(sum(x)) or abs(sum(k * k for k in state.q_WB) - 1.0) > 1e-3:
-            self.warn("ground_truth/odometry: not a finite state with a unit quaternion: not used", every=1.0)
-            return
         if state.stamp <= self._newest:
             self.warn("ground_truth/odometry: its stamps go back: begun anew", every=1.0)
             self._begin()
         self._newest = state.stamp
-        self._history.append(TrueState(state.stamp, np.array(x)))
+        self._history.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
         if self._frames:
             self._answer()
         self._emit()

@@ -46,7 +46,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
 
     config_type = VehicleParameters
 
-    motor_command = Input(MotorCommand, "motor_command")
+    motor_command = Input(MotorCommand, "motor_command", answered=True)
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
     attitude_thrust = Input(AttitudeThrust, "attitude_thrust_command")
     pace = Wake(CONTROL_PERIOD)

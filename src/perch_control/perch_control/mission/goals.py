@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from perch_core import so3
-from perch_core.values import PerchGoal
+from perch_core.values import PerchGoal, limits
 from perch_control.mission.missions import MISSIONS, known_modes, mission_class
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal
-
-_FARTHEST = 1e4  # [m]
 
 
 def problem_with(goal: PerchGoal, settings: MissionSettings) -> str:
@@ -22,20 +21,12 @@ def problem_with(goal: PerchGoal, settings: MissionSettings) -> str:
     problem = mission_class(goal.mode).problem(goal, settings)
     if problem:
         return problem
-    if not math.isnan(goal.takeoff_height) and not 0.3 <= goal.takeoff_height <= 10.0:
-        return f"takeoff_height {goal.takeoff_height:g} m is outside [0.3, 10]"
-    if not math.isnan(goal.search_timeout) and not 0.0 < goal.search_timeout <= 300.0:
-        return f"search_timeout {goal.search_timeout:g} s is outside (0, 300]"
-    if not math.isnan(goal.inclination_hint) and not 0.0 <= goal.inclination_hint <= math.pi:
-        return f"inclination_hint {goal.inclination_hint:g} rad is outside [0, pi]"
-    if goal.search_frame not in ("", "map"):
-        return f"search_pose: frame_id {goal.search_frame!r} is not 'map'"
-    if goal.search_frame:
-        p, q = np.array(goal.search_position), np.array(goal.search_attitude)
-        if not np.abs(p).max() < _FARTHEST or not abs(np.linalg.norm(q) - 1.0) <= 1e-3:
-            return "search_pose: position is not finite, or the quaternion is not of norm 1"
-        if p[2] < 0.3:
-            return f"search_pose: height {p[2]:g} m is below 0.3 m"
+    if goal.search_frame and goal.search_frame != "map":
+        return f"search_frame: {goal.search_frame!r} is not 'map'"
+    if said := limits.problem(goal if goal.search_frame else replace(goal, search_position=(0.0, 0.0, 0.0), search_attitude=(0.0, 0.0, 0.0, 1.0))):
+        return said
+    if goal.search_frame and goal.search_position[2] < 0.3:
+        return f"search_position: height {goal.search_position[2]:g} m is below 0.3 m"
     return ""
 
 

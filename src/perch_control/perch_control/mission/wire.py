@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from perch_core.values import PerchGoal, PowerlineMap
+from perch_core.values import PowerlineMap
 from perch_control.mission.line_target import mapped_target
 from perch_control.mission.machine import MissionMachine
 from perch_control.mission.moves import Look
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_plan import RunningPlan
-from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Inputs, Outputs, PlanAnswer, Target
 
 
@@ -20,15 +17,6 @@ class LineMission(MissionMachine):
     """What is done at a mapped powerline: the lines are looked at from several places first."""
 
     unseen = "no lines mapped"
-
-    @classmethod
-    def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
-        """A point and a tilt are needed."""
-        if not np.isfinite(goal.perch_point).all():
-            return "perch_point is not finite"
-        if not 0.0 <= goal.perch_pitch <= math.pi + 1e-6:
-            return f"perch_pitch {goal.perch_pitch:g} rad is outside [0, pi]"
-        return ""
 
     def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
         """The place on the mapped line that the goal means."""

@@ -10,8 +10,7 @@ import numpy as np
 from perch_core.errors import ConfigError, PerchError, PlanningRefusal
 from perch_core.lines import Segment
 from perch_core.rotor_model import P, THRUST, V, W, RotorModel, hover_state
-from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePlanRequest, seconds
-from perch_planner import request_limits
+from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePlanRequest, limits, seconds
 from perch_planner.powerline import plan
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 
@@ -38,16 +37,12 @@ def check_request(request: PowerlinePlanRequest) -> None:
     Raises:
         ConfigError: names the field, its value and the range.
     """
-    request_limits.check("request", request, request_limits.POWERLINE_PLAN)
+    limits.check("request", request)
     if len(request.rotor_thrust) not in (0, 4):
         raise ConfigError("request", "rotor_thrust", f"has {len(request.rotor_thrust)} values, needs 4 or none")
-    if len(request.lines) > request_limits.LINES_MAX:
-        raise ConfigError("request", "lines", f"{len(request.lines)} entries are more than {request_limits.LINES_MAX}")
-    for k, line in enumerate(request.lines):
-        request_limits.check(f"request: lines[{k}]", line, request_limits.LINE)
-    if request.perch_pose is not None:
-        for name, value, limit in zip(("position", "orientation"), request.perch_pose, request_limits.POSE):
-            request_limits.check_value("request", f"perch_pose.{name}", value, limit)
+    for (name, limit), value in zip(limits.POSE.items(), request.perch_pose or ()):
+        if said := limit.problem(value):
+            raise ConfigError("request", f"perch_pose.{name}", said)
 
 
 def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offset: float) -> PowerlineRequest:
@@ -61,11 +56,7 @@ def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offse
     Raises:
         PerchError: values that cannot be a request.
     """
-    q_WB = np.asarray(request.q, float)
-    norm = float(np.linalg.norm(q_WB))
-    if not abs(norm - 1.0) < 1e-2:
-        raise PlanningRefusal("bad_input", "start attitude", -1.0, f"start quaternion has norm {norm:.4f}, not 1")
-    start = hover_state(model, np.asarray(request.p, float), q_WB)
+    start = hover_state(model, np.asarray(request.p, float), np.asarray(request.q, float))
     start[V], start[W] = request.v, request.w
     if len(request.rotor_thrust):
         start[THRUST] = request.rotor_thrust

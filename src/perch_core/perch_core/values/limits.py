@@ -1,0 +1,312 @@
+"""What may enter: sizes, counts and magnitudes of every value, declared once, and the one form in which the rest is refused.
+
+The bounds lie far outside what any vehicle here measures or flies, so that what is beyond them is nonsense whoever takes it: a component
+refuses it at its door (`perch_core.component`), a planner answers BAD_INPUT, the mission BAD_GOAL. What depends on the present (stamps,
+frames, where the vehicle is) or on a vehicle is judged by who knows that. docs/limits.md is generated from this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, isfinite, pi
+from typing import Any
+
+import numpy as np
+
+from perch_core.camera import EquidistantCamera, PinholeCamera, RadialTangentialCamera
+from perch_core.errors import ConfigError
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.values.flight import ChooseLaw, ControllerCommand, ControllerStatus, MotorCommand, TrajectoryOrder
+from perch_core.values.mission import PerchGoal
+from perch_core.values.perching import MappedPowerline, PowerlineMap, TargetPose
+from perch_core.values.planning import PerchPlanRequest, PowerlinePlanRequest
+from perch_core.values.sensing import CameraImage, CameraModel, ImuSample, Transform
+from perch_core.values.stamps import NANOSECONDS
+from perch_core.values.state import EstimatorHealth, InertialState, OdometryState
+
+_SHOWN = 60  # characters of a refused text that are quoted
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Range of a number, or of every entry of an array; NaN is outside.
+
+    Attributes:
+        low, high: inclusive.
+        unit: of the values.
+        shape: of the array, () a number; -1: any number of rows up to `most`.
+        most: rows.
+        optional: NaN leaves the value to whoever takes it.
+    """
+
+    low: float
+    high: float
+    unit: str = ""
+    shape: tuple[int, ...] = ()
+    most: int = 0
+    optional: bool = False
+
+    def problem(self, value: Any) -> str:
+        """Why a value is refused; empty: it is not."""
+        try:
+            array = np.asarray(value, float)
+        except (TypeError, ValueError, OverflowError):
+            return "is not made of numbers"
+        many = self.shape[:1] == (-1,)
+        if many and len(array.shape) and not array.size:
+            return ""
+        if array.ndim != len(self.shape) or array.shape[many:] != self.shape[many:]:
+            wanted = " x ".join("n" if n < 0 else str(n) for n in self.shape) or "one"
+            return f"shape {array.shape} is not {wanted}"
+        if many and len(array) > self.most:
+            return f"{len(array)} entries are more than {self.most}"
+        inside = (array >= self.low) & (array <= self.high) | (np.isnan(array) if self.optional else False)
+        if np.all(inside):
+            return ""
+        shown = float(array[~inside].flat[0])
+        return f"{shown:g} is outside {self}" if isfinite(shown) or self.optional else f"{shown:g} is not finite"
+
+    def __str__(self) -> str:
+        return f"[{self.low:g}, {self.high:g}] {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit quaternion, but for rounding."""
+
+    tolerance: float = 1e-3
+
+    def problem(self, value: Any) -> str:
+        """Why a value is refused; empty: it is not."""
+        norm = float(np.sqrt(sum(float(x) * float(x) for x in value)))
+        return "" if len(value) == 4 and abs(norm - 1.0) <= self.tolerance else f"norm {norm:.4f} is not 1"
+
+    def __str__(self) -> str:
+        return f"norm 1 within {self.tolerance:g}"
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """A covariance matrix; `certain`: symmetric and without negative eigenvalues, otherwise its variances alone are looked at.
+
+    Attributes:
+        absent: a negative first entry says that there is none.
+    """
+
+    size: int
+    certain: bool = True
+    absent: bool = False
+
+    def problem(self, value: Any) -> str:
+        """Why a value is refused; empty: it is not."""
+        C = np.asarray(value, float)
+        if C.size != self.size**2:
+            return f"{C.size} entries are not {self.size} x {self.size}"
+        C = C.reshape(self.size, self.size)
+        scale = float(np.abs(C).max())
+        if not scale <= VARIANCE_MAX:
+            return f"an entry of {scale:g} is " + (f"beyond {VARIANCE_MAX:g}" if isfinite(scale) else "not finite")
+        if self.absent and C[0, 0] < 0.0:
+            return ""
+        if C.diagonal().min() < 0.0:
+            return f"a variance of {C.diagonal().min():g} is negative"
+        if self.certain and (np.abs(C - C.T).max() > 1e-5 * scale + 1e-15 or np.linalg.eigvalsh(C)[0] < -1e-6 * scale - 1e-15):
+            return "is not symmetric and positive semi-definite"
+        return ""
+
+    def __str__(self) -> str:
+        kind = "symmetric, positive semi-definite" if self.certain else "no negative variance"
+        return f"{self.size} x {self.size}, {kind}, entries up to {VARIANCE_MAX:g}"
+
+
+@dataclass(frozen=True)
+class Text:
+    """Text of up to so many characters."""
+
+    most: int
+
+    def problem(self, value: Any) -> str:
+        """Why a value is refused; empty: it is not."""
+        return "" if len(value) <= self.most else f"{value[:_SHOWN]!r}...: {len(value)} characters are more than {self.most}"
+
+    def __str__(self) -> str:
+        return f"up to {self.most} characters"
+
+
+@dataclass(frozen=True)
+class Each:
+    """Several values of one type, each within its own limits."""
+
+    kind: type
+    most: int
+
+    def problem(self, value: Any) -> str:
+        """Why a value is refused; empty: it is not."""
+        if len(value) > self.most:
+            return f"{len(value)} entries are more than {self.most}"
+        return next((f"[{k}].{said}" for k, one in enumerate(value) if (said := problem(one))), "")
+
+    def __str__(self) -> str:
+        return f"up to {self.most}, each a {self.kind.__name__}"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A value of another type, within that type's limits; None: left out."""
+
+    kinds: tuple[type, ...]
+
+    def problem(self, value: Any) -> str:
+        """Why a value is refused; empty: it is not."""
+        return "" if value is None else problem(value)
+
+    def __str__(self) -> str:
+        return "a " + " or ".join(kind.__name__ for kind in self.kinds)
+
+
+def _vector(size: float, unit: str) -> Limit:
+    return Limit(-size, size, unit, (3,))
+
+
+def _rows(size: float, unit: str, width: int, most: int) -> Limit:
+    return Limit(-size, size, unit, (-1, width), most)
+
+
+VARIANCE_MAX = 1e8  # of a variance beyond that nobody can say anything, and its square would not be a number
+SEGMENTS_MAX, DEGREE_MAX, SAMPLES_MAX = 1000, 20, 20_000  # of a trajectory; 20 s at a sample per ms
+PLAN_LONGEST, PLAN_SEGMENTS_MAX = 600.0, 101  # of what is planned on [s]
+PLAN_LINES_MAX = 100
+
+STAMP = Limit(0, (2**31 - 1) * NANOSECONDS, "ns")
+POSITION, VELOCITY, ACCELERATION = _vector(1e4, "m"), _vector(100.0, "m/s"), _vector(1e3, "m/s^2")
+TURN_RATE = _vector(100.0, "rad/s")  # gyroscopes end at 70 rad/s (4000 deg/s)
+FRAME = Text(256)
+ID = Limit(0, 2**32 - 1)
+_PIXELS = Limit(1, 1e4, "px")
+_FOCAL, _CENTRE = Limit(1.0, 1e5, "px"), Limit(-1e5, 1e5, "px")
+_CAMERA = {"width": _PIXELS, "height": _PIXELS, "fx": _FOCAL, "fy": _FOCAL, "cx": _CENTRE, "cy": _CENTRE}
+_DISTORTED = {**_CAMERA, "coefficients": Limit(-1e3, 1e3, "", (-1,), 8)}
+
+LIMITS: dict[type, dict[str, Any]] = {
+    ImuSample: {"w_B": TURN_RATE, "f_B": _vector(2000.0, "m/s^2"), "frame": FRAME},  # accelerometers end at 2000 m/s^2 (200 g)
+    CameraImage: {"width": _PIXELS, "height": _PIXELS, "frame": FRAME},
+    CameraModel: {"frame": FRAME, "camera": Part((PinholeCamera, RadialTangentialCamera, EquidistantCamera))},
+    PinholeCamera: _CAMERA, RadialTangentialCamera: _DISTORTED, EquidistantCamera: _DISTORTED,
+    Transform: {"parent": FRAME, "child": FRAME, "p": POSITION, "q": Unit(1e-2)},  # written by hand
+    OdometryState: {
+        "p_WB": POSITION, "q_WB": Unit(), "v_B": VELOCITY, "w_B": TURN_RATE, "pose_covariance": Covariance(6, certain=False),
+        "twist_covariance": Covariance(6, certain=False, absent=True), "frame": FRAME},
+    InertialState: {
+        "p_WB": POSITION, "q_WB": Unit(), "v_WB": VELOCITY, "gyro_bias": _vector(10.0, "rad/s"), "accel_bias": _vector(100.0, "m/s^2"),
+        "covariance": Covariance(15), "frame": FRAME},
+    EstimatorHealth: {"state": Limit(0, 3), "vio_age": Limit(-1.0, inf, "s")},
+    ControllerStatus: {"state": Limit(0, 7), "trajectory_id": ID, "trajectory_time": Limit(-3600.0, 1e6, "s")},
+    TargetPose: {"stamp": STAMP, "p_WS": POSITION, "q_WS": Unit(), "covariance": Covariance(6)},
+    MappedPowerline: {
+        "id": ID, "start": POSITION, "end": POSITION, "radius": Limit(1e-4, 1.0, "m"), "covariance": Covariance(3),
+        "direction_sigma": Limit(0.0, inf, "rad")},
+    PowerlineMap: {"stamp": STAMP, "lines": Each(MappedPowerline, 500)},
+    MotorCommand: {"rotor_speed": Limit(0.0, 1e4, "rad/s", (4,))},
+    ControllerCommand: {"command": Limit(0, 5)},
+    TrajectoryOrder: {
+        "id": ID, "at_end": Limit(0, 3), "contact_time": Limit(0.0, 60.0, "s"), "recovery_start": Limit(-inf, 3600.0, "s"),
+        "trajectory": Part((FlatTrajectory, SampledTrajectory))},
+    FlatTrajectory: {
+        "start_time": Limit(0.0, 2.0**31, "s"), "duration": Limit(0.0, 3600.0, "s"), "degree": Limit(0, DEGREE_MAX),
+        "durations": Limit(1e-6, 3600.0, "s", (-1,), SEGMENTS_MAX)},
+    SampledTrajectory: {
+        "start_time": Limit(0.0, 2.0**31, "s"), "times": Limit(0.0, 3600.0, "s", (-1,), SAMPLES_MAX),
+        "p": _rows(1e4, "m", 3, SAMPLES_MAX), "v": _rows(100.0, "m/s", 3, SAMPLES_MAX), "a": _rows(1e3, "m/s^2", 3, SAMPLES_MAX),
+        "w": _rows(100.0, "rad/s", 3, SAMPLES_MAX), "dw": _rows(1e5, "rad/s^2", 3, SAMPLES_MAX),
+        "rotor_thrust": _rows(1e3, "N", 4, SAMPLES_MAX)},
+    ChooseLaw: {"type": Text(100)},
+    PerchGoal: {
+        "takeoff_height": Limit(0.3, 10.0, "m", optional=True), "search_frame": FRAME, "search_position": POSITION, "search_attitude": Unit(),
+        "search_timeout": Limit(1e-3, 300.0, "s", optional=True), "inclination_hint": Limit(0.0, pi, "rad", optional=True),
+        "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-6, "rad"), "attempts": Limit(0, 100)},
+    PerchPlanRequest: {
+        "start": STAMP, "p": POSITION, "v": VELOCITY, "a": ACCELERATION, "j": _vector(1e5, "m/s^3"), "yaw": Limit(-1e3, 1e3, "rad"),
+        "yaw_rate": Limit(-100.0, 100.0, "rad/s"), "p_WS": POSITION, "q_WS": Unit(), "target_velocity": VELOCITY,
+        "waypoints": Limit(-1e4, 1e4, "m", (-1, 3), 50), "segment_times": Limit(0.01, PLAN_LONGEST, "s", (-1,), 51),
+        "impact_acceleration": Limit(0.0, 100.0, "m/s^2"), "impact_speed_min": Limit(0.0, 20.0, "m/s"),
+        "impact_speed_max": Limit(0.0, 20.0, "m/s"), "thrust_max": Limit(0.0, 1e3, "N"), "thrust_min": Limit(0.0, 1e3, "N"),
+        "objective": Limit(0, 4)},
+    PowerlinePlanRequest: {
+        "start": STAMP, "p": POSITION, "q": Unit(1e-2), "v": VELOCITY, "w": TURN_RATE, "rotor_thrust": Limit(0.0, 1e3, "N", (-1,), 4),
+        "lines": Each(MappedPowerline, PLAN_LINES_MAX), "target_line": ID, "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-9, "rad"),
+        "end_velocity": VELOCITY, "deadline": Limit(0.0, 1e12, "s")},
+}
+"""Type of a value -> field -> what it may be; None is left to whoever takes it."""
+
+STATE = {name: LIMITS[PerchPlanRequest][name] for name in ("p", "v", "a", "j", "yaw", "yaw_rate")}
+CURRENT = {"durations": Limit(1e-3, PLAN_LONGEST, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX)}
+"""Of `PerchPlanRequest.current`, whose state at the start is limited as one that is given."""
+POSE = {"position": POSITION, "orientation": Unit(1e-2)}
+"""Of `PowerlinePlanRequest.perch_pose`."""
+
+
+def problem(value: Any) -> str:
+    """Why a value is nonsense: `field: value why`; empty: it is not, or nothing is declared for its type. Runs at every IMU sample."""
+    kind = type(value)
+    try:
+        if kind in _QUICK and _QUICK[kind](value):
+            return ""
+    except (IndexError, TypeError, ValueError):  # of other sizes
+        pass
+    for name, limit in LIMITS.get(kind, {}).items():
+        if (entry := getattr(value, name)) is not None and (said := limit.problem(entry)):
+            return f"{name}{said}" if said[0] == "[" else f"{name}: {said}"
+    return ""
+
+
+def check(source: str, values: Any, limits: dict[str, Any] | None = None) -> None:
+    """Refuse nonsense.
+
+    Args:
+        source: for messages.
+        values: an object with an attribute for each limit.
+        limits: name -> limit; None: those of its type.
+
+    Raises:
+        ConfigError: names the field, its value and what is allowed.
+    """
+    for name, limit in (LIMITS[type(values)] if limits is None else limits).items():
+        value = getattr(values, name)
+        if value is not None and (said := limit.problem(value)):
+            raise ConfigError(source, name, said) if said[0] != "[" else ConfigError(source, *f"{name}{said}".split(": ", 1))
+
+
+def stamp_of(request: Any) -> int:
+    """The start of a request as a stamp for diagnostics [ns], 0 where it is none."""
+    return 0 if STAMP.problem(request.start) else int(request.start)
+
+
+def _imu(sample: ImuSample) -> bool:
+    (a, b, c), (x, y, z) = sample.w_B, sample.f_B
+    return a * a + b * b + c * c < 1e4 and x * x + y * y + z * z < 4e6 and len(sample.frame) < 256
+
+
+_seen: list[Any] = [None, None]  # covariances looked at last: the same ones come several times
+
+
+def _odometry(state: OdometryState) -> bool:
+    x, y, z, w = state.q_WB
+    if not (abs(x * x + y * y + z * z + w * w - 1.0) < 1e-3 and _below(state.p_WB, 1e8) and _below(state.v_B, 1e4)
+            and _below(state.w_B, 1e4) and len(state.frame) < 256):
+        return False
+    pose, twist = state.pose_covariance, state.twist_covariance
+    if pose is _seen[0] and twist is _seen[1]:
+        return True
+    fields = LIMITS[OdometryState]
+    if fields["pose_covariance"].problem(pose) or fields["twist_covariance"].problem(twist):
+        return False
+    _seen[:] = pose, twist
+    return True
+
+
+def _below(v: tuple[float, float, float], square: float) -> bool:
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2] < square
+
+
+_QUICK = {ImuSample: _imu, OdometryState: _odometry}
+"""Shorter ways to the answer that all is well, a microsecond or two each."""
