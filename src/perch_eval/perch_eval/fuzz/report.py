@@ -38,9 +38,9 @@ class Report:
         """Whether there is time for another input."""
         return time.monotonic() < self._end
 
-    def tried(self, outcome: str) -> None:
-        """One more input had an outcome that makes sense (`refused`)."""
-        self._counts[outcome] += 1
+    def tried(self, outcome: str, count: int = 1) -> None:
+        """One more input, or some, had an outcome that makes sense (`refused`)."""
+        self._counts[outcome] += count
         now = time.monotonic()
         if now - self._shown >= (0.2 if self._out.isatty() else self._period):
             self._shown = now
