@@ -15,9 +15,9 @@ from perch_core.camera import CameraMount
 from perch_core.component import Component, Input
 from perch_core.errors import ConfigError
 from perch_core.values import CameraImage, CameraModel, OdometryState, Transform, seconds
-from perch_core.vehicle import load_vehicle
 from perch_perception.mounted_camera import MountedCamera
 from perch_perception.pose_buffer import BodyState, PoseBuffer
+from perch_perception.sensor_file import camera_mounts
 from perch_perception.stamp_guard import StampGuard, StampVerdict
 from perch_perception.world_frames import is_world
 
@@ -30,6 +30,7 @@ class CameraConfig(Protocol):
     """What the parameters of a camera's component hold."""
 
     vehicle: str
+    sensors: str
     camera: str
     images: str
     extrinsics: str
@@ -63,13 +64,13 @@ class CameraComponent(Component[C], ABC):
         """
         super().__init__(config)
         cv2.setNumThreads(1)
-        mounts = load_vehicle(config.vehicle).mounts
+        mounts = camera_mounts(config.sensors, config.vehicle)
         usable = [camera for camera, mount in mounts.items() if self.unusable(mount) == ""]
         if config.camera not in usable:
             mount = mounts.get(config.camera)
             why = "not there" if mount is None else self.unusable(mount)
             raise ConfigError(type(self).__name__, "camera",
-                              f"{config.camera!r} of {config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
+                              f"{config.camera!r} of {config.sensors or config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
         self.mounted = MountedCamera(mounts[config.camera], config.extrinsics, self.warn)
         self.dropped = 0
         self._waiting: deque[CameraImage] = deque()
@@ -98,7 +99,9 @@ class CameraComponent(Component[C], ABC):
         """Use, or refuse, one image."""
 
     def on_camera_info(self, model: CameraModel) -> None:
-        """The camera's intrinsics."""
+        """The camera's intrinsics; of a sensor file they are known."""
+        if self.config.sensors:
+            model = model._replace(camera=self.mounted.nominal.camera)
         if self.mounted.take_model(model):
             self.use_camera(self.mounted.mount)
         self.advance()
@@ -111,6 +114,8 @@ class CameraComponent(Component[C], ABC):
 
     def on_image(self, image: CameraImage) -> None:
         """Keep an image, and use what can be."""
+        if self.config.sensors and self.mounted.mount is None:
+            self.on_camera_info(CameraModel(image.stamp, image.frame, self.mounted.nominal.camera))
         self._waiting.append(image)
         if len(self._waiting) > MOST_WAITING:
             self._waiting.popleft()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from perch_core.errors import PerchError
 from perch_core.values import EstimatorHealth, ImuSample, InertialState, OdometryState, Transform, rotated
 from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
+from perch_perception.sensor_file import imu_axes, imu_noise
 from perch_perception.ukf import Estimate, Estimator, VioOutcome, VioPose
 from perch_perception.ukf.odometry import covariances, pose_of, state_of
 from perch_perception.world_frames import MAP, is_world
@@ -42,8 +44,8 @@ class StateEstimator(Component[EstimatorConfig]):
     status = Output(EstimatorHealth, "estimator/status")
 
     def __init__(self, config: EstimatorConfig) -> None:
-        super().__init__(config)
-        self._intake = ImuIntake(self.warn)
+        super().__init__(replace(config, imu=imu_noise(config.sensors, config.imu)))
+        self._intake = ImuIntake(self.warn, imu_axes(config.sensors))
         self._begin()
 
     def _begin(self) -> None:

@@ -19,13 +19,14 @@ class ImuIntake:
 
     Args:
         warn: called with a warning and the least time between two of its kind [s].
+        R_BI: axes of the IMU in B, shape (3, 3); None: those of the sample's frame.
 
     Attributes:
         restarted: the sample taken last belongs to a stream that has started anew; what came before it is of another time.
     """
 
-    def __init__(self, warn: Callable[[str, float], None]) -> None:
-        self._warn = warn
+    def __init__(self, warn: Callable[[str, float], None], R_BI: np.ndarray | None = None) -> None:
+        self._warn, self._R_BI = warn, R_BI
         self._guard = StampGuard()
         self._transforms = StaticTransforms()
         self._turns: dict[str, np.ndarray] = {}  # frame -> R_BI
@@ -44,7 +45,9 @@ class ImuIntake:
         if not is_sane(sample):  # before its stamp counts: it may be another writer's
             self._warn("imu/data_raw: not finite, or beyond any sensor's range: not used", 1.0)
             return None
-        if sample.frame not in AXES_OF_B:
+        if self._R_BI is not None:
+            sample = _turned(sample, self._R_BI)
+        elif sample.frame not in AXES_OF_B:
             sample = self._turned(sample)
             if sample is None:
                 return None
@@ -67,4 +70,8 @@ class ImuIntake:
                            f"where it is in {BASE}", 1.0)
                 return None
             self._turns[sample.frame] = R_BI = place[1]
-        return ImuSample(sample.stamp, tuple((R_BI @ np.array(sample.w_B)).tolist()), tuple((R_BI @ np.array(sample.f_B)).tolist()))
+        return _turned(sample, R_BI)
+
+
+def _turned(sample: ImuSample, R_BI: np.ndarray) -> ImuSample:
+    return ImuSample(sample.stamp, tuple((R_BI @ np.array(sample.w_B)).tolist()), tuple((R_BI @ np.array(sample.f_B)).tolist()))

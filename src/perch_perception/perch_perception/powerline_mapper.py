@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from perch_perception.camera_component import LocatedCameraComponent, extrinsics
 from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
+from perch_perception.sensor_file import mount_rotation, sensors_parameter
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
@@ -24,6 +25,7 @@ class PowerlineMapperConfig:
     """Parameters of the powerline mapper."""
 
     vehicle: str = config.text("rpg", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    sensors: str = sensors_parameter()
     camera: str = config.text("front", doc="camera of the vehicle, colour for red wires; its images are on camera_<name>/image_raw")
     images: str = images_parameter()
     extrinsics: str = extrinsics_parameter()
@@ -42,7 +44,9 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
     powerlines = Output(PowerlineMap, "powerlines")
 
     def __init__(self, config: PowerlineMapperConfig) -> None:
-        super().__init__(config)
+        m = config.mapper
+        rotation = mount_rotation(config.sensors, config.camera, m.triangulation.mount_rotation)
+        super().__init__(replace(config, mapper=replace(m, triangulation=replace(m.triangulation, mount_rotation=rotation))))
         self._pixels = rgb_image if config.detection.appearance == "red" else mono_image
         self._images, self._diagnosed = 0, -np.inf
         self._forget()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from perch_core.values import CameraImage, TargetPose, TargetSighting, nanosecon
 from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, check_image, mono_image
 from perch_perception.pose_buffer import BodyState, StampError
+from perch_perception.sensor_file import sensors_parameter, tag_sigmas
 from perch_perception.tags import (
     BoardLocalizer, CalibrationSigma, FusedTarget, Localization, LocalizerConfig, MapPose, fuse, start_fusion, to_map)
 
@@ -28,6 +29,7 @@ class TargetLocalizerConfig:
     """Parameters of the target localiser."""
 
     vehicle: str = config.text("snapdragon", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    sensors: str = sensors_parameter()
     camera: str = config.text("front", doc="camera of the vehicle; its images are on camera_<name>/image_raw")
     images: str = images_parameter()
     extrinsics: str = extrinsics_parameter()
@@ -72,7 +74,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         Raises:
             ConfigError: no such vehicle, camera or board.
         """
-        super().__init__(config)
+        super().__init__(replace(config, calibration=tag_sigmas(config.sensors, config.camera, config.calibration)))
         self._board = load_board(config.board)
         self._given, self._localizer = localizer, localizer
         self._target: FusedTarget | MapPose | None = None

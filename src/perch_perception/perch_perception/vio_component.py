@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from perch_core.vehicle import load_vehicle
 from perch_perception.camera_component import CameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, mono_image
 from perch_perception.imu_intake import ImuIntake
+from perch_perception.sensor_file import imu_axes, imu_noise, sensors_parameter, vio_priors
 from perch_perception.ukf.odometry import covariances
 from perch_perception.vio import FrameOutcome, VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
 from perch_perception.vio.drawing import TrackPainter
@@ -27,12 +28,14 @@ class VioComponentConfig(VioConfig):
     """Parameters of the component: those of the odometry, and what it belongs to."""
 
     vehicle: str = config.text("snapdragon", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
+    sensors: str = sensors_parameter()
     camera: str = config.text("down", doc="camera of the vehicle; its images are on camera_<name>/image_raw")
     images: str = images_parameter()
     extrinsics: str = extrinsics_parameter()
     start_position: tuple[float, float, float] = config.quantity(
         (0.0, 0.0, 0.0), unit="m", doc="ground point under the vehicle in map, as in a scenario's start")
     start_yaw_deg: float = config.quantity(0.0, unit="deg", low=-180.0, high=180.0, doc="heading at the start in map")
+    level_ground: bool = config.quantity(True, doc="at the start it stands on level ground, of which start_position is a point")
 
 
 class VioComponent(CameraComponent[VioComponentConfig]):
@@ -50,9 +53,10 @@ class VioComponent(CameraComponent[VioComponentConfig]):
     debug_image = Output(CameraImage, "vio/debug_image")
 
     def __init__(self, config: VioComponentConfig) -> None:
-        super().__init__(config)
+        super().__init__(replace(config, imu=imu_noise(config.sensors, config.imu),
+                                 calibration=vio_priors(config.sensors, config.camera, config.calibration)))
         self._standing_height = load_vehicle(config.vehicle).standing_height
-        self._intake = ImuIntake(self.warn)
+        self._intake = ImuIntake(self.warn, imu_axes(config.sensors))
         self._counts = dict.fromkeys(FrameOutcome, 0)
         self._painter = TrackPainter()
         self._begin()
@@ -62,7 +66,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         c = self.config
         standing = np.array(c.start_position) + [0.0, 0.0, self._standing_height]
         self._vio = VisualInertialOdometry(c, self.mounted.mount or self.mounted.nominal, standing, float(np.radians(c.start_yaw_deg)),
-                                           float(c.start_position[2]))
+                                           float(c.start_position[2]) if c.level_ground else None)
         self.result: VioResult | None = None
         self._outcome: FrameOutcome | None = None
         self._diagnosed: int | None = None

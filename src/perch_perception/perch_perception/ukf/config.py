@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perch_core.config import choice, part, quantity
+from perch_core.config import choice, part, quantity, text
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class VioNoise:
 class UkfConfig:
     """The estimator's filter."""
 
+    sensors: str = text("", doc="sensor file, config/sensors/<name>.yaml or a path, whose noise counts in place of `imu`; empty: none")
     imu: ImuNoise = part(ImuNoise)
     faults: ImuFaults = part(ImuFaults)
     rest: RestConfig = part(RestConfig)

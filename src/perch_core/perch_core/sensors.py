@@ -1,0 +1,150 @@
+"""What a vehicle sees and feels with: cameras and IMU as their data sheets and calibration reports have them.
+
+One YAML file in `config/sensors/` each. Perception reads it (parameter `sensors` of its nodes), `scripts/perceive.py` does for recordings,
+and `scripts/sensors.py import` makes one of a Kalibr or EuRoC calibration. The simulator does not: what it draws is another matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from perch_core import config, so3
+from perch_core.camera import Camera, CameraMount, camera_of
+from perch_core.config import choice, label, part, quantity, text
+from perch_core.errors import ConfigError
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class CalibrationSigmas:
+    """1 sigma of what a camera's calibration leaves open; zero: known exactly. The defaults are those of a careful Kalibr calibration."""
+
+    rotation: float = quantity(0.005, unit="rad", low=0.0, high=0.2, doc="camera against IMU, per axis")
+    translation: float = quantity(0.005, unit="m", low=0.0, high=0.2, doc="camera against IMU, per axis")
+    time_offset: float = quantity(0.002, unit="s", low=0.0, high=0.1, doc="camera against the IMU's clock")
+    focal: float = quantity(0.003, unit="-", low=0.0, high=0.05, doc="relative error of each focal length")
+    centre: float = quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSensor:
+    """A camera as its calibration has it."""
+
+    model: str = choice(options=("radtan", "equidistant", "pinhole"), doc="projection, in Kalibr's words")
+    width: int = quantity(unit="px", low=16, high=1 << 14)
+    height: int = quantity(unit="px", low=16, high=1 << 14)
+    focal: tuple[float, float] = quantity(unit="px", above=0.0, high=1e5, doc="fx, fy")
+    centre: tuple[float, float] = quantity(unit="px", low=-1e4, high=2e4, doc="cx, cy")
+    distortion: tuple[float, ...] = quantity((), low=-100.0, high=100.0, doc=(
+        "radtan: k1, k2, p1, p2, then k3, then k4, k5, k6, as many as there are; equidistant: k1..k4; pinhole: none"))
+    position: Vector3 = quantity((0.0, 0.0, 0.0), unit="m", low=-5.0, high=5.0, doc="p_BC")
+    orientation: Quaternion = quantity((0.0, 0.0, 0.0, 1.0), low=-1.01, high=1.01, doc="q_BC, xyzw")
+    rate: float = quantity(30.0, unit="Hz", above=0.0, high=500.0)
+    stamp_offset: float = quantity(0.0, unit="s", low=-0.5, high=0.5, doc=(
+        "stamp of an image minus the middle of its exposure on the IMU's clock: minus Kalibr's timeshift_cam_imu"))
+    colour: bool = quantity(False, doc="delivers colour")
+    topic: str = text("", doc="of its images in recordings; empty: camera_<name>/image_raw")
+    sigma: CalibrationSigmas = part(CalibrationSigmas)
+
+    def __post_init__(self) -> None:
+        _check_quaternion("orientation", self.orientation)
+        if self.model == "pinhole" and any(self.distortion):
+            raise ConfigError("", "distortion", f"{list(self.distortion)} of a pinhole: the model with distortion is radtan")
+        self.camera
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The projection."""
+        fx, fy, cx, cy = *self.focal, *self.centre
+        name = {"equidistant": "equidistant", "pinhole": ""}.get(self.model)
+        if name is None:
+            name = "plumb_bob" if len(self.distortion) <= 5 else "rational_polynomial"
+        try:
+            return camera_of(name, self.width, self.height, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+                             np.array(self.distortion if self.model != "pinhole" else ()))
+        except ConfigError as error:
+            raise ConfigError("", "distortion", error.problem) from None
+
+    def mount(self, name: str) -> CameraMount:
+        """The camera with its place on the body."""
+        return CameraMount(name=name, camera=self.camera, p_BC=np.array(self.position), R_BC=_rotation(self.orientation), rate=self.rate,
+                           stamp_offset=self.stamp_offset, colour=self.colour)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSensor:
+    """An IMU as its data sheet, or an Allan deviation, has it; where the rotors shake it, with what they add in flight."""
+
+    rate: float = quantity(unit="Hz", low=10.0, high=4000.0)
+    accel_noise_density: float = quantity(unit="m/s^2/sqrt(Hz)", above=0.0, high=10.0)
+    gyro_noise_density: float = quantity(unit="rad/s/sqrt(Hz)", above=0.0, high=1.0)
+    accel_bias_walk: float = quantity(unit="m/s^2/sqrt(s)", above=0.0, high=10.0)
+    gyro_bias_walk: float = quantity(unit="rad/s/sqrt(s)", above=0.0, high=1.0)
+    accel_bias: float = quantity(0.2, unit="m/s^2", above=0.0, high=10.0, doc="1 sigma of the turn-on bias")
+    gyro_bias: float = quantity(0.05, unit="rad/s", above=0.0, high=1.0, doc="1 sigma of the turn-on bias")
+    accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, high=1e4, doc="saturation of an axis")
+    gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, high=1e3, doc="saturation of an axis")
+    integration: str = choice("instant", options=("mean", "instant"), doc=(
+        "mean: a sample is the mean over the period that ends at its stamp; instant: it is the value at its stamp"))
+    orientation: Quaternion = quantity((0.0, 0.0, 0.0, 1.0), low=-1.01, high=1.01, doc="q_BI, xyzw: the IMU's axes in B, whose origin it is")
+    topic: str = text("", doc="of its samples in recordings; empty: imu/data_raw")
+
+    def __post_init__(self) -> None:
+        _check_quaternion("orientation", self.orientation)
+
+    @property
+    def accel_noise(self) -> float:
+        """1 sigma of one sample [m/s^2]."""
+        return self.accel_noise_density * self.rate**0.5
+
+    @property
+    def gyro_noise(self) -> float:
+        """1 sigma of one sample [rad/s]."""
+        return self.gyro_noise_density * self.rate**0.5
+
+    @cached_property
+    def R_BI(self) -> np.ndarray:
+        """Axes of the IMU in B, shape (3, 3)."""
+        return _rotation(self.orientation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensors:
+    """Cameras by name, and the IMU. B has its origin in the IMU."""
+
+    name: str = label()
+    cameras: dict[str, CameraSensor] = text()
+    imu: ImuSensor | None = text(None)
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise ConfigError("", "cameras", "there is no camera")
+
+    @cached_property
+    def mounts(self) -> dict[str, CameraMount]:
+        """The cameras with their places on the body, by name."""
+        return {name: camera.mount(name) for name, camera in self.cameras.items()}
+
+
+def load_sensors(name_or_path: str | Path) -> Sensors:
+    """The sensors of `config/sensors/<name>.yaml`, or of a file.
+
+    Raises:
+        ConfigError: no such file, or a value that is refused.
+    """
+    return config.load(Sensors, config.find("sensors", name_or_path))
+
+
+def _rotation(q: Quaternion) -> np.ndarray:
+    return so3.quat_to_matrix(np.array(q) / np.linalg.norm(q))
+
+
+def _check_quaternion(key: str, q: Quaternion) -> None:
+    if not abs(np.linalg.norm(q) - 1.0) < 1e-3:
+        raise ConfigError("", key, f"norm {np.linalg.norm(q):.4f} is not 1")

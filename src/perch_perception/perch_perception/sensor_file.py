@@ -1,0 +1,76 @@
+"""What the sensor file says in place of single parameters: noise of the IMU, cameras and how well they are calibrated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perch_core import config
+from perch_core.camera import CameraMount
+from perch_core.errors import ConfigError
+from perch_core.sensors import CalibrationSigmas, load_sensors
+from perch_core.vehicle import load_vehicle
+from perch_perception.tags.map_pose import CalibrationSigma
+from perch_perception.ukf.config import ImuNoise
+from perch_perception.vio.config import CalibrationPriors
+
+
+def sensors_parameter() -> str:
+    """Declares the parameter `sensors`."""
+    return config.text("", doc=("sensor file, config/sensors/<name>.yaml or a path, in place of the vehicle file's cameras, of camera_info and "
+                                "of the parameters that tell noise and calibration; empty: none"))
+
+
+def camera_mounts(sensors: str, vehicle: str) -> dict[str, CameraMount]:
+    """The cameras of the sensor file, or of the vehicle where none is named.
+
+    Raises:
+        ConfigError: no such file, or a value that is refused.
+    """
+    return load_sensors(sensors).mounts if sensors else load_vehicle(vehicle).mounts
+
+
+def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:
+    """The IMU's noise, of one sample, by the sensor file; what was given where none is named.
+
+    Raises:
+        ConfigError: no such file, or it has no IMU.
+    """
+    if not sensors:
+        return given
+    imu = load_sensors(sensors).imu
+    if imu is None:
+        raise ConfigError(sensors, "imu", "missing")
+    return ImuNoise(imu.accel_noise, imu.gyro_noise, imu.accel_bias_walk, imu.gyro_bias_walk, imu.accel_bias, imu.gyro_bias,
+                    imu.accel_range, imu.gyro_range, imu.integration)
+
+
+def imu_axes(sensors: str) -> np.ndarray | None:
+    """R_BI of the sensor file, shape (3, 3); None: the IMU's axes are those of B, or its frame says what they are."""
+    imu = load_sensors(sensors).imu if sensors else None
+    return None if imu is None or np.array_equal(imu.R_BI, np.eye(3)) else imu.R_BI
+
+
+def vio_priors(sensors: str, camera: str, given: CalibrationPriors) -> CalibrationPriors:
+    """How well a camera is calibrated, as VIO takes it; what was given where no file is named."""
+    s = _sigmas(sensors, camera)
+    return given if s is None else CalibrationPriors(math.sqrt(3.0) * s.rotation, s.translation, s.time_offset, s.focal, s.centre)
+
+
+def tag_sigmas(sensors: str, camera: str, given: CalibrationSigma) -> CalibrationSigma:
+    """The same as the target localiser takes it."""
+    s = _sigmas(sensors, camera)
+    return given if s is None else CalibrationSigma(s.focal, s.centre, math.degrees(s.rotation), s.time_offset)
+
+
+def mount_rotation(sensors: str, camera: str, given: float) -> float:
+    """1 sigma of a camera's attitude on the body, per axis [deg], as the powerline mapper takes it."""
+    s = _sigmas(sensors, camera)
+    return given if s is None else math.degrees(s.rotation)
+
+
+def _sigmas(sensors: str, camera: str) -> CalibrationSigmas | None:
+    """Of a camera of the file; None: no file is named. Which cameras there are is checked by whoever looks through them."""
+    cameras = load_sensors(sensors).cameras if sensors else {}
+    return cameras[camera].sigma if camera in cameras else None
