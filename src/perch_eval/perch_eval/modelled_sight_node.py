@@ -70,7 +70,8 @@ class ModelledLocalizer(TargetLocalizer):
         self._truth, self._newest = StateHistory(MEMORY), 0
         self._sight = ModelledSight(
             load_board(config.board), mount, true, config.localizer, seeding.stream(config.seed, "tag_corners"), self._truth,
-            lambda: pad_surface(scenario, (self._newest - START) * 1e-9), averaging=config.mode == "average", calibration=config.calibration)
+            lambda: pad_surface(scenario, (self._newest - START) * 1e-9), averaging=config.mode == "average",
+            calibration=config.calibration)
         super().__init__(config, self._sight)
 
     def _channel(self, port: str) -> str:

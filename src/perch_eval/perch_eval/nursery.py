@@ -33,8 +33,8 @@ class Nursery:
             modules: what is loaded before anything is forked.
             scenarios: flown in process once before, which loads compiled code.
         """
-        self._process = subprocess.Popen([sys.executable, "-m", "perch_eval.nursery"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                                         process_group=0)
+        self._process = subprocess.Popen([sys.executable, "-m", "perch_eval.nursery"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                         text=True, process_group=0)
         self._tell({"modules": list(modules), "scenarios": list(scenarios)})
 
     def _tell(self, order: Mapping[str, object]) -> int:

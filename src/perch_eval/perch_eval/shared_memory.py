@@ -30,6 +30,11 @@ class SharedMemory:
         for pid in pids:
             self._seen |= self._used_by(self._proc / str(pid))
 
+    @property
+    def seen(self) -> frozenset[str]:
+        """The remembered segments."""
+        return frozenset(self._seen)
+
     def clean(self) -> list[str]:
         """Remove the remembered segments that no process uses any more, with their lock files.
 

@@ -47,7 +47,8 @@ WORDS = {
     "mission": r"mission|trajectory|order",
 }
 """What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
-_TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|restarted|back)\b", re.IGNORECASE)
+_TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|restarted|back)\b",
+                      re.IGNORECASE)
 _STAMP = re.compile(r"\[(?P<time>\d{9,}\.\d+)\]")
 
 

@@ -32,15 +32,18 @@ SCENARIO = """
 extends: {base}
 name: {base}_blind
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
-parameters: {{perching_planner: {{time_limit: 20.0}}, vehicle: {{lockstep_timeout: 8.0}}}}
+parameters: {{perching_planner: {{time_limit: 20.0}}, mission: {{mission.plan_lead: 1.5}}, vehicle: {{lockstep_timeout: 8.0}}}}
 """
-"""What is flown: without images. A busy machine may take its time to plan; the lockstep goes on without a node that hangs after 8 s instead of 60."""
+"""What is flown: without images. A busy machine may take its time to plan, 1.5 s instead of 0.1; the lockstep goes on without a node
+that hangs after 8 s instead of 60."""
 DOMAINS = range(43, 70)
 READY = 60.0     # for the nodes to come up [s]
 STALL = 30.0     # simulation time may stand still for so long [s]
 SETTLE = 4.0     # an end that lasts so long is one, in simulation time [s]
 LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
 STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
+PORTS, DOMAIN_PORTS = 7400, 250  # first port of domain 0, and ports of each, by the standard of DDS
+_PORT = re.compile(r"(?:sem\.)?fast\w+_port(\d+)")
 NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
 
 
@@ -109,7 +112,7 @@ class Group:
             self._commands["relay"] = "perch_eval.graph_faults.relay_node:Relay", [*channels, "--ros-args"]
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []
-        self._memory, self._since = SharedMemory(), time.time()
+        self._memory = SharedMemory()
 
     @staticmethod
     def _place(one: NodeLaunch) -> str:
@@ -163,25 +166,21 @@ class Group:
         end = time.monotonic() + STOPPING[1]
         while (found := [pid for leader in self._sessions for pid in session(leader)]) and time.monotonic() < end:
             time.sleep(0.05)
+        seen = self._memory.seen
         self._memory.clean()
-        return (*(f"process {pid}" for pid in found), *self._sockets(), *self._shared_memory())
+        return (*(f"process {pid}" for pid in found), *self._sockets(), *self._shared_memory(seen))
 
     def _sockets(self) -> list[str]:
         mine = f"perch-lockstep-{os.getuid()}-{self._domain}-"
         return [f"socket {line.split()[-1]}" for line in Path("/proc/net/unix").read_text().splitlines() if mine in line]
 
-    def _shared_memory(self) -> list[str]:
-        """Segments of the middleware that have come since the start and that no process uses."""
-        found = {file for file in Path("/dev/shm").glob("fast*") if _since(file) >= self._since}
-        used = {Path(name.removesuffix("_el").removesuffix("_sl")) for name in SharedMemory().used()}
-        return [f"shared memory {file.name}" for file in found if Path(str(file).removesuffix("_el").removesuffix("_sl")) not in used]
-
-
-def _since(file: Path) -> float:
-    try:
-        return file.stat().st_mtime
-    except OSError:  # gone meanwhile
-        return -1.0
+    def _shared_memory(self, seen: frozenset[str]) -> list[str]:
+        """Segments of these processes, or of a port of their domain, that no process uses any more."""
+        ports = range(PORTS + DOMAIN_PORTS * self._domain, PORTS + DOMAIN_PORTS * (self._domain + 1))
+        used = SharedMemory().used()
+        found = {file for file in Path("/dev/shm").iterdir() if (of := _PORT.match(file.name)) and int(of[1]) in ports}
+        found |= {Path(name) for name in seen if Path(name).exists()}
+        return [f"shared memory {file.name}" for file in sorted(found) if re.sub("_[es]l$", "", str(file)) not in used]
 
 
 class _Director:
@@ -272,7 +271,8 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
     source = folder / "flown.yaml"
     source.write_text(SCENARIO.format(base="surface_90"))
     scenario, lockstep = load_scenario(source), case.mode == LOCKSTEP
-    launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides={"mission": {"lockstep_hold": "perch"}} if lockstep else None)
+    hold = {"mission": {"lockstep_hold": "perch"}} if lockstep else None
+    launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
     with reserved_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain, _in_domain(domain):
         group = Group(nursery, launches, case.node if case.fault not in PROCESS else "", folder, domain)
         pilot = Pilot()
@@ -300,8 +300,9 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
     found = named(case, director.struck, group.lines(), director.said) if director.struck is not None else None
     touched = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
                and director.at is not None and 1e-9 * c.stamp >= director.at]
-    return Row(*case, case.seed, commit, director.at, director.before[:3], end, None if found is None else round(found[0], 2),
-               "" if found is None else found[1][:300], goal[:300], round(max(touched, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
+    after, words = (None, "") if found is None else (round(found[0], 2), found[1][:300])
+    return Row(*case, case.seed, commit, director.at, director.before[:3], end, after, words, goal[:300],
+               round(max(touched, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
 
 
 def _settled(pilot: Pilot, watcher: Watcher, director: _Director) -> str:

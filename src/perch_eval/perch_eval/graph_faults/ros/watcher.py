@@ -72,7 +72,7 @@ class Watcher:
         state, rotors = (topics.decode(channel, self._newest[channel]) for channel in ("ground_truth/odometry", "rotor_state"))
         status = self._newest.get("controller/status")
         up = so3.quat_to_matrix(state.q_WB)[2, 2]
-        held = next((c.state for c in reversed(self.contacts) if c.state in (ContactState.NONE, ContactState.ATTACHED)), None) == ContactState.ATTACHED
+        held = [c.state for c in self.contacts if c.state in (ContactState.NONE, ContactState.ATTACHED)][-1:] == [ContactState.ATTACHED]
         hovers = status is not None and topics.decode("controller/status", status).state == HOVERING
         return Situation(self.height, math.dist(state.v_WB, (0.0,) * 3), math.degrees(math.acos(min(max(up, -1.0), 1.0))),
                          max(rotors.speed), held, hovers)
