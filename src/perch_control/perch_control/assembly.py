@@ -9,7 +9,6 @@ import numpy as np
 
 from perch_control.admission import Order, check_order
 from perch_control.flight import FlightController
-from perch_control.inner_loop import flown, led
 from perch_control.l1 import L1Augmentation
 from perch_control.law import Law
 from perch_control.laws import LAWS, law_class
@@ -41,7 +40,7 @@ class Assembly:
     """Owns the laws.
 
     Attributes:
-        vehicle: as its file says; behind an inner loop its rotors have no lag of their own.
+        vehicle: as its file says.
         flight: the flight controller, flying the law and the augmentation that the parameters name.
         laws: those that are built, by name.
     """
@@ -51,8 +50,7 @@ class Assembly:
         Raises:
             ConfigError: there is no such law.
         """
-        self.vehicle = vehicle = flown(vehicle)
-        self._params = params = led(params, vehicle)
+        self._params, self.vehicle = params, vehicle
         self._failed: dict[str, tuple[str, Callable[[], None]]] = {}  # why, and how to try it again
         self._segments: Sequence[Segment] = ()
         choice = params.controller
@@ -130,7 +128,7 @@ class Assembly:
         Raises:
             ConfigError: one that is fixed after the start has changed, or the law is not ready; all stays as it was.
         """
-        flight, old, params = self.flight, self._params, led(params, self.vehicle)
+        flight, old = self.flight, self._params
         choice, flown = params.controller, self.flown
         if choice.type != old.controller.type and choice.type not in self.laws and law_class(choice.type).slow:
             raise ConfigError("", "controller.type", self._absent(choice.type))

@@ -14,7 +14,6 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
-from perch_control.inner_loop import flown, led
 from perch_control.modes import Command, State, StepResult
 from perch_control.parameters import ControllerParameters
 from perch_control.stamp_guard import Stamp, StampGuard
@@ -276,6 +275,5 @@ class Controller(Component[ControllerParameters]):
 @lru_cache(maxsize=4)
 def _rehearse(params: ControllerParameters) -> None:
     """`dry_run`, once in a process: it loads what all controllers share."""
-    vehicle = flown(load_vehicle(params.vehicle))
-    params = led(params, vehicle)
+    vehicle = load_vehicle(params.vehicle)
     dry_run(vehicle, params.gain_set(vehicle.name), params.flight, params.l1)

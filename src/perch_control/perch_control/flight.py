@@ -11,6 +11,7 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import packed_vehicle
 from perch_control.geometric.step import predicted
 from perch_control.guidance import Running
+from perch_control.inner_loop import Later
 from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
 from perch_control.maneuvers import Maneuvers
@@ -27,6 +28,7 @@ from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 
 _SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
 _NOWHERE = (0.0,) * 6        # position and velocity of a descent that knows neither
+_STILL = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
@@ -260,9 +262,9 @@ class FlightController:
         setpoint = m.setpoint()
         self.position_error = norm(axpy(-1.0, setpoint.p, m.belief[0:3]))
         contact = m.time_to_contact
-        m.rotors = m.rotors.at(m.belief, self.vehicle)
-        out = self.law.control(m.belief, m, m.rotors, self._compensation(contact), contact)
-        m.rotors = m.rotors.following(out.rotor_speed, out.w_C)
+        state, delay = m.rotors.ahead(m.belief, self.vehicle), m.rotors.delay
+        out = self.law.control(state, Later(m, delay) if delay > 0.0 else m, m.rotors.led, self._compensation(contact), max(contact - delay, 0.0))
+        m.rotors = m.rotors.following(out.rotor_speed, state, self.vehicle, out.w_C)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
         self._spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (self.margin - self._spare) if m.state is State.HOVERING else 0.0
@@ -288,9 +290,8 @@ class FlightController:
         if m.blind.landed:
             m.motors_off(self._lying, "landed without position, motors off")
             return self._idle()
-        m.rotors = m.rotors.at((*_NOWHERE, *m.blind.attitude.q, *m.blind.attitude.w), self.vehicle)
-        speed, thrust = m.blind.rotors(m.rotors.speed)
-        m.rotors = m.rotors.following(speed)
+        speed, thrust = m.blind.rotors(m.rotors.led.speed)
+        m.rotors = m.rotors.following(speed, (*_NOWHERE, *m.blind.attitude.q, *m.blind.attitude.w), self.vehicle)
         self.margin = (self.vehicle.thrust_max - max(thrust)) / self.vehicle.thrust_max
         return StepResult(True, speed, wrench=m.blind.wanted(), margin=self.margin, event=self._event(), loop=m.rotors.sent)
 
@@ -303,7 +304,7 @@ class FlightController:
         m = self.maneuvers
         armed = m.state is State.ARMED
         speed = (self.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
-        m.rotors = m.rotors.following(speed)
+        m.rotors = m.rotors.following(speed, m.belief or _STILL, self.vehicle)
         self.margin, self.position_error = 1.0, 0.0
         return StepResult(armed, speed, event=self._event(), loop=m.rotors.sent)
 

@@ -89,7 +89,7 @@ class RotorEstimate(NamedTuple):
         share = 1.0 if time_constant <= 0.0 else 1.0 - exp(-duration / time_constant)
         return RotorEstimate(approached(self.speed, self.command, share), self.command)
 
-    def following(self, command: tuple[float, float, float, float], w_C: tuple[float, ...] = ()) -> RotorEstimate:
+    def following(self, command: tuple[float, float, float, float], *_: object) -> RotorEstimate:
         """The same rotors with a new command."""
         return RotorEstimate(self.speed, command)
 
@@ -97,9 +97,19 @@ class RotorEstimate(NamedTuple):
         """All at one speed [rad/s]."""
         return RotorEstimate((speed,) * 4, (speed,) * 4)
 
-    def at(self, state: tuple[float, ...], vehicle: Vehicle) -> RotorEstimate:
-        """The same rotors on a vehicle in some state, which does not matter to them."""
+    def ahead(self, state: tuple[float, ...], vehicle: Vehicle) -> tuple[float, ...]:
+        """The state when a command that is sent now acts: at once."""
+        return state
+
+    @property
+    def led(self) -> RotorEstimate:
+        """The rotors when a command that is sent now acts: at once."""
         return self
+
+    @property
+    def delay(self) -> float:
+        """From a command to when it acts [s]."""
+        return 0.0
 
     @property
     def sent(self) -> None:

@@ -84,7 +84,7 @@ class NmpcController(Law):
         s, n = self.settings, self._layout.states
         self._rate_max = s.rate_max or _RATE_RESERVE * self.vehicle.body_rate_max
         self._thrust_rate_max = s.thrust_rate_max or _thrust_rate(self.vehicle)
-        self._lag = lag_behind(self.vehicle.motor_time_constant, s.lead, self.period) if self.vehicle.motor_time_constant > 0.0 else s.lead
+        self._lag = lag_behind(self.vehicle.motor_time_constant, s.lead, self.period)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
@@ -207,7 +207,5 @@ def _thrust_rate(vehicle: Vehicle) -> float:
     """Rate that a rotor's lag allows from hover at full command, or the vehicle's own limit [N/s]."""
     if np.isfinite(vehicle.thrust_rate_max):
         return float(vehicle.thrust_rate_max)
-    if vehicle.motor_time_constant <= 0.0:
-        return float("inf")
     hover = np.sqrt(vehicle.hover_thrust / 4.0 / vehicle.thrust_coefficient)
     return float(2.0 * vehicle.thrust_coefficient * hover * (vehicle.speed_max - hover) / vehicle.motor_time_constant)
