@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-MIDDLE = {"perch_planner", "perch_control", "perch_perception", "perch_sim"}
+MIDDLE = {"perch_planner", "perch_control", "perch_perception", "perch_sim", "perch_autopilot"}
 ALLOWED = {"perch_core": {"perch_core"}, "perch_eval": MIDDLE | {"perch_core", "perch_eval"}} | {
     name: {"perch_core", name} for name in MIDDLE}
 ROS = ("rclpy", "rcl_interfaces", "builtin_interfaces", "geometry_msgs", "nav_msgs", "sensor_msgs", "std_msgs", "std_srvs",

@@ -93,6 +93,11 @@ class Actuation:
     thrust_lag: float = quantity(0.03, unit="s", above=0.0, high=1.0)
     thrust_gain: float = quantity(1.0, unit="-", above=0.1, high=10.0, doc="thrust that is reached / commanded")
     attitude_lag: float = quantity(0.08, unit="s", above=0.0, high=1.0)
+    firmware: str = text("", doc="in simulation: Betaflight's own, set to config/autopilot/<name>.txt, is the inner loop; empty: an ideal one")
+
+    def __post_init__(self) -> None:
+        if self.firmware and self.type != "rates_and_thrust":
+            raise ConfigError("", "actuation.firmware", f"takes rates_and_thrust, not {self.type}")
 
 
 @dataclass(frozen=True, kw_only=True)

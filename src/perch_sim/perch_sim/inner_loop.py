@@ -9,13 +9,29 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from perch_core.jit import compiled
+from perch_core.registry import resolved
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
+from perch_sim.imu import ImuSample
 from perch_sim.motors import MotorCommandError
+
+FIRMWARE = "perch_autopilot.loop:FirmwareLoop"  # an optional extra, loaded where a vehicle names it
+
+
+def inner_loop(vehicle: Vehicle, lag_factor: float) -> InnerLoop | Any:
+    """What stands between commands and the rotors; None: nothing does.
+
+    Raises:
+        PerchError: it is a firmware that this machine does not have.
+    """
+    if vehicle.actuation.type == "rotor_speeds":
+        return None
+    return resolved(FIRMWARE)(vehicle) if vehicle.actuation.firmware else InnerLoop(vehicle, lag_factor)
 
 
 @compiled
@@ -102,8 +118,9 @@ class InnerLoop:
         self._coming: deque[tuple[int, np.ndarray, np.ndarray | None]] = deque()
         self._rates, self._attitude = np.zeros(4), None
 
-    def command(self, now: int, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
-        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop.
+    def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
+        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop;
+        whether it is armed is the motors' business.
 
         Raises:
             MotorCommandError: not finite, or no attitude.
@@ -113,16 +130,20 @@ class InnerLoop:
             raise MotorCommandError(f"inner loop: rates {list(rates)}, thrust {thrust}, attitude {attitude} are no command: ignored")
         self._coming.append((now + self._delay, values, None if attitude is None else np.array(attitude, float)))
 
-    def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: ImuSample | None = None) -> np.ndarray:
         """What the motors aim at in the period that begins now [ns], (4,) [rad/s].
 
         Args:
             now: [ns].
             x: true state (13,), see `dynamics`.
             speeds: of the rotors (4,) [rad/s].
+            sample: what the IMU has read last; this loop knows the truth.
         """
         while self._coming and self._coming[0][0] <= now:
             _, self._rates, self._attitude = self._coming.popleft()
         rates = self._rates[:3] if self._attitude is None else rates_of_attitude(x[3:7], self._attitude, self._rates[:3], self._attitude_lag)
         rates = self._gain[:3] * np.clip(rates, -self._rate_max, self._rate_max)
         return targets(x[10:13], speeds, rates, self._gain[3] * self._rates[3], *self._rotors, self._lags, CONTROL_PERIOD)
+
+    def close(self) -> None:
+        """It holds nothing."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
-from perch_core.errors import ConfigError
+from perch_core.errors import ConfigError, PerchError
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
@@ -69,6 +69,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
 
         Raises:
             ConfigError: the scenario, its vehicle or its board does not exist, or has a camera that is not simulated.
+            PerchError: the vehicle's firmware is not on this machine, or does not start.
         """
         super().__init__(config)
         self.scenario = scenario = load_scenario(config.scenario) if scenario is None else scenario
@@ -77,8 +78,9 @@ class SimulatedVehicle(Component[VehicleParameters]):
         try:
             self.simulation = Simulation(scenario, config.seed, self._drawing)
             self._cameras = {name: self._ports(name) for name in self.simulation.cameras}
-        except ConfigError:
-            self.close()
+        except PerchError:
+            if self._drawing is not None:
+                self._drawing.close()
             raise
         self.time = self.simulation.time
         self._index = 0                          # steps so far
@@ -97,7 +99,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
         return self._drawing is None or self._drawing.ready()
 
     def close(self) -> None:
-        """End the drawing processes."""
+        """End the drawing processes, and what runs beside the simulation."""
+        self.simulation.close()
         if self._drawing is not None:
             self._drawing.close()
 
@@ -124,7 +127,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             if simulation.loop is None:
                 simulation.motors.command(self.time, command.armed, *content)
             else:
-                simulation.loop.command(self.time, *content)
+                simulation.loop.command(self.time, command.armed, *content)
                 simulation.motors.command(self.time, command.armed, simulation.plant.rotor_speed)
         except MotorCommandError as error:
             self._counts["commands_refused"] += 1

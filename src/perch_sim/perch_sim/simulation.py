@@ -19,7 +19,7 @@ import numpy as np
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.timing import CONTROL_PERIOD_NS
-from perch_core.vehicle import Vehicle, load_vehicle
+from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
 from perch_sim.camera_stream import CameraStream
@@ -27,7 +27,7 @@ from perch_sim.camera_timing import CameraTiming
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing
 from perch_sim.imu import Imu, ImuSample
-from perch_sim.inner_loop import InnerLoop
+from perch_sim.inner_loop import inner_loop
 from perch_sim.lockstep.tasks import START
 from perch_sim.motors import Motors
 from perch_sim.obstacles import pad_surface
@@ -72,8 +72,9 @@ class Simulation:
                               f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout), 0
-        self.loop = None if self.vehicle.actuation.type == "rotor_speeds" else InnerLoop(self.vehicle, scenario.disturbance.loop_lag_factor)
+        self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor)
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
+        self._sample = ImuSample(np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
         self.cameras = self._make_cameras(seed, drawing)
@@ -109,10 +110,16 @@ class Simulation:
             self._starts = self.motors.starts
             self.plant.release()
         if self.loop is not None:
-            self.motors.aim(self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed))
+            self.motors.aim(self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed, self._sample))
         result = self.plant.advance(self.motors.target(self.time))
         for state in result.states:
             self._history.append(state)
         for camera in self.cameras.values():
             camera.expose(self.time, self._history)
-        return Output(self.time, self._imu.sample(result.inertial), result.states[-1], result.contacts)
+        self._sample = self._imu.sample(result.inertial)
+        return Output(self.time, self._sample, result.states[-1], result.contacts)
+
+    def close(self) -> None:
+        """End what runs beside it."""
+        if self.loop is not None:
+            self.loop.close()

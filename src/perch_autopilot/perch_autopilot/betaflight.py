@@ -1,0 +1,157 @@
+"""Component of the node `betaflight`: body rates and thrust to a flight controller over MSP; its IMU and its state back."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
+from perch_core.config import part, quantity, text
+from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
+from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_autopilot import msp
+from perch_autopilot.configuration import load_configuration
+from perch_autopilot.keeper import KeeperLink
+from perch_autopilot.rates import Sticks, rate_curves
+from perch_autopilot.watchdog import CENTRED, WatchdogSettings
+from perch_autopilot.wire import WireError
+
+_HANDSHAKE = 2.0                     # for the autopilot's version [s]
+_REFUSED = NANOSECONDS               # an order to arm that has had no effect for so long is refused [ns]
+_SELDOM = (msp.STATUS, msp.ATTITUDE, msp.ANALOG)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BetaflightParameters:
+    """Parameters of the node `betaflight`; all are read once, at the start."""
+
+    vehicle: str = text("betaflight", doc="config/vehicles/<name>.yaml, or a file")
+    wire: str = text("/dev/ttyACM0", doc="/dev/ttyACM0, /dev/ttyACM0@921600, tcp:HOST:PORT")
+    configuration: str = text("betaflight", doc="what the autopilot is set to: config/autopilot/<name>.txt, or a file")
+    one_g: float = quantity(512.0, above=0.0, high=1e4, doc="reading of its accelerometer at rest (RAW_IMU); 256 in the firmware as a program")
+    watchdog: WatchdogSettings = part(WatchdogSettings)
+
+
+class Betaflight(Component[BetaflightParameters]):
+    """Commands a flight controller that runs Betaflight.
+
+    Whether its motors turn is decided by the switch that it gets, by the firmware's own checks, and by the pilot, whose switch for the mode
+    MSP OVERRIDE takes the sticks back at any time.
+    """
+
+    config_type = BetaflightParameters
+
+    rates_thrust = Input(RatesThrust, "rates_thrust_command")
+    poll = Wake(0.01)
+    imu = Output(ImuSample, "imu/data_raw")
+
+    def __init__(self, config: BetaflightParameters) -> None:
+        """
+        Raises:
+            ConfigError: there is no such vehicle or configuration.
+            WireError: the wire cannot be opened.
+            MspError: nobody answers, or another firmware than this was written for.
+        """
+        super().__init__(config)
+        vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
+        self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
+        hover, descent = (self._sticks.channels((0.0, 0.0, 0.0), share * GRAVITY)[2] for share in (1.0, config.watchdog.descent))
+        self._link, self._parser = KeeperLink(config.wire, config.watchdog, hover, descent), msp.Parser()
+        try:
+            self.version = self._greet()
+        except BaseException:
+            self._link.close()
+            raise
+        self._polls, self._mode = 0, "disarmed"
+        self._status: msp.Status | None = None
+        self._attitude: tuple[float, float, float] | None = None
+        self._battery: msp.Battery | None = None
+        self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
+        self._wanted = False
+        self._answered, self._diagnosed = 0, 0
+
+    def _greet(self) -> msp.Version:
+        """Who is at the other end."""
+        answers: dict[int, msp.Frame] = {}
+        last = time.monotonic() + _HANDSHAKE
+        while time.monotonic() < last:
+            self._link.request(msp.request(msp.FC_VARIANT) + msp.request(msp.FC_VERSION))
+            for frame in self._parser.feed(self._link.receive(0.2)[0]):
+                answers[frame.command] = frame
+            if {msp.FC_VARIANT, msp.FC_VERSION} <= answers.keys():
+                return msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
+        noise = f"; {self._parser.skipped} bytes came that are no MSP: is the baud rate right?" if self._parser.skipped else ""
+        raise msp.MspError(f"{self.config.wire}: no autopilot answers within {_HANDSHAKE:g} s{noise}")
+
+    # -- to the autopilot --------------------------------------------------------------------------------------------
+
+    def on_rates_thrust(self, command: RatesThrust) -> None:
+        """On to the autopilot, until the next, or until it is stale."""
+        values = (*command.w_B, command.thrust)
+        if not sum(value * value for value in values) < 1e8:
+            self.warn(f"rates_thrust_command: {values} is not finite, or beyond any vehicle: ignored", every=1.0)
+            return
+        self._wanted = command.armed
+        self._link.command(command.armed, self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED)
+
+    # -- from it -----------------------------------------------------------------------------------------------------
+
+    def on_poll(self, now: int) -> None:
+        """Take what has come; ask for the next sample, and for the rest in turn."""
+        try:
+            data, said = self._link.receive()
+            for line in said:
+                self._mode = line
+                self.log(LogLine("info" if line in ("disarmed", "following") else "warning", f"autopilot: {line}"))
+            for frame in self._parser.feed(data):
+                self._take(frame, now)
+            self._polls += 1
+            asked = msp.request(msp.RAW_IMU)
+            if self._polls % 10 == 0:
+                asked += msp.request(_SELDOM[self._polls // 10 % len(_SELDOM)])
+            self._link.request(asked)
+        except WireError as error:
+            self.log(LogLine("error", str(error), 1.0))
+        if now - self._diagnosed >= NANOSECONDS:
+            self._diagnosed = now
+            self._diagnose(now)
+
+    def _take(self, frame: msp.Frame, now: int) -> None:
+        try:
+            if frame.command == msp.RAW_IMU:
+                force, rate = msp.inertial(frame, self.config.one_g)
+                self.imu(ImuSample(now, rate, force))
+                self._answered = now
+            elif frame.command == msp.STATUS:
+                self._status = msp.status(frame)
+                self._judge_arming(now)
+            elif frame.command == msp.ATTITUDE:
+                self._attitude = msp.attitude(frame)
+            elif frame.command == msp.ANALOG:
+                self._battery = msp.battery(frame)
+        except msp.MspError as error:
+            self.warn(str(error), every=1.0)
+
+    def _judge_arming(self, now: int) -> None:
+        """Say why it does not arm."""
+        if not self._wanted or self._status.armed:
+            self._wanted_since = None
+        elif self._wanted_since is None:
+            self._wanted_since = now
+        elif now - self._wanted_since > _REFUSED and self._status.refusals:
+            self.log(LogLine("error", f"the autopilot refuses to arm: {', '.join(self._status.refusals)}", 2.0))
+
+    def _diagnose(self, now: int) -> None:
+        silent = now - self._answered > NANOSECONDS
+        values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn, "skipped_bytes": self._parser.skipped}
+        if self._status is not None:
+            values |= {"armed": self._status.armed, "refusals": ", ".join(self._status.refusals)}
+        if self._battery is not None:
+            values |= {"voltage_v": self._battery.voltage, "current_a": self._battery.current, "rssi": self._battery.rssi}
+        if self._attitude is not None:
+            values |= dict(zip(("roll_rad", "pitch_rad", "heading_rad"), self._attitude))
+        self.diagnostics(Diagnostics(now, values, 2 if silent else 0, "the autopilot is silent" if silent else "ok"))
+
+    def close(self) -> None:
+        """Commands end: what flies descends, by the watchdog's times."""
+        self._link.close()

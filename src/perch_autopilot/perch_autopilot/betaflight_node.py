@@ -1,0 +1,7 @@
+"""Node `betaflight`: `ros2 run perch_autopilot betaflight`."""
+
+from perch_autopilot.betaflight import Betaflight
+from perch_core.ros.node import node
+
+NODE = node("betaflight", Betaflight)
+create, main = NODE.create, NODE.main

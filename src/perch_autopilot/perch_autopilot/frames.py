@@ -1,0 +1,48 @@
+"""Between the axes of ROS and those of aviation, in one place.
+
+    world: ENU (x east, y north, z up)       <->  NED (x north, y east, z down)
+    body:  FLU (x forward, y left, z up)     <->  FRD (x forward, y right, z down)
+
+Both changes of axes are their own inverse, so one function serves both ways. Vectors have shape (3,), quaternions are xyzw, shape (4,).
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+_H = sqrt(0.5)
+
+
+def world(v: np.ndarray) -> np.ndarray:
+    """A vector of the world, ENU <-> NED; any unit."""
+    return np.array([v[1], v[0], -v[2]])
+
+
+def body(v: np.ndarray) -> np.ndarray:
+    """A vector of the body, FLU <-> FRD; any unit."""
+    return np.array([v[0], -v[1], -v[2]])
+
+
+def attitude(q: np.ndarray) -> np.ndarray:
+    """Attitude of the body in the world: of FLU in ENU <-> of FRD in NED.
+
+        q' = q_NE q q_FB,   q_NE = (1, 1, 0, 0) / sqrt 2,  q_FB = (1, 0, 0, 0),   xyzw; the sign is that with w >= 0
+    """
+    x, y, z, w = q
+    turned = _H * np.array([x + y, x - y, w - z, w + z])
+    return turned if turned[3] >= 0.0 else -turned
+
+
+def world_covariance(covariance: np.ndarray) -> np.ndarray:
+    """Covariance of a vector of the world, shape (3, 3), ENU <-> NED."""
+    order = [1, 0, 2]
+    sign = np.array([1.0, 1.0, -1.0])
+    return covariance[np.ix_(order, order)] * np.outer(sign, sign)
+
+
+def body_covariance(covariance: np.ndarray) -> np.ndarray:
+    """Covariance of a vector of the body, shape (3, 3), FLU <-> FRD."""
+    sign = np.array([1.0, -1.0, -1.0])
+    return covariance * np.outer(sign, sign)

@@ -1,0 +1,222 @@
+"""MultiWii serial protocol, version 1, as Betaflight speaks it: frames, and the few messages that a companion computer needs.
+
+    '$' 'M' direction  size  command  payload  checksum        direction: '<' request, '>' answer, '!' refused
+                       u8    u8       size     xor of size, command and payload
+
+Numbers are little-endian. Axes of what the firmware sends are FRD, but `RAW_IMU` is as its sensors give it: see `inertial`.
+"""
+
+from __future__ import annotations
+
+import struct
+from math import radians
+from typing import NamedTuple
+
+from perch_core.errors import PerchError
+
+API_VERSION, FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, RC, ATTITUDE, STATUS, SET_RAW_RC, REBOOT = 1, 2, 3, 110, 102, 105, 108, 150, 200, 68
+LONGEST = 255
+VERSIONS = ((4, 3), (4, 6))
+"""Firmware with which the messages below have been read; later ones turn yaw's polarity."""
+ARMING_REASONS = (
+    "no gyro", "failsafe", "no radio signal (RX_FAILSAFE)", "not recovered from failsafe", "box failsafe switch", "runaway take-off", "crash detected",
+    "throttle is not low", "tilted beyond small_angle", "starting up (BOOT_GRACE_TIME)", "no pre-arm", "processor overload", "calibrating", "CLI is open",
+    "CMS menu is open", "OSD menu is open", "BST", "MSP connection blocks arming (configurator)", "paralyzed", "GPS rescue has no fix",
+    "RESC", "RPM filter without telemetry", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated", "motor protocol is not set",
+    "arming switch was on too early: switch it off first")
+"""Why the firmware refuses to arm: by bit of its flags, 4.3 to 4.6."""
+
+
+class MspError(PerchError):
+    """The other end does not speak MSP as it should."""
+
+
+class Frame(NamedTuple):
+    """An answer.
+
+    Attributes:
+        command: its number.
+        payload: its bytes.
+        refused: the other end does not know the command, or not now.
+    """
+
+    command: int
+    payload: bytes
+    refused: bool
+
+
+def request(command: int, payload: bytes = b"") -> bytes:
+    """A request as bytes.
+
+    Raises:
+        MspError: the payload is longer than a frame can be.
+    """
+    if len(payload) > LONGEST:
+        raise MspError(f"MSP {command}: {len(payload)} bytes are more than {LONGEST}")
+    body = bytes((len(payload), command)) + payload
+    return b"$M<" + body + bytes((_checksum(body),))
+
+
+def _checksum(body: bytes) -> int:
+    total = 0
+    for byte in body:
+        total ^= byte
+    return total
+
+
+class Parser:
+    """Finds answers in a stream of bytes, in whatever pieces it comes.
+
+    Attributes:
+        torn: frames with a wrong checksum so far.
+        skipped: bytes that belong to no frame so far.
+    """
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self.torn = self.skipped = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """What `data` completes; bytes that are no frame are skipped, a torn frame costs its first byte only."""
+        self._bytes += data
+        buffer, found = self._bytes, []
+        while True:
+            start = buffer.find(b"$M")
+            if start < 0:
+                keep = 1 if buffer.endswith(b"$") else 0
+                self.skipped += len(buffer) - keep
+                del buffer[:len(buffer) - keep]
+                return found
+            self.skipped += start
+            del buffer[:start]
+            if len(buffer) < 5:
+                return found
+            size = buffer[3]
+            if buffer[2] not in b">!":
+                self._skip()
+            elif len(buffer) < size + 6:
+                return found
+            elif _checksum(buffer[3:size + 5]) != buffer[size + 5]:
+                self.torn += 1
+                self._skip()
+            else:
+                found.append(Frame(buffer[4], bytes(buffer[5:size + 5]), buffer[2] == ord("!")))
+                del buffer[:size + 6]
+
+    def _skip(self) -> None:
+        self.skipped += 1
+        del self._bytes[:1]
+
+
+def _unpacked(layout: str, frame: Frame) -> tuple:
+    """The beginning of a frame's payload; later firmware appends."""
+    size = struct.calcsize(layout)
+    if frame.refused or len(frame.payload) < size:
+        raise MspError(f"MSP {frame.command}: " + ("refused" if frame.refused else f"{len(frame.payload)} bytes, needs {size}"))
+    return struct.unpack_from(layout, frame.payload)
+
+
+class Version(NamedTuple):
+    """Of the firmware."""
+
+    variant: str
+    number: tuple[int, int, int]
+
+    def __str__(self) -> str:
+        return f"{self.variant} {'.'.join(map(str, self.number))}"
+
+
+def version(variant: Frame, number: Frame) -> Version:
+    """Of the answers to `FC_VARIANT` and `FC_VERSION`.
+
+    Raises:
+        MspError: it is not Betaflight, or none of `VERSIONS`.
+    """
+    found = Version(_unpacked("<4s", variant)[0].decode("ascii", "replace"), _unpacked("<3B", number))
+    low, high = VERSIONS
+    if found.variant != "BTFL" or not low <= found.number[:2] <= high:
+        raise MspError(f"the autopilot runs {found}, not Betaflight (BTFL) {low[0]}.{low[1]} to {high[0]}.{high[1]}")
+    return found
+
+
+class Status(NamedTuple):
+    """Of the flight controller.
+
+    Attributes:
+        modes: flight modes that are on, a bit each, in the order of its boxes; bit 0 is ARM.
+        refusals: why it does not arm, empty: it does.
+    """
+
+    modes: int
+    refusals: tuple[str, ...]
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motors turn."""
+        return bool(self.modes & 1)
+
+
+def status(frame: Frame) -> Status:
+    """Of an answer to `STATUS` (MSP_STATUS_EX).
+
+    Raises:
+        MspError: it is too short.
+    """
+    modes, _, _, _, _, more = _unpacked("<6xIBHBBB", frame)
+    at = 16 + (more & 0x0F)
+    if len(frame.payload) < at + 5:
+        raise MspError(f"MSP {frame.command}: {len(frame.payload)} bytes, needs {at + 5}")
+    count, flags = struct.unpack_from("<BI", frame.payload, at)
+    return Status(modes, tuple(
+        ARMING_REASONS[bit] if bit < len(ARMING_REASONS) and bit != count - 1 else ARMING_REASONS[-1] if bit == count - 1 else f"flag {bit}"
+        for bit in range(32) if flags >> bit & 1))
+
+
+class Battery(NamedTuple):
+    """Voltage [V], charge used [mAh], strength of the radio's signal 0..1, current [A]."""
+
+    voltage: float
+    used: int
+    rssi: float
+    current: float
+
+
+def battery(frame: Frame) -> Battery:
+    """Of an answer to `ANALOG`.
+
+    Raises:
+        MspError: it is too short.
+    """
+    tenths, used, rssi, current = _unpacked("<BHHh", frame)
+    voltage = _unpacked("<7xH", frame)[0] / 100.0 if len(frame.payload) >= 9 else tenths / 10.0
+    return Battery(voltage, used, min(rssi / 1023.0, 1.0), current / 100.0)
+
+
+def attitude(frame: Frame) -> tuple[float, float, float]:
+    """Roll, pitch, heading of an answer to `ATTITUDE` [rad], FRD against NED: roll to the right, nose up, clockwise from north.
+
+    Raises:
+        MspError: it is too short.
+    """
+    roll, pitch, heading = _unpacked("<3h", frame)
+    return radians(roll / 10.0), radians(pitch / 10.0), radians(heading)
+
+
+def inertial(frame: Frame, one_g: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Specific force [m/s^2] and angular velocity [rad/s] of an answer to `RAW_IMU`, both in FLU.
+
+    Args:
+        frame: the answer.
+        one_g: reading of the accelerometer at rest (512 with the usual sensors, 256 in the simulated one).
+
+    Raises:
+        MspError: it is too short.
+    """
+    *force, p, q, r = _unpacked("<6h", frame)
+    x, y, z = (9.81 * value / one_g for value in force)
+    return (x, y, z), (radians(p), radians(q), radians(r))
+
+
+def channels(values: tuple[int, ...]) -> bytes:
+    """The request `SET_RAW_RC` with pulse widths [us]."""
+    return request(SET_RAW_RC, struct.pack(f"<{len(values)}H", *values))

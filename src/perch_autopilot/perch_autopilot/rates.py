@@ -1,0 +1,87 @@
+"""From body rates and thrust to a pilot's sticks: the firmware's rate curve, and the vehicle's thrust curve, backwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import degrees, sqrt
+
+from perch_core.errors import ConfigError
+from perch_core.vehicle import Vehicle
+
+CENTRE, HALF, LOW, HIGH = 1500, 500, 1000, 2000  # pulse widths [us]
+AXES = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class RateCurve:
+    """Betaflight's rate curve of type ACTUAL.
+
+        rate(s) = c s + (m - c) |s| (e s^5 + (1 - e) s),   s in [-1, 1]
+
+    Attributes:
+        centre: c, slope at the centre of the stick [deg/s].
+        most: m, at its end [deg/s].
+        expo: e, 0..1.
+    """
+
+    centre: float
+    most: float
+    expo: float
+
+    def rate(self, stick: float) -> float:
+        """Angular velocity [deg/s] at a stick's deflection in [-1, 1]."""
+        return self.centre * stick + max(self.most - self.centre, 0.0) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
+
+    def stick(self, rate: float) -> float:
+        """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. The curve rises, so it is found by bisection."""
+        if abs(rate) >= self.rate(1.0):
+            return 1.0 if rate > 0 else -1.0
+        low, high = 0.0, 1.0
+        for _ in range(14):  # finer than a microsecond of the pulse
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.rate(middle) < abs(rate) else (low, middle)
+        return 0.5 * (low + high) if rate > 0 else -0.5 * (low + high) if rate < 0 else 0.0
+
+
+def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
+    """The curves of roll, pitch and yaw of a configuration.
+
+    Raises:
+        ConfigError: they are of another type, or missing.
+    """
+    if settings.get("rates_type") != "ACTUAL":
+        raise ConfigError(source, "rates_type", f"{settings.get('rates_type')} is not ACTUAL, the one type that is known here")
+    try:
+        return tuple(RateCurve(10.0 * float(settings[f"{axis}_rc_rate"]), 10.0 * float(settings[f"{axis}_srate"]),
+                               float(settings[f"{axis}_expo"]) / 100.0) for axis in AXES)
+    except KeyError as error:
+        raise ConfigError(source, error.args[0], "is not set: the sticks' meaning depends on it") from None
+
+
+class Sticks:
+    """Channels of body rates and thrust, in Betaflight's order AETR: roll, pitch, throttle, yaw, then switches."""
+
+    def __init__(self, vehicle: Vehicle, curves: tuple[RateCurve, ...]) -> None:
+        """
+        Args:
+            vehicle: its mass and thrust curve.
+            curves: of roll, pitch, yaw.
+        """
+        self._curves, self._mass, self._coefficient = curves, vehicle.mass, vehicle.thrust_coefficient
+        self._idle, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
+
+    def throttle(self, thrust: float) -> float:
+        """Throttle 0..1 at which the four rotors together give a thrust per mass [m/s^2]: their speed is linear in it."""
+        speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient))
+        return min(max((speed - self._idle) / self._span, 0.0), 1.0)
+
+    def channels(self, rates: tuple[float, float, float], thrust: float) -> tuple[int, int, int, int]:
+        """Pulse widths [us] of roll, pitch, throttle, yaw.
+
+        Args:
+            rates: angular velocity in FLU [rad/s]. Betaflight's sticks: roll to the right, nose *down*, nose to the right.
+            thrust: of all rotors per mass [m/s^2].
+        """
+        p, q, r = (degrees(rate) for rate in rates)
+        roll, pitch, yaw = (round(CENTRE + HALF * curve.stick(rate)) for curve, rate in zip(self._curves, (p, q, -r)))
+        return roll, pitch, round(LOW + (HIGH - LOW) * self.throttle(thrust)), yaw

@@ -1,0 +1,80 @@
+"""What the autopilot is told while nobody says anything: level, descend, disarm. Pure: time is given to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from perch_core.config import quantity
+
+STICKS = 4
+CENTRED = (1500, 1500, 1000, 1500)
+ON, OFF = 1900, 1000  # of a switch [us]
+Channels = tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchdogSettings:
+    """When a command is stale, and what follows."""
+
+    rate: float = quantity(100.0, unit="Hz", low=50.0, high=250.0, doc="of the frames that the autopilot gets, whatever happens")
+    stale_after: float = quantity(0.1, unit="s", low=0.02, high=0.25, doc="a command that is older is not sent any more: level")
+    descend_after: float = quantity(0.5, unit="s", low=0.0, high=0.9, doc="after so long without a command, level: descend")
+    disarm_after: float = quantity(4.0, unit="s", low=0.5, high=60.0, doc="after so long without a command: motors off")
+    descent: float = quantity(0.9, low=0.5, high=1.0, doc="thrust of the descent as a share of the weight")
+
+
+class Mode(Enum):
+    """What the watchdog does."""
+
+    DISARMED = "disarmed"
+    FOLLOWING = "following"
+    LEVEL = "level: commands have stopped"
+    DESCENDING = "descending: commands have stopped"
+
+
+class Watchdog:
+    """Decides which channels go to the autopilot: roll, pitch, throttle, yaw, then the switches arm and level.
+
+    Attributes:
+        mode: what it does.
+    """
+
+    def __init__(self, settings: WatchdogSettings, hover: int, descent: int) -> None:
+        """
+        Args:
+            settings: times.
+            hover, descent: throttle that carries the weight, and that of the descent [us].
+        """
+        self._settings, self._hover, self._descent = settings, hover, descent
+        self.mode = Mode.DISARMED
+        self._sticks: Channels = CENTRED
+        self._wanted, self._came = False, 0.0
+        self._locked = False  # motors were taken away: only a command to disarm allows the next to arm
+
+    def command(self, now: float, armed: bool, sticks: Channels) -> None:
+        """Take a command.
+
+        Args:
+            now: [s].
+            armed: whether the motors shall turn.
+            sticks: roll, pitch, throttle, yaw [us].
+        """
+        self._wanted, self._came, self._sticks = armed, now, sticks
+        self._locked = self._locked and armed
+
+    def channels(self, now: float) -> Channels:
+        """What the autopilot gets now [us]; never a command that is stale."""
+        age = now - self._came
+        limits = self._settings
+        if not self._wanted or self._locked or age < 0.0:
+            self.mode = Mode.DISARMED
+        elif age <= limits.stale_after:
+            self.mode = Mode.FOLLOWING
+            return (*self._sticks, ON, OFF)
+        elif age <= limits.disarm_after:
+            self.mode = Mode.LEVEL if age <= limits.descend_after else Mode.DESCENDING
+            return (1500, 1500, self._hover if self.mode is Mode.LEVEL else self._descent, 1500, ON, ON)
+        else:
+            self.mode, self._locked = Mode.DISARMED, True
+        return (*CENTRED, OFF, OFF)

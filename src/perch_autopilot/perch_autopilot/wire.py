@@ -1,0 +1,97 @@
+"""The wire to an autopilot: a serial line, or TCP."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import socket
+import termios
+import tty
+
+from perch_core.errors import PerchError
+
+CONNECT_TIMEOUT = 3.0  # [s]
+
+
+class WireError(PerchError):
+    """There is no such wire, or it has ended."""
+
+
+class Wire:
+    """Bytes to and from an autopilot."""
+
+    def __init__(self, address: str) -> None:
+        """
+        Args:
+            address: `/dev/ttyACM0`, `/dev/ttyACM0@921600` (115200 baud without a rate), `tcp:HOST:PORT`, or `fd:NUMBER`, a file that
+                this process has.
+
+        Raises:
+            WireError: it cannot be opened.
+        """
+        self._socket: socket.socket | None = None
+        try:
+            if found := re.fullmatch(r"tcp:([^:]+):(\d+)", address):
+                self._socket = socket.create_connection((found[1], int(found[2])), timeout=CONNECT_TIMEOUT)
+                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self.file = self._socket.fileno()
+            elif found := re.fullmatch(r"fd:(\d+)", address):
+                self.file = int(found[1])
+            else:
+                device, _, baud = address.partition("@")
+                self.file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                self._set_serial(baud or "115200", address)
+            os.set_blocking(self.file, False)
+        except (OSError, OverflowError) as error:
+            raise WireError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
+
+    def _set_serial(self, baud: str, address: str) -> None:
+        speed = getattr(termios, f"B{baud}", None)
+        if speed is None:
+            raise WireError(f"{address}: {baud} baud is no rate of a serial line")
+        try:
+            tty.setraw(self.file)
+            attributes = termios.tcgetattr(self.file)
+            attributes[4] = attributes[5] = speed
+            termios.tcsetattr(self.file, termios.TCSANOW, attributes)
+        except termios.error as error:
+            raise WireError(f"{address}: is no serial line: {error}") from None
+
+    def write(self, data: bytes) -> None:
+        """Send; what the line cannot take now is lost, as a stale command would be worse.
+
+        Raises:
+            WireError: it has ended.
+        """
+        try:
+            os.write(self.file, data)
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            raise WireError(f"the wire to the autopilot has ended: {error.strerror}") from None
+
+    def read(self, timeout: float = 0.0) -> bytes:
+        """What has come within a time [s]; empty: nothing.
+
+        Raises:
+            WireError: it has ended.
+        """
+        if not select.select([self.file], [], [], timeout)[0]:
+            return b""
+        try:
+            data = os.read(self.file, 4096)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise WireError(f"the wire to the autopilot has ended: {error.strerror}") from None
+        if not data:
+            raise WireError("the wire to the autopilot has ended")
+        return data
+
+    def close(self) -> None:
+        """Close it."""
+        if self._socket is not None:
+            self._socket.close()
+        else:
+            os.close(self.file)
