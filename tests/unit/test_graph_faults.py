@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 from perch_eval.graph_faults import campaign
-from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named
+from perch_eval.graph_faults.cases import (
+    FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named)
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.nursery import Nursery, alive, session
 
@@ -44,9 +45,9 @@ def test_ends(situation, end):
 
 
 def test_a_node_is_no_witness_of_itself_and_routine_names_nobody():
-    lines = [("estimator", "[ERROR] [1000000101.0] [estimator]: odometry lost"), ("mission", "[INFO] [1000000101.0] [mission]: odometry is good"),
-             ("controller", "[INFO] [1000000102.5] [controller]: descent without position: no odometry"),
-             ("vehicle", "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator is gone"), ("vehicle", "Traceback: estimator")]
+    lines = ["[ERROR] [1000000101.0] [estimator]: odometry lost", "[INFO] [1000000101.0] [mission]: odometry is good",
+             "[INFO] [1000000102.5] [controller]: descent without position: no odometry",
+             "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator is gone", "Traceback: estimator"]
     assert named(CASE, 1000000100.0, lines, []) == (2.5, "controller: descent without position: no odometry")
     assert named(CASE, 1000000100.0, lines[:2], []) is None
     assert named(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has been silent for 3 s")])[0] == 1.5
@@ -67,8 +68,8 @@ def test_disturbances():
 
 
 def row(**changes) -> dict:
-    return {**CASE._asdict(), "seed": 1, "commit": "abc", "struck": 3.0, "before": [1.0, 0.0, 0.0], "end": "landed", "named": 0.5, "words": "w",
-            "goal": "g", "impact": 0.0, "ended": [], "left": [], "duration": 9.0} | changes
+    return {**CASE._asdict(), "seed": 1, "commit": "abc", "struck": 3.0, "before": [1.0, 0.0, 0.0], "end": "landed", "named": 0.5,
+            "words": "w", "goal": "g", "impact": 0.0, "ended": [], "left": [], "duration": 9.0} | changes
 
 
 @pytest.mark.parametrize("changes, problem", [
@@ -93,11 +94,11 @@ def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
 
 def test_processes_of_a_nursery_are_their_own_and_end_with_it(tmp_path, monkeypatch):
     (tmp_path / "sleeper.py").write_text(
-        "import os, subprocess, sys, time\nclass Sleeper:\n    @staticmethod\n    def main():\n        print(sys.argv[1], os.environ['WORD'], flush=True)\n"
-        "        subprocess.Popen(['sleep', '60'])\n        time.sleep(60)\n")
+        "import os, subprocess, sys, time\ndef sleeper():\n    print(sys.argv[1], os.environ['WORD'], flush=True)\n"
+        "    subprocess.Popen(['sleep', '60'])\n    time.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     nursery = Nursery(("sleeper",))
-    pids = [nursery.start("sleeper:Sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}) for k in range(2)]
+    pids = [nursery.start("sleeper:sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}) for k in range(2)]
     until(lambda: all(len(session(pid)) == 2 for pid in pids))
     assert [Path(tmp_path / f"{k}.log").read_text() for k in range(2)] == ["number 0 heard\n", "number 1 heard\n"]
     os.kill(pids[0], signal.SIGKILL)

@@ -9,7 +9,8 @@ from perch_eval import soak
 
 
 def flights(memory, descriptors=lambda k: 10, good=lambda k: True):
-    return [soak.Flight(float(k), "perched" if good(k) else "missed", good(k), "", {"all": soak.Sample(memory(k), descriptors(k), 5)}, 1.0) for k in range(150)]
+    return [soak.Flight(float(k), "perched" if good(k) else "missed", good(k), "", {"all": soak.Sample(memory(k), descriptors(k), 5)}, 1.0)
+            for k in range(150)]
 
 
 def test_what_grows_is_found():

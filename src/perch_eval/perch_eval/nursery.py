@@ -49,7 +49,7 @@ class Nursery:
         """Start a node.
 
         Args:
-            what: `module:name` of something with `main()`.
+            what: `module:name` of something with `main()`, or of a function.
             arguments: of its command line.
             log: receives what it writes.
             environment: on top of the caller's.
@@ -124,7 +124,8 @@ def _become(order: dict) -> None:
         os.closerange(3, 256)
         os.environ.update(order["environment"])
         sys.argv = [order["what"], *order["arguments"]]
-        resolved(order["what"]).main()
+        what = resolved(order["what"])
+        getattr(what, "main", what)()
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1

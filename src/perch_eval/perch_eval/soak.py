@@ -123,6 +123,8 @@ def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: flo
                         break
         except StackError as error:
             print(f"\n{error}", file=sys.stderr)
+        except KeyboardInterrupt:
+            print("\ninterrupted; what has been flown counts", file=sys.stderr)
         finally:
             progress.close()
             pilot.close()
@@ -164,7 +166,7 @@ def verdicts(flights: Sequence[Flight]) -> list[str]:
     for name, of in growth(flights).items():
         if of["slope_MB_per_100"] is not None and of["slope_MB_per_100"] > BAR:
             found.append(f"{name}: memory grows by {of['slope_MB_per_100']:.2f} MB per 100 flights")
-        found += [f"{name}: {what} between {of[what][0]} and {of[what][1]}" for what in ("descriptors", "threads") if of[what][0] != of[what][1]]
+        found += [f"{name}: {what} between {low} and {high}" for what in ("descriptors", "threads") for low, high in (of[what],) if low != high]
     return found
 
 
@@ -193,38 +195,41 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
 
 def page(folder: Path) -> str:
     """The page of all soaks whose figures lie in a folder."""
-    text = ["# Soak", "", "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart, perch "
-            f"again. Growth of memory by least squares over the flights after the first {SETTLED}; bar: {BAR:g} MB per 100 flights, descriptors and "
-            "threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
+    text = ["# Soak", "", "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
+            f"perch again. Growth of memory by least squares over the flights after the first {SETTLED}; bar: {BAR:g} MB per 100 flights,",
+            "descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
     for file in sorted(folder.glob("*.json")):
         run = json.loads(file.read_text())
         good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
         sight = "with cameras" if run["cameras"] else "without cameras (error models in their place)"
-        text += ["", f"## {file.stem}", "", f"`{run['scenario']}`, seed {run['seed']}, {sight}; {run['commit']}, {run['machine']}; "
-                 f"{good} of {len(run['flights'])} flights perched and departed, {run['flights'][-1]['time'] / 60.0:.1f} min of simulated time in "
-                 f"{run['wall_s'] / 60.0:.1f} min.", "",
-                 "| process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads |", "| --- | --- | --- | --- | --- | --- |"]
+        minutes = run["flights"][-1]["time"] / 60.0
+        text += ["", f"## {file.stem}", "", f"`{run['scenario']}`, seed {run['seed']}, {sight}; {run['commit']}, {run['machine']}.",
+                 f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in {run['wall_s'] / 60.0:.1f} min.",
+                 "", "| process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads |", "| --- " * 6 + "|"]
         for name, of in run["growth"].items():
             rate = "too few flights" if of["slope_MB_per_100"] is None else f"{of['slope_MB_per_100']:+.2f}"
             text.append(f"| {name} | {of['rss_first_MB']:.1f} | {of['rss_last_MB']:.1f} | {rate} | " + " | ".join(
                 f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])) + " |")
         shared = [flight["shared"] for flight in run["flights"]]
-        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB. " + ("Not as it should be:" if run["problems"] else "All as it should be."),
-                 *([""] if run["problems"] else []), *(f"* {problem}" for problem in run["problems"]), "", f"![{file.stem}]({file.stem}.png)"]
+        verdict = ["Not as it should be:", "", *(f"* {problem}" for problem in run["problems"])] if run["problems"] else ["All as it should be."]
+        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)"]
     return "\n".join(text) + "\n"
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="soak.py", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = argparse.ArgumentParser(prog="soak.py", description=__doc__, epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     out.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a file (default: %(default)s)")
     out.add_argument("--seed", type=int, default=1, help="of every random number (default: %(default)s)")
     out.add_argument("--hours", type=float, default=1.0, help="of simulated time (default: %(default)s)")
     out.add_argument("--flights", type=count, metavar="N", help="at most so many")
     out.add_argument("--cameras", action="store_true", help="render and look at images, too")
-    out.add_argument("--composed", nargs="*", metavar="NODE", help="nodes that share a process; all without names (default: " + ", ".join(FAST_NODES) + ")")
+    out.add_argument("--composed", nargs="*", metavar="NODE",
+                     help=f"nodes that share a process; all without names (default: {', '.join(FAST_NODES)})")
     out.add_argument("--name", help="of the run's files (default: the scenario's)")
-    out.add_argument("--out", type=Path, default=Path("docs/results/soak"), metavar="DIR", help="folder of figures and page (default: %(default)s)")
+    out.add_argument("--out", type=Path, default=Path("docs/results/soak"), metavar="DIR",
+                     help="folder of figures and page (default: %(default)s)")
     out.add_argument("--logs", type=Path, default=Path("out/soak"), metavar="DIR", help="folder of logs (default: %(default)s)")
     return out
 
@@ -238,7 +243,8 @@ def main(arguments: list[str] | None = None) -> int:
             raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
         output_folder(args.out), output_folder(args.logs)
         code = commit()
-        flights = fly(args.scenario, args.seed, args.cameras, sharing(args.composed, otherwise=FAST_NODES), args.hours, args.flights, args.logs)
+        composed = sharing(args.composed, otherwise=FAST_NODES)
+        flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs)
         if not flights:
             raise PerchError(f"no flight was flown; logs: {args.logs}")
     except (PerchError, OSError) as error:

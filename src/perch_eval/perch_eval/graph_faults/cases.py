@@ -49,7 +49,7 @@ WORDS = {
 """What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
 _TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|restarted|back)\b",
                       re.IGNORECASE)
-_STAMP = re.compile(r"\[(?P<time>\d{9,}\.\d+)\]")
+_LINE = re.compile(r"\[(?P<level>[A-Z]+)\] \[(?P<time>\d{9,}\.\d+)\] \[(?P<node>[\w.]+)\]: (?P<text>.*)")
 
 
 class Case(NamedTuple):
@@ -69,6 +69,11 @@ class Case(NamedTuple):
     def seed(self) -> int:
         """Of the flight, and of the moment within the phase."""
         return int(self._digest[:7], 16)
+
+    @property
+    def alone(self) -> bool:
+        """Whether every node has a process of its own; otherwise the struck one has, and most of the others share one, as in `demo.py`."""
+        return self.seed % 4 == 0
 
     @property
     def _digest(self) -> str:
@@ -113,21 +118,19 @@ def ending(now: Situation) -> str:
     return "held with running motors" if now.held else "on the ground with running motors" if now.height < 0.15 else "in flight"
 
 
-def named(case: Case, struck: float, lines: Iterable[tuple[str, str]], said: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
+def named(case: Case, struck: float, lines: Iterable[str], said: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
     """When after the fault [s], and by which words, who and what it is was said; None: never.
 
     Args:
         case: the fault; the node that it strikes is no witness.
         struck: when, seconds since the epoch.
-        lines: (node, line of its log, stamped with seconds since the epoch).
+        lines: of all logs, each with level, seconds since the epoch, node.
         said: (seconds since the epoch, words) of who sent the goal.
     """
     words = re.compile(WORDS[case.node], re.IGNORECASE)
     found = [(time - struck, f"pilot: {text}") for time, text in said if time >= struck and words.search(text)]
-    for node, line in lines:
-        stamp = _STAMP.search(line)
-        if stamp and node != case.node and float(stamp["time"]) >= struck:
-            text = line[stamp.end():].replace(f"[{node}]: ", "").strip()
-            if words.search(text) and (_TROUBLE.search(text) or line.startswith(("[WARN", "[ERROR"))):
-                found.append((float(stamp["time"]) - struck, f"{node}: {text}"))
+    for line in filter(None, map(_LINE.match, lines)):
+        after, text = float(line["time"]) - struck, line["text"]
+        if line["node"] != case.node and after >= 0.0 and words.search(text) and (_TROUBLE.search(text) or line["level"] != "INFO"):
+            found.append((after, f"{line['node']}: {text}"))
     return min(found, default=None)

@@ -1,7 +1,8 @@
-"""One flight on the real graph with one fault: a process for every node, no cameras, a pilot that sends the goal."""
+"""One flight on the real graph with one fault: a process for the node that is struck, no cameras, a pilot that sends the goal."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -92,24 +93,32 @@ class Group:
     """The processes of one flight.
 
     Attributes:
-        pids: node -> process id of the present one.
+        pids: process -> id of the present one; its name is that of its node, or `composed`.
+        nodes: fully qualified names.
     """
 
-    def __init__(self, nursery: Nursery, launches: tuple[NodeLaunch, ...], relayed: str, folder: Path, domain: int) -> None:
+    def __init__(self, nursery: Nursery, launches: tuple[NodeLaunch, ...], case: Case, folder: Path, domain: int) -> None:
         """
         Args:
             nursery: starts them.
             launches: the nodes.
-            relayed: the node whose messages pass the relay; empty: none.
+            case: says who has a process, and whose messages pass the relay.
             folder: receives parameters and logs.
             domain: ROS domain.
         """
         self._nursery, self._folder, self._domain = nursery, folder, domain
         self._commands = {one.name: (self._place(one), ros_arguments(one, folder)) for one in launches}
-        channels = TALKERS.get(relayed, ())
-        if channels:
-            self._commands[relayed][1][1:1] = [text for channel in channels for text in ("-r", f"{channel}:={DIRECT}/{channel}")]
+        self.nodes = {f"/{name}" for name in self._commands}
+        together = [] if case.alone else [one for one in launches if one.name not in (*SIGHTS, case.node)]
+        if together:
+            plan = [{"name": one.name, "module": one.module, "arguments": self._commands.pop(one.name)[1]} for one in together]
+            (folder / "composed.json").write_text(json.dumps(plan))
+            self._commands["composed"] = "perch_eval.composed_node:main", [str(folder / "composed.json")]
+        if case.fault not in PROCESS:
+            channels = TALKERS[case.node]
+            self._commands[case.node][1][1:1] = [text for channel in channels for text in ("-r", f"{channel}:={DIRECT}/{channel}")]
             self._commands["relay"] = "perch_eval.graph_faults.relay_node:Relay", [*channels, "--ros-args"]
+            self.nodes.add("/relay")
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []
         self._memory = SharedMemory()
@@ -139,18 +148,12 @@ class Group:
         """Nodes whose processes have ended."""
         return tuple(name for name, pid in self.pids.items() if not alive(pid))
 
-    def lines(self) -> Iterator[tuple[str, str]]:
-        """(node, line) of everything that was written."""
-        for name in self._commands:
-            for line in (self._folder / f"{name}.log").read_text(errors="replace").splitlines():
-                yield name, line
+    def lines(self) -> list[str]:
+        """Everything that was written."""
+        return [line for name in self._commands for line in (self._folder / f"{name}.log").read_text(errors="replace").splitlines()]
 
-    def stop(self) -> tuple[str, ...]:
-        """End everything.
-
-        Returns:
-            What is left all the same, in words.
-        """
+    def stop(self) -> None:
+        """End everything."""
         self._memory.observe(self.pids.values())
         running = [pid for pid in self.pids.values() if alive(pid)]
         for number, patience in zip((signal.SIGINT, signal.SIGKILL), STOPPING):
@@ -163,6 +166,9 @@ class Group:
             end = time.monotonic() + patience
             while time.monotonic() < end and (running := [pid for pid in running if alive(pid)]):
                 time.sleep(0.02)
+
+    def left(self) -> tuple[str, ...]:
+        """What is left when all have been stopped, the pilot included, in words; shared memory is cleaned first."""
         end = time.monotonic() + STOPPING[1]
         while (found := [pid for leader in self._sessions for pid in session(leader)]) and time.monotonic() < end:
             time.sleep(0.05)
@@ -274,18 +280,15 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
     hold = {"mission": {"lockstep_hold": "perch"}} if lockstep else None
     launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
     with reserved_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain, _in_domain(domain):
-        group = Group(nursery, launches, case.node if case.fault not in PROCESS else "", folder, domain)
-        pilot = Pilot()
-        left: tuple[str, ...] = ()
+        group, pilot = Group(nursery, launches, case, folder, domain), Pilot()
         try:
             watcher = Watcher(pilot)
             director = _Director(case, group, watcher, scenario.mission.takeoff_height, pad_surface(scenario, 0.0))
             group.start_all()
-            wanted = {f"/{name}" for name in group.pids}
             limit = time.monotonic() + READY
-            while not wanted <= pilot.visible_nodes():
+            while missing := group.nodes - pilot.visible_nodes():
                 if time.monotonic() > limit or group.ended():
-                    raise PerchError(f"not ready: {', '.join(group.ended() or sorted(wanted - pilot.visible_nodes()))}; logs: {folder}")
+                    raise PerchError(f"not ready: {', '.join(group.ended() or sorted(missing))}; logs: {folder}")
             try:
                 result = pilot.fly(scenario, director.on_phase, director.look, stall=STALL)
                 goal = f"{result.outcome}: {result.message}"
@@ -295,8 +298,9 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
             end = _settled(pilot, watcher, director)
             ended = tuple(name for name in group.ended() if name != case.node or case.fault == "restart" or case.fault not in PROCESS)
         finally:
-            left = group.stop()
+            group.stop()
             pilot.close()
+            left = group.left()
     found = named(case, director.struck, group.lines(), director.said) if director.struck is not None else None
     touched = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
                and director.at is not None and 1e-9 * c.stamp >= director.at]
