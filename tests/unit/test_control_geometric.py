@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.geometric.law import attitude_error, geometric_step
 from perch_control.geometric.step import predicted
-from perch_control.reference import FlatReference, SampledReference, Setpoint, heading, packed_many
+from perch_control.reference import FlatReference, SampledReference, Setpoint, packed_many
 from perch_control.rotor_lag import RotorEstimate, leading_command, reachable, thrusts
 from perch_control.settings import GeometricGains
 from perch_core import rigid_body
-from perch_core.flatness import flat_to_state
+from perch_core.flatness import flat_to_state, heading_derivatives
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import load_vehicle
 
@@ -31,7 +31,7 @@ def flat(rng, yaw_rate=True):
 
 
 def setpoint(x):
-    return Setpoint(*(tuple(map(float, v)) for v in x[:5]), *heading(*map(float, x[5:])))
+    return Setpoint(*(tuple(map(float, v)) for v in x[:5]), *heading_derivatives(*map(float, x[5:])))
 
 
 def body(R, w):

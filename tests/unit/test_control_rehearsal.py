@@ -5,14 +5,18 @@ import pytest
 
 from closed_loop.loop import make_loop, perch
 from perch_control.admission import AtEnd
-from perch_core import bernstein
 from perch_core.trajectory import FlatTrajectory
 
 
 def rest_of(trajectory, time):
     """The same trajectory from a time [s] on, as a new plan for an unmoved target would be."""
     k, s = trajectory.locate(time)
-    right = bernstein.subdivide(trajectory.coefficients[k], s)[1]
+    work = trajectory.coefficients[k].copy()
+    right = [work[:, -1]]
+    while work.shape[1] > 1:  # de Casteljau
+        work = (1 - s) * work[:, :-1] + s * work[:, 1:]
+        right.insert(0, work[:, -1])
+    right = np.stack(right, axis=-1)
     durations = np.concatenate([[(1 - s) * trajectory.durations[k]], trajectory.durations[k + 1:]])
     return FlatTrajectory(durations, np.concatenate([right[None], trajectory.coefficients[k + 1:]]))
 

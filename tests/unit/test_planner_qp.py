@@ -41,6 +41,7 @@ def cost(coefficients: np.ndarray, durations: np.ndarray, order: int) -> float:
 
 @pytest.mark.parametrize("order", [3, 4])
 def test_gram_matrices_are_the_integrals(order):
+    """[M:eq5]"""
     nodes, weights = np.polynomial.legendre.leggauss(16)
     rows = bernstein.evaluate(reference_element.TABLES[order, :15 - order].T, 0.5 * (nodes + 1.0))
     assert reference_element.GRAMS[order] == pytest.approx((rows * weights / 2) @ rows.T, rel=1e-9, abs=1e-8)
@@ -72,6 +73,7 @@ def solved(made, rows, solver: str = "daqp") -> np.ndarray:
 @pytest.mark.parametrize("objective, order", [("snap", 4), ("jerk", 3)])
 @pytest.mark.parametrize("waypoints, durations", [((), (1.6,)), (THREE, (0.7, 0.5, 0.5, 0.7))])
 def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
+    """The program that flies has the optimum of the paper's. [M:eq4-8]"""
     asked, durations = problem(60.0, waypoints), np.array(durations)
     settings = PerchSettings(objective=objective, tangential_speed_max=20.0)  # which the paper leaves free
     contact = Contact(asked, settings, VEHICLE.perch_offset)
@@ -113,6 +115,7 @@ def test_contradictory_bounds_are_not_called_solved(name):
 
 
 def test_end_conditions_and_continuity_are_exact():
+    """[M:eq6, M:eq7, M:eq11, M:eq14]"""
     durations = np.array([0.7, 0.5, 0.5, 0.7])
     made, rows, given, values = program(Contact(problem(90.0, THREE), PerchSettings(), VEHICLE.perch_offset), durations)
     coefficients = solved(made, rows)

@@ -1,10 +1,9 @@
-"""The planner around the solver: recoveries from anywhere, extra lines, files and reports, the search for a start."""
+"""The planner around the solver: recoveries from anywhere, extra lines, files and reports."""
 
 from __future__ import annotations
 
 import csv
 import json
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,7 +22,6 @@ from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.report import write_report
 from perch_planner.powerline.request import PerchPose
-from perch_planner.powerline.starts import StartSearch, best_start
 
 ROOT = Path(__file__).resolve().parents[2]
 VEHICLE = load_vehicle("rpg")
@@ -162,26 +160,3 @@ def test_problem_files_are_read_strictly(change: str, words: str, tmp_path: Path
     path.write_text("\n".join([*kept, change]))
     with pytest.raises(ConfigError, match=words):
         problem.load(path)
-
-
-def test_best_start_prefers_sight_and_short_ways(planner: PowerlinePlanner) -> None:
-    request = replace(problem.load("powerline_line_80_pa").request(VEHICLE), with_recovery=False)
-    search = StartSearch(distances=(3.0,), heights=(0.0, -4.0), bearings=(0.0,))
-    scores = best_start(request, planner.plan, VEHICLE, planner.solver.model, 0.8, search=search)
-    assert len(scores) == 2  # the present start and one candidate: the other is below the minimum height
-    assert scores[0].score <= scores[1].score < np.inf
-    for item in scores:
-        assert item.plan is not None and item.duration == item.plan.perch.duration and 0 <= item.seen_share <= 1
-
-
-def test_starts_that_are_refused_come_last_with_their_reason(planner: PowerlinePlanner) -> None:
-    search = StartSearch(distances=(0.05,), heights=(0.0,), bearings=(0.0,))
-    scores = best_start(replace(REQUEST, with_recovery=False), planner.plan, VEHICLE, planner.solver.model, 0.8, search=search)
-    assert scores[0].plan is not None and scores[1].plan is None and "nearer than the body" in scores[1].refusal
-
-
-def test_the_example_of_the_documentation_runs(capsys: pytest.CaptureFixture) -> None:
-    text = (ROOT / "docs" / "powerline.md").read_text()
-    example = re.search(r"```python\n(.*?)```", text, re.S).group(1)
-    exec(compile(example, "docs/powerline.md", "exec"), {})
-    assert len(capsys.readouterr().out.splitlines()) == 3

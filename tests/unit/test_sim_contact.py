@@ -31,8 +31,7 @@ def throw(plant: Plant, normal=0.5, tangential=0.0, tilt_deg=0.0, aside=0.0, gap
     """Put the vehicle `gap` in front of the pad, flying at it. `tilt` pitches, `aside` is along s2, `tangential` up."""
     pad = scenario.surface
     R_WB = pad.R_WS @ so3.exp(np.array([0.0, np.radians(tilt_deg), 0.0]))
-    p_WB, _ = pad.contact_pose(VEHICLE.perch_offset)
-    p_WB = p_WB + pad.R_WS @ np.array([0.0, aside, gap + 0.05 * abs(np.sin(np.radians(tilt_deg)))])
+    p_WB = pad.p_WS + VEHICLE.perch_offset * pad.normal + pad.R_WS @ np.array([0.0, aside, gap + 0.05 * abs(np.sin(np.radians(tilt_deg)))])
     v_WB = pad.R_WS @ np.array([tangential, 0.0, -normal])
     plant.place(p_WB, so3.quat_from_matrix(R_WB), v_WB, np.zeros(3), OFF)
 

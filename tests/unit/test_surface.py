@@ -49,13 +49,6 @@ def test_corners_turn_clockwise_when_seen_from_outside():
     assert np.cross(edges[0], edges[1]) @ surface.normal < 0
 
 
-def test_contact_pose_holds_the_velcro_on_the_pad():
-    surface = PerchSurface.from_inclination([3.0, 0.0, 1.5], np.pi / 3)
-    p_WB, R_WB = surface.contact_pose(0.05)
-    velcro_W = p_WB + R_WB @ [0, 0, -0.05]
-    np.testing.assert_allclose(velcro_W, surface.p_WS, atol=1e-12)
-
-
 @pytest.mark.parametrize("arguments, key", [
     (([0, 0, 0], -0.1), "inclination"), (([0, 0, np.nan], 1.0), "p_WS"), (([0, 0, 0], 1.0, 0.0, (0.6, 0.0)), "size")])
 def test_impossible_surfaces_are_refused(arguments, key):

@@ -6,12 +6,12 @@ A source is anything with `duration` and `setpoint(t)`, t in seconds since its s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import cos, sin
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from perch_core import bernstein, so3
+from perch_core.flatness import heading_derivatives
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import GRAVITY
@@ -69,14 +69,6 @@ def _floats(v) -> Vector:
     return (float(v[0]), float(v[1]), float(v[2]))
 
 
-@compiled
-def heading(yaw: float, rate: float, acceleration: float) -> tuple[Vector, Vector, Vector]:
-    """b2_des of a yaw angle and its first two derivatives. [M:eq12]"""
-    c, s = cos(yaw), sin(yaw)
-    return ((-s, c, 0.0), (-c * rate, -s * rate, 0.0),
-            (s * rate * rate - c * acceleration, -c * rate * rate - s * acceleration, 0.0))
-
-
 class Following(Protocol):
     """A running reference: its source, the time since it began, and its setpoint some time from now."""
 
@@ -128,7 +120,7 @@ def flat_setpoints(tables, edges, durations, choose, times, out):
             for order in range(5):
                 for i in range(3):
                     row[3 * order + i] = x[order, i]
-        h, dh, ddh = heading(yaw, rate, acc)
+        h, dh, ddh = heading_derivatives(yaw, rate, acc)
         for i in range(3):
             row[15 + i], row[18 + i], row[21 + i] = h[i], dh[i], ddh[i]
 

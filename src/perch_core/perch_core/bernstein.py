@@ -139,22 +139,6 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out / binomials(n + m)
 
 
-def subdivide(coefficients: np.ndarray, s: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """De Casteljau's algorithm: the same polynomials on [0, s] and on [s, 1], each mapped to [0, 1].
-
-    Returns:
-        Two arrays of the shape of `coefficients`.
-    """
-    work = np.array(coefficients, float)
-    left, right = np.empty_like(work), np.empty_like(work)
-    last = work.shape[-1] - 1
-    for k in range(last + 1):
-        left[..., k] = work[..., 0]
-        right[..., last - k] = work[..., last - k]
-        work[..., :last - k] = (1.0 - s) * work[..., :last - k] + s * work[..., 1:last - k + 1]
-    return left, right
-
-
 @lru_cache(maxsize=None)
 def power_matrix(degree: int) -> np.ndarray:
     """Matrix M with `powers = coefficients @ M.T` for powers of s in ascending order, integers, read-only."""
@@ -169,11 +153,3 @@ def to_powers(coefficients: np.ndarray) -> np.ndarray:
     """Coefficients of ascending powers of s, shape as given. Loses about 0.5 * degree digits: not for bounds."""
     coefficients = np.asarray(coefficients, float)
     return coefficients @ power_matrix(coefficients.shape[-1] - 1).T
-
-
-def from_powers(powers: np.ndarray) -> np.ndarray:
-    """Bernstein coefficients from ascending powers of s, shape as given."""
-    powers = np.asarray(powers, float)
-    n = powers.shape[-1] - 1
-    M = np.array([[comb(i, k) / comb(n, k) if k <= i else 0.0 for k in range(n + 1)] for i in range(n + 1)])
-    return powers @ M.T

@@ -72,14 +72,6 @@ class Catenary:
                        math.log(span / 60.0), math.log(span**2 / sag + span) + 2.0, xtol=1e-14)
         return cls(start, end, math.exp(log_a), down)
 
-    @classmethod
-    def from_tension(cls, start: np.ndarray, end: np.ndarray, horizontal_tension: float, weight_per_length: float,
-                     down: np.ndarray = DOWN) -> Catenary:
-        """The cable under a horizontal tension [N] with a weight per length [N/m]."""
-        if not (horizontal_tension > 0 and weight_per_length > 0):
-            raise PerchError(f"cable: tension {horizontal_tension!r} N and weight {weight_per_length!r} N/m must be > 0")
-        return cls(start, end, horizontal_tension / weight_per_length, down)
-
     @property
     def _rise(self) -> float:
         return float(-(self.end - self.start) @ self.down)
@@ -149,14 +141,6 @@ class Catenary:
         """`count` points in W from start to end, evenly spread along the cable [m], shape (count, 3)."""
         return self.point(np.linspace(0.0, self.length, count))
 
-    def tension(self, s: np.ndarray | float, weight_per_length: float) -> np.ndarray:
-        """Tension [N] at arc lengths s [m] of a cable with this weight per length [N/m]."""
-        if self.straight:
-            raise PerchError("cable: a straight cable's tension is unbounded")
-        slope = np.asarray(s, dtype=float) / self.parameter - math.sinh(self._x0 / self.parameter)
-        return weight_per_length * self.parameter * np.sqrt(1 + slope**2)
-
-
 @dataclass(frozen=True, eq=False)
 class SegmentFit:
     """Straight pieces that stand for a cable.
@@ -209,20 +193,3 @@ def fit_segments(cable: Catenary, count: int) -> SegmentFit:
     q = half / a
     area = 2 * a**2 * np.cosh(middle / a) * (q * math.cosh(q) - math.sinh(q))
     return SegmentFit(vertices, float(gap.max()), float(area.sum() / length.sum()))
-
-
-def fit_within(cable: Catenary, max_error: float) -> SegmentFit:
-    """The fewest chords that stay within `max_error` [m] of the cable.
-
-    Raises:
-        PerchError: the error is not positive.
-    """
-    if not max_error > 0:
-        raise PerchError(f"cable: an error of {max_error!r} m is not > 0")
-    low, high = 0, 1
-    while fit_segments(cable, high).max_error > max_error:
-        low, high = high, 2 * high
-    while high - low > 1:
-        count = (low + high) // 2
-        low, high = (low, count) if fit_segments(cable, count).max_error <= max_error else (count, high)
-    return fit_segments(cable, high)

@@ -65,7 +65,7 @@ def heading_derivatives(yaw, yaw_rate, yaw_acc):
 
 @compiled
 def commanded_frame(f, df, ddf, h, dh, ddh):
-    """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [M:eq12, M:eq13]
+    """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [defines M:eq10, M:eq12, M:eq13]
 
     Args:
         f, df, ddf: specific force and its derivatives, |f| > 0.
@@ -87,25 +87,6 @@ def commanded_frame(f, df, ddf, h, dh, ddh):
     dwy = dot(b1, ddb3) - wx * wz
     dwz = dot(b2, ddb1) - wx * wy
     return b1, b2, b3, (wx, wy, wz), (dwx, dwy, dwz)
-
-
-def thrust_direction(a_W: np.ndarray) -> np.ndarray:
-    """Body z axis that flatness demands for an acceleration. [M:eq10]
-
-    Args:
-        a_W: acceleration of the centre of mass in W [m/s^2], shape (3,).
-
-    Returns:
-        Unit vector b3 in W, shape (3,).
-
-    Raises:
-        FreeFallError: where `a_W + g e3` vanishes and no direction is defined.
-    """
-    f = np.asarray(a_W, float) + (0.0, 0.0, GRAVITY)
-    norm = float(np.linalg.norm(f))
-    if not norm > _SPECIFIC_THRUST_FLOOR:
-        raise FreeFallError(f"specific thrust {norm:g} m/s^2 at acceleration {np.asarray(a_W)}: no thrust direction")
-    return f / norm
 
 
 def attitude(b3_W: np.ndarray, yaw: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core.components import (
-    Scalar, Vector, add, components, cross, dot, function, rotate, rotate_back, scale, stack, subtract,
+    Scalar, Vector, add, components, cross, dot, function, rotate_back, scale, stack, subtract,
 )
 from perch_core.errors import PerchError
 
@@ -89,7 +89,7 @@ def segment_distance(a: Segment, b: Segment) -> float:
 
 
 def scaled_line(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, radii: Vector) -> tuple[Vector, Vector]:
-    """Line in the body frame, scaled so that the body's ellipsoid is the unit ball. [P:eq3]
+    """Line in the body frame, scaled so that the body's ellipsoid is the unit ball. [defines P:eq3]
 
     Args:
         p_WB, q_WB: pose of the body [m, xyzw].
@@ -103,14 +103,8 @@ def scaled_line(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, radii: Vec
     return tuple(o / d for o, d in zip(o_B, radii)), tuple(l / d for l, d in zip(l_B, radii))
 
 
-def line_distance_squared(o: Vector, l: Vector) -> Scalar:
-    """Squared distance of a line from the origin; above 1 in the scaled frame: no contact. [P:eq4]"""
-    moment = cross(o, l)
-    return dot(moment, moment) / dot(l, l)
-
-
 def line_clearance(o: Vector, l: Vector) -> Scalar:
-    """[P:eq4] without the fraction; positive: no contact with the infinite line. [P:eq5]
+    """Squared distance of a line from the unit ball times |l|^2; positive: no contact. [defines P:eq4, P:eq5]
 
     The paper's line `(|o|^2 - 1) |l|^2 - (o.l)^2 > 0`, from |o x l|^2 = |o|^2 |l|^2 - (o.l)^2.
     """
@@ -118,7 +112,7 @@ def line_clearance(o: Vector, l: Vector) -> Scalar:
 
 
 def segment_activation(p_WB: Vector, o_W: Vector, half_length: Scalar, reach: Scalar) -> Scalar:
-    """0 where the body can touch the segment, 1 far from it: sigm of k(x). [P:eq6]
+    """0 where the body can touch the segment, 1 far from it: sigm of k(x). [defines P:eq6]
 
     tanh instead of the paper's arctan: arctan's tails leave percents of k(x) in the middle of the segment, where it
     would weaken the constraint. Here less than 1 % is left at half the ramp.
@@ -138,7 +132,7 @@ def segment_activation(p_WB: Vector, o_W: Vector, half_length: Scalar, reach: Sc
 
 def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half_length: Scalar, radius: Scalar,
                       body_radii: Vector) -> Scalar:
-    """h_ca: positive where body and segment do not touch. [P:eq7]
+    """h_ca: positive where body and segment do not touch. [defines P:eq7]
 
     Args:
         p_WB, q_WB: pose of the body [m, xyzw].
@@ -178,14 +172,9 @@ def scaled_clearance(states_p: np.ndarray, states_q: np.ndarray, segment: Segmen
 
 def line_in_camera(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, p_BC: Vector, q_BC: Vector
                    ) -> tuple[Vector, Vector]:
-    """A line's point and direction in the camera frame C (z forward). [P:eq8]"""
+    """A line's point and direction in the camera frame C (z forward). [defines P:eq8]"""
     o_B = subtract(rotate_back(q_WB, subtract(o_W, p_WB)), p_BC)
     return rotate_back(q_BC, o_B), rotate_back(q_BC, rotate_back(q_WB, l_W))
-
-
-def camera_point(p_WB: Vector, q_WB: Vector, p_BC: Vector, q_BC: Vector, point_C: Vector) -> Vector:
-    """A point of the camera frame in W: the inverse of [P:eq8]."""
-    return add(p_WB, rotate(q_WB, add(p_BC, rotate(q_BC, point_C))))
 
 
 def image_line(o_C: Vector, l_C: Vector, fx: float = 1.0, fy: float = 1.0) -> tuple[Vector, Vector]:
@@ -195,7 +184,7 @@ def image_line(o_C: Vector, l_C: Vector, fx: float = 1.0, fy: float = 1.0) -> tu
 
 
 def reprojection_error(n_I: Vector) -> Scalar:
-    """r_e: signed distance of the line from the image centre, in units of the focal length (fx = 1) or pixels. [P:eq9]
+    """r_e: signed distance of the line from the image centre, in units of the focal length (fx = 1) or pixels. [defines P:eq9]
 
     It vanishes also where the camera looks along the line or the line lies behind; never use it alone.
     """
@@ -203,35 +192,29 @@ def reprojection_error(n_I: Vector) -> Scalar:
 
 
 def centre_points(n_I: Vector, l_I: Vector) -> tuple[Vector, Vector]:
-    """p2D, towards the line's point nearest to the image centre, and d3D, its point nearest to the camera. [P:eq10]"""
+    """p2D, towards the line's point nearest to the image centre, and d3D, its point nearest to the camera. [defines P:eq10]"""
     p2D = (-n_I[0] * n_I[2], -n_I[1] * n_I[2], n_I[0] * n_I[0] + n_I[1] * n_I[1])  # n x (e_z x n)
     return p2D, cross(l_I, n_I)
 
 
-def centred_point(n_I: Vector, l_I: Vector) -> Vector:
-    """p3D: the point of the line whose image is nearest to the image centre, in the 3-d image frame. [P:eq11]"""
-    p2D, d3D = centre_points(n_I, l_I)
-    return tuple(value / d3D[2] for value in p2D)
-
-
 def cheirality(n_I: Vector, l_I: Vector) -> Scalar:
-    """h_lc: positive where the line passes in front of the camera. [P:eq12]"""
+    """h_lc: positive where the line passes in front of the camera. [defines P:eq12]"""
     return centre_points(n_I, l_I)[1][2]
 
 
-def segment_visibility(n_I: Vector, l_I: Vector, e1_I: Vector, e2_I: Vector) -> Scalar:
-    """h_sv: positive where the centred point lies between the segment's ends. [P:eq13]
+def segment_place(n_I: Vector, l_I: Vector, o_I: Vector, half_length: Scalar) -> tuple[Scalar, Scalar]:
+    """Where the line's point nearest to the image centre lies along its segment. [defines P:eq11, P:eq13]
+
+    The paper's point p3D = p2D / d3D_z and constraint -(p3D - e1) . (p3D - e2) > 0 have a pole where the camera looks along the
+    line. With p3D = o_I + s half_length l_I the constraint is s^2 < 1; s d and d = d3D_z have no pole.
 
     Args:
-        n_I, l_I: the line, from `image_line`.
-        e1_I, e2_I: the segment's ends in the 3-d image frame, K_P e_C.
+        n_I, l_I: the line, from `image_line` with fx = fy = 1, |l_I| = 1.
+        o_I: middle of the segment in that frame [m].
+        half_length: [m].
+
+    Returns:
+        s d and d [m]; the point is on the segment where |s d| < |d|.
     """
-    p3D = centred_point(n_I, l_I)
-    return -dot(subtract(p3D, e1_I), subtract(p3D, e2_I))
-
-
-def segment_ends(o_C: Vector, l_C: Vector, half_length: Scalar, fx: float = 1.0, fy: float = 1.0) -> tuple[Vector, Vector]:
-    """Ends of a segment in the 3-d image frame, K_P (o_C -+ half_length l_C). [P:eq13]"""
-    reach = scale(half_length, l_C)
-    first, second = subtract(o_C, reach), add(o_C, reach)
-    return (fx * first[0], fy * first[1], first[2]), (fx * second[0], fy * second[1], second[2])
+    p2D, d3D = centre_points(n_I, l_I)
+    return (dot(p2D, l_I) - d3D[2] * dot(o_I, l_I)) / half_length, d3D[2]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_core import so3
 from perch_core.vehicle import GRAVITY, Vehicle
 
 
@@ -30,8 +29,3 @@ def accelerations(vehicle: Vehicle, R_WB: np.ndarray, w_WB_B: np.ndarray, rotor_
     J = vehicle.inertia_matrix
     dw_B = np.linalg.solve(J, wrench[1:] - np.cross(w_WB_B, J @ w_WB_B))
     return a_W, dw_B
-
-
-def attitude_rate(R_WB: np.ndarray, w_WB_B: np.ndarray) -> np.ndarray:
-    """Time derivative of the attitude, `R hat(w)`, shape (3, 3). [M:eq1]"""
-    return R_WB @ so3.hat(w_WB_B)

@@ -48,7 +48,7 @@ class RotorModel:
 
 
 def derivative(model: RotorModel, x: Vector, u: Vector) -> Vector:
-    """Time derivative of the state. [P:eq1]
+    """Time derivative of the state. [defines M:eq1, P:eq1]
 
     Args:
         model: constants.

@@ -28,14 +28,6 @@ def hat(v: np.ndarray) -> np.ndarray:
     return out
 
 
-def vee(S: np.ndarray) -> np.ndarray:
-    """Inverse of `hat`, for the skew part of `S`, shape (..., 3, 3) -> (..., 3)."""
-    S = np.asarray(S, float)
-    return 0.5 * np.stack(
-        [S[..., 2, 1] - S[..., 1, 2], S[..., 0, 2] - S[..., 2, 0], S[..., 1, 0] - S[..., 0, 1]], axis=-1
-    )
-
-
 def _sinc_terms(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, by series near zero."""
     small = angle < _SMALL
@@ -59,19 +51,6 @@ def exp(phi: np.ndarray) -> np.ndarray:
 def log(R: np.ndarray) -> np.ndarray:
     """Rotation vector of a rotation matrix, angle in [0, pi], shape (..., 3, 3) -> (..., 3) [rad]."""
     return quat_log(quat_from_matrix(R))
-
-
-def left_jacobian(phi: np.ndarray) -> np.ndarray:
-    """`exp(phi + d) = exp(J d) exp(phi)` to first order, shape (..., 3) -> (..., 3, 3)."""
-    phi = np.asarray(phi, float)
-    _, c, d = _sinc_terms(np.linalg.norm(phi, axis=-1))
-    K = hat(phi)
-    return np.eye(3) + c[..., None, None] * K + d[..., None, None] * (K @ K)
-
-
-def right_jacobian(phi: np.ndarray) -> np.ndarray:
-    """`exp(phi + d) = exp(phi) exp(J d)` to first order, shape (..., 3) -> (..., 3, 3)."""
-    return left_jacobian(-np.asarray(phi, float))
 
 
 def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -97,11 +97,3 @@ class PerchSurface:
         """Corners in W [m], shape (4, 3): top left, top right, bottom right, bottom left, seen from outside, s1 up."""
         a, b = np.array(self.size) / 2
         return self.to_world(np.array([[a, b, 0.0], [a, -b, 0.0], [-a, -b, 0.0], [-a, b, 0.0]]))
-
-    def contact_pose(self, perch_offset: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of the body at contact: p_WB = p_WS + perch_offset s3 [m] and R_WB = R_WS.
-
-        Args:
-            perch_offset: distance of the velcro below the centre of mass [m].
-        """
-        return self.p_WS + perch_offset * self.normal, self.R_WS.copy()

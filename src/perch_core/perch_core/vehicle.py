@@ -152,7 +152,7 @@ class Vehicle:
 
     @cached_property
     def allocation(self) -> np.ndarray:
-        """Rotor thrusts -> (collective thrust, Mx, My, Mz), shape (4, 4). [P:eq2]"""
+        """Rotor thrusts -> (collective thrust, Mx, My, Mz), shape (4, 4). [defines P:eq2]"""
         xy = np.array(self.rotor_xy)
         return np.stack([np.ones(4), xy[:, 1], -xy[:, 0], self.torque_ratio * np.array(self.rotor_yaw_sign, float)])
 

@@ -1,14 +1,17 @@
-"""The index of equations: where each equation of both papers stands in the code, read from the tags in docstrings.
+"""The index of equations: where each equation of both papers is defined, read from the tags in docstrings.
 
-A tag is `[M:eq15]`, `[P:eq3-7]`, `[M:eq2,12,13]` or `[M:alg1]`; a letter after a number (`[P:eq14h]`) names a row. The one function
-that a reader who wants to change an equation has to change carries `[defines M:eq15]`, and comes first in the index.
+`[defines M:eq15]` stands in the docstring of the one function or class that a reader changes to change the equation; a vehicle
+flies it: it is reached from a node's program by names and imports. Whatever else has to do with the equation carries `[uses M:eq15]`
+or `[M:eq15]`. A tag may name several: `[P:eq3-7]`, `[M:eq2,12,13]`, `[M:alg1]`; a letter (`[P:eq14h]`) names a row.
 """
 
 from __future__ import annotations
 
+import ast
 import re
 import sys
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 TITLES = {
@@ -25,29 +28,35 @@ TITLES = {
           "eq10": "closest points in 2-D and 3-D", "eq11": "intersection of both", "eq12": "line cheirality",
           "eq13": "segment visibility", "eq14": "the nonlinear program", "eq15": "cost terms"},
 }
-REASONS: dict[tuple[str, str], str] = {}
-"""Equations that are deliberately not implemented, with the reason. None so far."""
+REASONS = {
+    ("M", "eq18"): "what flies is decided by subdivision: in floating point the chain accepts polynomials that break their bound",
+    ("M", "eq19"): "an example of (18)",
+}
+"""Equations whose definition does not fly, with the reason."""
 
-_TAG = re.compile(r"\[(?:defines )?([MP]):((?:eq|alg)[^\]]*)\]")
+_ENTRY = "*_node.py"
+_TAG = re.compile(r"\[(?:defines |uses )?([MP]):((?:eq|alg)[^\]]*)\]")
 _DEFINITION = re.compile(r"\[defines [^\]]*\]")
+_NAMED = re.compile(r"(perch_[\w.]+):(\w+)")  # an entry of a registry
+_Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
 class Place:
-    """A line that carries a tag; `defines`: as the definition of its equation."""
+    """A function or class (a module: its name is its file's) whose docstring defines an equation; `flies`: a program reaches it."""
 
     file: str
-    line: int
     name: str
-    defines: bool = False
+    flies: bool
 
 
-def equations_of(text: str) -> list[tuple[str, str]]:
-    """(paper, equation) of every tag in a line: `[M:eq2,12-13]` -> M eq2, eq12, eq13."""
+def equations_of(text: str) -> list[_Key]:
+    """(paper, equation) of every tag in a text: `[M:eq2,12-13]` -> M eq2, eq12, eq13."""
     out = []
     for paper, body in _TAG.findall(text):
-        kind = "alg" if body.startswith("alg") else "eq"
         for part in re.split(r",\s*", body):
+            paper = part[0] if part[1:2] == ":" else paper
+            kind = "alg" if body.startswith("alg") else "eq"
             numbers = [int(n) for n in re.findall(r"\d+", part)]
             if not numbers:
                 continue
@@ -56,65 +65,119 @@ def equations_of(text: str) -> list[tuple[str, str]]:
     return out
 
 
-def collect(root: Path, folders: tuple[str, ...]) -> dict[tuple[str, str], list[Place]]:
-    """Every tagged line of the Python files below some folders, with the function or class it stands in."""
-    found: dict[tuple[str, str], list[Place]] = {}
-    for folder in folders:
-        for path in sorted((root / folder).rglob("*.py")):
-            if path.name == "equations.py":
-                continue
-            name = path.stem
-            for number, line in enumerate(path.read_text().splitlines(), 1):
-                header = re.match(r"\s*(?:def|class) (\w+)", line)
-                name = header.group(1) if header else name
-                defined = {key for tag in _DEFINITION.findall(line) for key in equations_of(tag)}
-                for key in dict.fromkeys(equations_of(line)):
-                    found.setdefault(key, []).append(Place(str(path.relative_to(root)), number, name, key in defined))
+class _Module:
+    """What a module defines at its top level, and the names that it imports, (module, name) or (module, "")."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.path, self.tree = path, ast.parse(path.read_text())
+        self.package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        self.defined: dict[str, ast.stmt] = {}
+        self.imported: dict[str, _Key] = {}
+        for node in self.tree.body:
+            for target in getattr(node, "targets", [getattr(node, "target", node)]):
+                for leaf in ast.walk(target) if isinstance(node, ast.Assign) else [target]:
+                    name = getattr(leaf, "name", getattr(leaf, "id", None))
+                    if name:
+                        self.defined[name] = node
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.ImportFrom):
+                self.imported |= {alias.asname or alias.name: (node.module or "", alias.name) for alias in node.names}
+            elif isinstance(node, ast.Import):
+                self.imported |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
+
+
+def _modules(root: Path) -> dict[str, _Module]:
+    """The packages' modules by dotted name."""
+    out = {}
+    for path in sorted((root / "src").glob("perch_*/perch_*/**/*.py")):
+        name = ".".join(path.relative_to(root / "src").with_suffix("").parts[1:]).removesuffix(".__init__")
+        out[name] = _Module(path, name)
+    return out
+
+
+def _reached(modules: dict[str, _Module]) -> set[_Key]:
+    """(module, top-level name) of all that the programs of the nodes refer to, directly or through others; a class with all it has."""
+    out: set[_Key] = set()
+    todo = [(name, top) for name, module in modules.items() if module.path.match(_ENTRY) for top in module.defined]
+    while todo:
+        module, name = todo.pop()
+        if f"{module}.{name}" in modules or module not in modules or (module, name) in out:
+            continue
+        here = modules[module]
+        if name not in here.defined:
+            todo += [here.imported[name]] if name in here.imported else []
+            continue
+        out.add((module, name))
+        for node in ast.walk(here.defined[name]):
+            if isinstance(node, ast.Name):
+                todo.append(here.imported.get(node.id, (module, node.id)))
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in here.imported:
+                origin = here.imported[node.value.id]
+                todo += [(".".join(filter(None, origin)), node.attr), origin]
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                todo += _NAMED.findall(node.value)
+    return out
+
+
+@lru_cache
+def definitions(root: Path) -> dict[_Key, list[Place]]:
+    """Where each equation is defined."""
+    modules, found = _modules(root), {}
+    reached = _reached(modules)
+    modules.pop(__name__, None)  # it shows what a tag looks like
+    for name, module in modules.items():
+        for top in [module.tree, *module.tree.body]:
+            for node in ast.walk(top) if isinstance(top, ast.ClassDef) else [top]:
+                if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                    continue
+                keys = [key for tag in _DEFINITION.findall(ast.get_docstring(node) or "") for key in equations_of(tag)]
+                flies = any(at == name for at, _ in reached) if top is module.tree else (name, getattr(top, "name", "")) in reached
+                place = Place(str(module.path.relative_to(root)), getattr(node, "name", module.path.stem), flies)
+                for key in keys:
+                    found.setdefault(key, []).append(place)
     return found
 
 
-def missing(root: Path) -> list[tuple[str, str]]:
-    """Equations with neither a tag in `src` nor a stated reason."""
-    code = collect(root, ("src",))
-    return [(paper, eq) for paper, titles in TITLES.items() for eq in titles if (paper, eq) not in code and (paper, eq) not in REASONS]
-
-
-def defined_twice(root: Path) -> list[tuple[str, str]]:
-    """Equations with more than one definition in `src`."""
-    return [key for key, places in collect(root, ("src",)).items() if sum(place.defines for place in places) > 1]
+def problems(root: Path) -> list[str]:
+    """What is wrong with the index, one line each: no definition, two, or one that no program reaches."""
+    found, out = definitions(root), []
+    for paper, titles in TITLES.items():
+        for eq, title in titles.items():
+            places, what = found.get((paper, eq), []), f"{paper}:{eq} ({title})"
+            if len(places) != 1:
+                out.append(f"{what} has {len(places)} definitions: {', '.join(f'{p.file} {p.name}' for p in places) or 'none'}")
+            elif places[0].flies == ((paper, eq) in REASONS):
+                out.append(f"{what} is defined in {places[0].file} {places[0].name}, which " +
+                           ("flies in spite of its reason" if places[0].flies else "no program reaches"))
+    return out + [f"{paper}:{eq} is no equation of the papers" for paper, eq in found if eq not in TITLES[paper]]
 
 
 def page(root: Path) -> str:
     """The content of docs/equations.md."""
-    code, tests = collect(root, ("src",)), collect(root, ("tests",))
+    found = definitions(root)
+    tests: dict[_Key, list[Path]] = {}
+    for path in sorted((root / "tests").rglob("*.py")):
+        for key in dict.fromkeys(equations_of(path.read_text()) if path.name != "test_equations.py" else ()):
+            tests.setdefault(key, []).append(path.relative_to(root))
     lines = ["# Where each equation lives", "",
              "Generated by `python3 scripts/equations.py` from the tags in the code. M = Mao et al., P = Paneque et al.",
-             "**Bold**: the definition, which is what flies; as M prints it, section IV-C is `perch_planner/paper/paper_m.py`.", ""]
+             "The definition is the one place to change, and what flies. `grep -rn M:eq15 src` finds what else has to do with it.",
+             "As M prints it, section IV-C is [perch_planner/paper/paper_m.py](../src/perch_planner/perch_planner/paper/paper_m.py).", ""]
     for paper, titles in TITLES.items():
-        lines += [f"## Paper {paper}", "", "| equation | what | code | tests |", "| --- | --- | --- | --- |"]
+        lines += [f"## Paper {paper}", "", "| equation | what | definition | tests |", "| --- | --- | --- | --- |"]
         for eq, title in titles.items():
-            places = _links(code.get((paper, eq), []), 4) or REASONS.get((paper, eq), "")
-            checks = ", ".join(dict.fromkeys(f"[{Path(p.file).name}](../{p.file})" for p in tests.get((paper, eq), [])))
-            lines.append(f"| {paper} {eq.replace('eq', '(') + ')' if eq.startswith('eq') else 'algorithm 1'} | {title} | {places} | {checks} |")
+            places = ", ".join(f"[`{p.name}`](../{p.file})" for p in found.get((paper, eq), []))
+            reason = f"; {REASONS[paper, eq]}" if (paper, eq) in REASONS else ""
+            checks = ", ".join(f"[{path.name}](../{path})" for path in tests.get((paper, eq), []))
+            number = f"({eq[2:]})" if eq.startswith("eq") else "algorithm 1"
+            lines.append(f"| {paper} {number} | {title}{reason} | {places} | {checks} |")
         lines.append("")
     return "\n".join(lines)
 
 
-def _links(places: list[Place], most: int) -> str:
-    seen: dict[tuple[str, str], Place] = {}
-    for place in sorted(places, key=lambda place: not place.defines):
-        seen.setdefault((place.file, place.name), place)
-    chosen = list(seen.values())
-    text = ", ".join(("**[`{}`](../{}#L{})**" if p.defines else "[`{}`](../{}#L{})").format(p.name, p.file, p.line) for p in chosen[:most])
-    return text + (f" and {len(chosen) - most} more" if len(chosen) > most else "")
-
-
 def main(root: Path) -> int:
-    """Write docs/equations.md; 1 where an equation is missing or defined twice."""
+    """Write docs/equations.md; 1 where it has an equation without the one definition that flies."""
     (root / "docs" / "equations.md").write_text(page(root))
-    gaps = missing(root)
-    for paper, eq in gaps:
-        print(f"no tag for {paper} {eq} ({TITLES[paper][eq]})", file=sys.stderr)
-    for paper, eq in (twice := defined_twice(root)):
-        print(f"two definitions of {paper} {eq} ({TITLES[paper][eq]})", file=sys.stderr)
-    return 1 if gaps or twice else 0
+    for line in (wrong := problems(root)):
+        print(line, file=sys.stderr)
+    return 1 if wrong else 0

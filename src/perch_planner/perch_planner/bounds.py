@@ -77,7 +77,7 @@ def split(work, left):
 
 @compiled
 def stays_below(coefficients, bound):
-    """Whether a polynomial stays below a bound on [0, 1]. [defines M:alg1, decided by subdivision]
+    """Whether a polynomial stays below a bound on [0, 1]. [uses M:alg1]
 
     Args:
         coefficients: Bernstein coefficients, shape (n + 1,).
@@ -131,7 +131,7 @@ def stays_below(coefficients, bound):
 
 @compiled
 def maximum(coefficients, tolerance, floor):
-    """Largest value of a polynomial on [0, 1], enclosed as far as it exceeds `floor`.
+    """Largest value of a polynomial on [0, 1], enclosed as far as it exceeds `floor`. [defines M:alg1, by subdivision]
 
     Args:
         coefficients: Bernstein coefficients, shape (n + 1,).

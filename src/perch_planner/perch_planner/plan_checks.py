@@ -30,7 +30,7 @@ _FINE = 1e-10      # where a limit falls inside the enclosure
 
 @compiled
 def specific_force(coefficients, duration):
-    """f = a + g e3 of a segment, Bernstein coefficients of degree 12, shape (3, 15) -> (3, 13) [m/s^2]."""
+    """f = a + g e3 of a segment, the thrust per mass: shape (3, 15) -> Bernstein coefficients of degree 12, (3, 13) [m/s^2]. [defines M:eq9]"""
     force = time_derivative(coefficients, 2, duration)
     for k in range(force.shape[1]):
         force[2, k] += GRAVITY

@@ -114,7 +114,7 @@ def moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, dw_extra):
 
 @compiled
 def geometric_step(state, reference, thrust, extra, gains, limits, J):
-    """Wanted specific thrust and moment. [M:eq2, M:eq12, M:eq13]
+    """Wanted specific thrust and moment. [defines M:eq2] [M:eq12, M:eq13]
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.

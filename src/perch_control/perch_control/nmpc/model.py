@@ -92,16 +92,12 @@ def _line_residuals(vehicle: Vehicle, x: Vector, parameters: Vector) -> list:
         q_BC = tuple(float(v) for v in quat_from_matrix(mount.R_BC))
         o_C, l_C = lines.line_in_camera(p, q, first[0:3], first[3:6], tuple(map(float, mount.p_BC)), q_BC)
         n_I, l_I = lines.image_line(o_C, l_C)
-        p2D, d3D = lines.centre_points(n_I, l_I)
         # [P:eq9] with the root kept away from zero: its gradient has no value where the camera looks along the line.
         out.append(ca.sqrt(perception) * n_I[2] / ca.sqrt(n_I[0] ** 2 + n_I[1] ** 2 + 1e-6))
         size = ca.sqrt(dot(n_I, n_I) + 1e-6)
         out.append(ca.sqrt(visibility) * _hinge(lines.cheirality(n_I, l_I) / size))
-        # [P:eq13] without its quotient: the centred point lies between the ends where s^2 d^2 < L^2 d^2.
-        depth = d3D[2]
-        gap = tuple(p2D[i] - o_C[i] * depth for i in range(3))
-        reach = first[6] * first[6] * depth * depth
-        beyond = dot(gap, gap)
+        beyond, reach = (first[6] * value for value in lines.segment_place(n_I, l_I, o_C, first[6]))
+        beyond, reach = beyond * beyond, reach * reach
         out.append(ca.sqrt(visibility) * _hinge((reach - beyond) / (reach + beyond + 1e-6)))
     for k in range(LINES):
         o, l, half, radius = (parameters[LINE * k:LINE * k + 3], parameters[LINE * k + 3:LINE * k + 6],

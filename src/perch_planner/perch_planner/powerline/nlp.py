@@ -102,7 +102,7 @@ class Solution:
 
 @dataclass
 class Problem:
-    """A solver of one structure, built from stage functions once and solved many times."""
+    """A solver of one structure, built from stage functions once and solved many times. [defines P:eq14]"""
 
     structure: Structure
     stages: StageFunctions

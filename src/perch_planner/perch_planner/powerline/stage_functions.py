@@ -86,18 +86,15 @@ def _violated(h: Scalar) -> Scalar:
 
 
 def _sight(model: StageModel, x: Vector, line: Vector) -> Vector:
-    """What the perception cost weighs and squares: reprojection, cheirality, segment visibility. [P:eq9, P:eq12, P:eq13]
+    """What the perception cost weighs and squares: reprojection, cheirality, segment visibility. [uses P:eq9, P:eq12, P:eq13]
 
-    [P:eq13] is a quotient with a pole where the camera looks along the line, and its arctan (the authors' remedy) has
-    no slope there, so that a solver started so never turns. With s the place of the centred point along the line, in
-    half lengths, the constraint says s^2 < 1; the angle of (d3D_z, d3D_z s) says the same, falls linearly as the
-    camera turns, and needs no quotient. As it is soft, it aims at less than s^2 < 1, see SEGMENT_AIM.
+    The authors' arctan of [P:eq13] has no slope where the camera looks along the line, so that a solver started so never
+    turns. The angle of (d, s d) of `lines.segment_place` says the same, and falls linearly as the camera turns. As it is
+    soft, it aims at less than s^2 < 1, see SEGMENT_AIM.
     """
     o_C, l_C = lines.line_in_camera(x[P], x[Q], line[0:3], line[3:6], model.p_BC, model.q_BC)
     n_I, l_I = lines.image_line(o_C, l_C)
-    p2D, d3D = lines.centre_points(n_I, l_I)
-    in_front = lines.cheirality(n_I, l_I)
-    along = (dot(p2D, l_I) - in_front * dot(o_C, l_I)) / line[7]  # = d3D_z s, for |l_C| = 1
+    along, in_front = lines.segment_place(n_I, l_I, o_C, line[7])
     beside = ca.fabs(ca.atan2(along, SEGMENT_AIM * in_front)) - np.pi / 4
     return lines.reprojection_error(n_I), _violated(in_front), _violated(-beside)
 
@@ -179,7 +176,7 @@ class StageFunctions:
 
 
 def stage_functions(model: StageModel) -> StageFunctions:
-    """Build the stage functions and their derivatives as expressions."""
+    """Build the stage functions and their derivatives as expressions; `run`, `see` and `end` are the cost. [defines P:eq15]"""
     x, u = ca.SX.sym("x", STAGE_STATES), ca.SX.sym("u", INPUTS)
     line, reference = ca.SX.sym("line", LINE_SIZE), ca.SX.sym("reference", REFERENCE)
     unit_step, limit = ca.SX.sym("unit_step"), ca.SX.sym("limit")

@@ -19,7 +19,7 @@ class Visibility:
     Attributes:
         reprojection: distance of the line from the image centre [px], shape (m,). [P:eq9]
         cheirality: h_lc > 0: the line is in front, shape (m,). [P:eq12]
-        segment: h_sv > 0: the segment is at the centre, shape (m,). [P:eq13]
+        segment: the segment is at the centre, shape (m,). [P:eq13]
         in_image: share of the segment's sample points that the camera really sees, shape (m,).
     """
 
@@ -53,7 +53,7 @@ def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount, samp
     o_C, l_C = lines.line_in_camera(p_WB, q_WB, components(line.centre), components(line.direction),
                                     components(mount.p_BC), components(so3.quat_from_matrix(mount.R_BC)))
     n_I, l_I = lines.image_line(o_C, l_C, fx, fy)
-    e1_I, e2_I = lines.segment_ends(o_C, l_C, line.half_length, fx, fy)
+    place, depth = lines.segment_place(*lines.image_line(o_C, l_C), o_C, line.half_length)
     points_W = line.centre + np.linspace(-line.half_length, line.half_length, samples)[:, None] * line.direction
     seen = np.empty(len(states))
     for k, state in enumerate(states):
@@ -64,5 +64,4 @@ def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount, samp
         seen[k] = inside.mean()
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(lines.reprojection_error(n_I))
-        segment = lines.segment_visibility(n_I, l_I, e1_I, e2_I) > 0
-    return Visibility(error, lines.cheirality(n_I, l_I) > 0, segment, seen)
+    return Visibility(error, lines.cheirality(n_I, l_I) > 0, np.abs(place) < np.abs(depth), seen)
