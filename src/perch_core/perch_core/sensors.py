@@ -92,7 +92,7 @@ class ImuSensor:
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, high=1e3, doc="saturation of an axis")
     integration: str = choice("instant", options=("mean", "instant"), doc=(
         "mean: a sample is the mean over the period that ends at its stamp; instant: it is the value at its stamp"))
-    orientation: Quaternion = quantity((0.0, 0.0, 0.0, 1.0), low=-1.01, high=1.01, doc="q_BI, xyzw: the IMU's axes in B, whose origin it is")
+    orientation: Quaternion = quantity((0.0, 0.0, 0.0, 1.0), low=-1.01, high=1.01, doc="q_BI, xyzw: its axes in B, whose origin it is")
     topic: str = text("", doc="of its samples in recordings; empty: imu/data_raw")
 
     def __post_init__(self) -> None:

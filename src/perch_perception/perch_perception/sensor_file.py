@@ -18,8 +18,9 @@ from perch_perception.vio.config import CalibrationPriors
 
 def sensors_parameter() -> str:
     """Declares the parameter `sensors`."""
-    return config.text("", doc=("sensor file, config/sensors/<name>.yaml or a path, in place of the vehicle file's cameras, of camera_info and "
-                                "of the parameters that tell noise and calibration; empty: none"))
+    return config.text("", doc=(
+        "sensor file, config/sensors/<name>.yaml or a path, in place of the vehicle file's cameras, of camera_info and of the parameters "
+        "that tell noise and calibration; empty: none"))
 
 
 def camera_mounts(sensors: str, vehicle: str) -> dict[str, CameraMount]:

@@ -1,0 +1,117 @@
+"""Folders in the format of EuRoC and TUM-VI (ASL): `mav0/cam0/data.csv`, `mav0/imu0/data.csv`, `sensor.yaml` beside each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from perch_core.sensors import Sensors
+from perch_core.values import ImuSample
+from perch_eval.recordings.calibration import from_asl
+from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError, picture
+
+AFTER = 1_000_000_000  # what the IMU says later than this after the last image is left out [ns]
+TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
+
+
+def root_of(path: Path) -> Path | None:
+    """The folder with `cam*` of a recording in this format; None: it is none."""
+    for folder in (path / "mav0", path):
+        if any(folder.glob("cam*/data.csv")):
+            return folder
+    return None
+
+
+class AslRecording(Recording):
+    """A folder in the ASL format. Cameras have the names of their folders."""
+    def __init__(self, path: Path, sensors: Sensors | None) -> None:
+        """
+        Raises:
+            RecordingError: a file is missing or is none of its format.
+            ConfigError: a `sensor.yaml` cannot be used.
+        """
+        self._root = root_of(path)
+        if self._root is None:
+            raise RecordingError(f"{path}: no mav0/cam*/data.csv")
+        folders = {file.parent.name: file.parent for file in sorted(self._root.glob("cam*/data.csv"))}
+        if sensors is None and all((folder / "sensor.yaml").is_file() for folder in folders.values()):
+            sensors = from_asl(self._root)
+        super().__init__(path, sensors)
+        if sensors is not None:
+            missing = sorted(set(sensors.cameras) - set(folders))
+            if len(missing) == len(sensors.cameras):
+                raise RecordingError(
+                    f"{self._root}: of the cameras {', '.join(missing)} of {sensors.name} there is none, only {', '.join(folders)}")
+            folders = {name: folder for name, folder in folders.items() if name in sensors.cameras}
+        self._frames = [(stamp, name, folder / "data" / file) for name, folder in folders.items()
+                        for stamp, file in _frames(folder / "data.csv")]
+        self._frames.sort(key=lambda row: row[0])
+        if not self._frames:
+            raise RecordingError(f"{self._root}: no image is named in cam*/data.csv")
+        self.images = {name: sum(row[1] == name for row in self._frames) for name in folders}
+        imu = self._root / "imu0" / "data.csv"
+        self._stamps, self._imu = table(imu, 7) if imu.is_file() else (np.empty(0, np.int64), np.empty((0, 6)))
+        self.samples = int((self._stamps <= self._frames[-1][0] + AFTER).sum())
+
+    @property
+    def truth(self) -> Path | None:
+        """The motion capture's file."""
+        files = (self._root / name / "data.csv" for name in TRUTHS)
+        return next((file for file in files if file.is_file() and file.stat().st_size > 1000), None)
+
+    def events(self) -> Iterator[Event]:
+        """In the order of the stamps, until a little after the last image; an IMU sample comes before an image of the same stamp."""
+        k, cameras = 0, self.sensors.cameras if self.sensors is not None else {}
+        last = self._frames[-1][0] + AFTER
+        for stamp, name, path in self._frames:
+            while k < len(self._stamps) and self._stamps[k] <= stamp:
+                yield self._sample(k)
+                k += 1
+            yield Event(name, stamp, picture(path, stamp, name, cameras.get(name)))
+        while k < len(self._stamps) and self._stamps[k] <= last:
+            yield self._sample(k)
+            k += 1
+
+    def _sample(self, k: int) -> Event:
+        stamp, row = int(self._stamps[k]), self._imu[k].tolist()
+        return Event(IMU, stamp, ImuSample(stamp, tuple(row[:3]), tuple(row[3:])))
+
+
+def _frames(path: Path) -> list[tuple[int, str]]:
+    """(stamp [ns], file name) of each image."""
+    rows = []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        stamp, _, name = line.partition(",")
+        if not stamp.strip().isdigit():
+            raise RecordingError(f"{path}: line {number}: {stamp[:40]!r} is no stamp in nanoseconds")
+        rows.append((int(stamp), name.strip() or f"{stamp.strip()}.png"))
+    return rows
+
+
+def table(path: Path, columns: int, delimiter: str = ",") -> tuple[np.ndarray, np.ndarray]:
+    """A table of numbers whose first column is a stamp.
+
+    Args:
+        path: of the file; lines that begin with # are not numbers.
+        columns: how many are read, with the stamp.
+        delimiter: between them.
+
+    Returns:
+        Stamps [ns], int64, shape (n,), exact; and the other columns, shape (n, columns - 1).
+
+    Raises:
+        RecordingError: it cannot be read, or is no such table.
+    """
+    try:
+        rows = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        stamps = np.array([int(line.split(delimiter, 1)[0]) for line in rows], np.int64)
+        values = np.loadtxt(rows, delimiter=delimiter, usecols=range(1, columns), ndmin=2) if rows else np.empty((0, columns - 1))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, IndexError, OverflowError) as error:
+        raise RecordingError(f"{path}: is no table of a stamp [ns] and {columns - 1} numbers: {error}") from None
+    return stamps, values

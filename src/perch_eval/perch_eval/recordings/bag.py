@@ -1,0 +1,151 @@
+"""ROS bags: rosbag2 (a folder with `metadata.yaml`, or one `.mcap` or `.db3`) and ROS 1 `.bag`, read by `rosbags` without ROS."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from perch_core.errors import PerchError
+from perch_core.ros.messages.sensing import compressed_value, image_value, imu_value
+from perch_core.sensors import Sensors
+from perch_core.values import CameraImage
+from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError
+
+IMAGES = {"sensor_msgs/msg/Image": image_value, "sensor_msgs/msg/CompressedImage": compressed_value}
+IMU_TYPE = "sensor_msgs/msg/Imu"
+WIDE = {"mono16": "mono8", "16UC1": "mono8"}
+SUFFIXES = (".bag", ".mcap", ".db3")
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is that of a bag."""
+    return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
+
+
+class BagRecording(Recording):
+    """A bag. A camera is the topic that the sensor file names, or `camera_<name>/image_raw` (or `/compressed` below it)."""
+    def __init__(self, path: Path, sensors: Sensors | None) -> None:
+        """
+        Raises:
+            RecordingError: it cannot be read, or has none of the topics.
+        """
+        super().__init__(path, sensors)
+        with _open(path) as reader:
+            kinds = {c.topic: c.msgtype for c in reader.connections}
+            counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+        pictures = {topic for topic, kind in kinds.items() if kind in IMAGES}
+        imus = sorted(topic for topic, kind in kinds.items() if kind == IMU_TYPE)
+        if sensors is None:
+            self._cameras = {_camera_of(topic, sorted(pictures)): topic for topic in sorted(pictures)}
+            self._imu = imus[0] if imus else ""
+        else:
+            found = {name: _topic(camera.topic or f"camera_{name}/image_raw", pictures) for name, camera in sensors.cameras.items()}
+            self._cameras = {name: topic for name, topic in found.items() if topic}
+            if not self._cameras:
+                raise RecordingError(
+                    f"{path}: none of the cameras' topics of {sensors.name}; images are on: {', '.join(sorted(pictures)) or 'none'}")
+            wanted = sensors.imu.topic or "imu/data_raw" if sensors.imu is not None else ""
+            self._imu = _topic(wanted, set(imus)) if wanted else ""
+            if wanted and not self._imu:
+                raise RecordingError(f"{path}: no IMU on {wanted}; there are: {', '.join(imus) or 'none'}")
+        self.images = {name: counts[topic] for name, topic in self._cameras.items()}
+        self.samples = counts[self._imu] if self._imu else 0
+
+    def events(self) -> Iterator[Event]:
+        """In the order in which they were recorded. An image of an encoding that is not known here ends the reading."""
+        sources = {topic: name for name, topic in self._cameras.items()}
+        if self._imu:
+            sources[self._imu] = IMU
+        with _open(self.path) as reader:
+            try:
+                for connection, arrived, data in reader.messages([c for c in reader.connections if c.topic in sources]):
+                    message = reader.deserialize(data, connection.msgtype)
+                    source = sources[connection.topic]
+                    yield Event(source, arrived,
+                                imu_value(message)._replace(frame="imu_link") if source == IMU else self._image(message, connection))
+            except _damage() as error:
+                self.damage = f"{type(error).__name__}: {error}"
+
+    def poses(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """(stamp [ns], geometry_msgs pose or transform) of each message of a topic.
+
+        Raises:
+            RecordingError: there is no such topic, or its messages are no poses.
+        """
+        with _open(self.path) as reader:
+            connections = [c for c in reader.connections if c.topic == topic]
+            if not connections:
+                raise RecordingError(f"{self.path}: no topic {topic}")
+            for connection, _, data in reader.messages(connections):
+                message = reader.deserialize(data, connection.msgtype)
+                inner = getattr(message, "pose", getattr(message, "transform", None))
+                inner = getattr(inner, "pose", inner)
+                if inner is None or not hasattr(message, "header"):
+                    raise RecordingError(f"{self.path}: {topic}: {connection.msgtype} is no stamped pose, transform or odometry")
+                yield message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec, inner
+
+    def _image(self, message: Any, connection: Any) -> CameraImage:
+        try:
+            if getattr(message, "encoding", "") in WIDE:
+                message.data = message.data.reshape(-1, 2)[:, 0 if message.is_bigendian else 1].copy()
+                message.step, message.encoding = message.step // 2, WIDE[message.encoding]
+            return IMAGES[connection.msgtype](message)
+        except PerchError as error:
+            raise RecordingError(f"{self.path}: {connection.topic}: {error}") from None
+
+
+def _topic(wanted: str, there: set[str]) -> str:
+    """The topic that is wanted, with or without slash, namespace and `/compressed`; empty: none."""
+    end = "/" + wanted.lstrip("/")
+    names = (end, f"{end}/compressed")
+    exact = [topic for topic in names if topic in there]
+    return (exact or [topic for topic in sorted(there) if topic.endswith(names)] or [""])[0]
+
+
+def _camera_of(topic: str, others: list[str]) -> str:
+    """A name for the camera of a topic: `down` of camera_down/image_raw; else what tells it from the others."""
+    first = topic.strip("/").removesuffix("/compressed").removesuffix("/image_raw")
+    return first.rpartition("camera_")[2].replace("/", "_") or "camera"
+
+
+def _damage() -> tuple[type[BaseException], ...]:
+    """What a damaged bag raises."""
+    from rosbags.highlevel import AnyReaderError
+    from rosbags.rosbag1 import ReaderError as Reader1Error
+    from rosbags.rosbag2 import ReaderError as Reader2Error
+    from rosbags.serde import SerdeError
+
+    return (AnyReaderError, Reader1Error, Reader2Error, SerdeError, struct.error, EOFError, OSError, sqlite3.Error, AssertionError,
+            KeyError, ValueError, IndexError)
+
+
+def _open(path: Path) -> Any:
+    """A reader of a bag.
+
+    Raises:
+        RecordingError: it is none, or is damaged.
+    """
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader.open()
+    except _damage() as error:
+        raise RecordingError(f"{path}: cannot be read: {error or type(error).__name__}") from None
+    return _Opened(reader)
+
+
+class _Opened:
+    """A reader that has been opened, to be closed at the end of a block."""
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+
+    def __enter__(self) -> Any:
+        return self._reader
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()

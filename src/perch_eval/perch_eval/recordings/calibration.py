@@ -1,0 +1,190 @@
+"""Calibration files of others as sensor files: Kalibr's camera chain and IMU, EuRoC's `sensor.yaml`."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from perch_core import config, so3
+from perch_core.errors import ConfigError
+from perch_core.sensors import Sensors
+from perch_core.yaml_text import parse_yaml
+
+MODELS = {
+    "radtan": "radtan",
+    "radial-tangential": "radtan",
+    "plumb_bob": "radtan",
+    "equidistant": "equidistant",
+    "none": "pinhole",
+    "": "pinhole"
+}
+RIGID = 1e-3  # by how much a rotation in a file may miss being one
+IMU_KEYS = {
+    "accel_noise_density": "accelerometer_noise_density",
+    "gyro_noise_density": "gyroscope_noise_density",
+    "accel_bias_walk": "accelerometer_random_walk",
+    "gyro_bias_walk": "gyroscope_random_walk"
+}
+
+
+def from_kalibr(cameras: Path, imu: Path | None, name: str, R_BI: np.ndarray = np.eye(3)) -> Sensors:
+    """A Kalibr calibration as a sensor file.
+
+    Args:
+        cameras: `camchain-imucam.yaml`: with `T_cam_imu` of every camera.
+        imu: `imu.yaml`; None: cameras only.
+        name: of the sensors.
+        R_BI: axes of the IMU in the body, shape (3, 3).
+
+    Raises:
+        ConfigError: a file cannot be read, lacks something, or has a model that is not known here.
+    """
+    chain = _mapping(cameras)
+    found = {key: value for key, value in chain.items() if re.fullmatch(r"cam\d+", key)}
+    if not found:
+        raise ConfigError(str(cameras), "", "has no cam0: it is no camera chain of Kalibr")
+    out = {key: _kalibr_camera(str(cameras), key, value, R_BI) for key, value in found.items()}
+    sensors: dict[str, Any] = {"name": name, "cameras": out}
+    if imu is not None:
+        content = _mapping(imu)
+        sensors["imu"] = _imu(str(imu), content.get("imu0", content), R_BI)
+    return config.from_mapping(Sensors, sensors, str(cameras))
+
+
+def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
+    """The `sensor.yaml` files of a folder in the ASL format; B is the body of their `T_BS`, which must be the IMU's.
+
+    Raises:
+        ConfigError: a file cannot be read, lacks something, or has a model that is not known here.
+    """
+    out: dict[str, Any] = {
+        "name": re.sub(r"[^\w.+-]", "_",
+                       root.resolve().parent.name if root.name == "mav0" else root.resolve().name) or "asl",
+        "cameras": {}
+    }
+    imu = root / "imu0" / "sensor.yaml"
+    T_BI = np.eye(4)
+    if imu.is_file():
+        content = _mapping(imu)
+        T_BI = _transform(str(imu), "T_BS", content.get("T_BS", np.eye(4).tolist()))
+        out["imu"] = _imu(str(imu), content, R_BI)
+    for file in sorted(root.glob("cam*/sensor.yaml")):
+        c, source = _mapping(file), str(file)
+        T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
+        camera = _camera(source, "", c, c.get("distortion_coefficients", []), T_IC, R_BI)
+        camera["rate"] = c.get("rate_hz", 20)
+        out["cameras"][file.parent.name] = camera
+    return config.from_mapping(Sensors, out, str(root))
+
+
+def to_yaml(sensors: Sensors, comment: str = "") -> str:
+    """A sensor file's text; what has its default is left out."""
+    body = yaml.safe_dump(_plain(sensors), sort_keys=False, default_flow_style=None, width=120)
+    return "".join(f"# {line}\n" for line in comment.splitlines()) + body
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses as mappings without their defaults, tuples as lists."""
+    if dataclasses.is_dataclass(value):
+        pairs = {f.name: (getattr(value, f.name), f) for f in dataclasses.fields(value)}
+        return {
+            key: _plain(item)
+            for key, (item, f) in pairs.items()
+            if item != f.default and (f.default_factory is dataclasses.MISSING or item != f.default_factory())
+        }
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _kalibr_camera(source: str, key: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
+    if not isinstance(c, dict):
+        raise ConfigError(source, key, "is no mapping")
+    if "T_cam_imu" not in c:
+        raise ConfigError(source, f"{key}.T_cam_imu", "missing: give the result of kalibr_calibrate_imu_camera (camchain-imucam)")
+    T_CI = _transform(source, f"{key}.T_cam_imu", c["T_cam_imu"])
+    out = _camera(source, f"{key}.", c, c.get("distortion_coeffs", []), np.linalg.inv(T_CI), R_BI)
+    # Kalibr: t_imu = t_cam + timeshift
+    out["stamp_offset"] = -_number(source, f"{key}.timeshift_cam_imu", c.get("timeshift_cam_imu", 0.0))
+    out["topic"] = str(c.get("rostopic", ""))
+    return out
+
+
+def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.ndarray, R_BI: np.ndarray) -> dict[str, Any]:
+    """What both formats share."""
+    kind = str(c.get("camera_model", "pinhole"))
+    if kind != "pinhole":
+        raise ConfigError(source, f"{dot}camera_model", f"{kind!r} is not pinhole (with radtan, equidistant or no distortion)")
+    model = str(c.get("distortion_model", ""))
+    if model not in MODELS:
+        raise ConfigError(source, f"{dot}distortion_model", f"{model!r} is not one of {', '.join(filter(None, MODELS))}")
+    intrinsics, resolution = (_needed(source, c, key, dot) for key in ("intrinsics", "resolution"))
+    for key, value, n in (("intrinsics", intrinsics, 4), ("resolution", resolution, 2)):
+        if not isinstance(value, list) or len(value) != n:
+            raise ConfigError(source, f"{dot}{key}", f"{value!r} is not {n} numbers")
+    R_BC, p_BC = R_BI @ T_IC[:3, :3], R_BI @ T_IC[:3, 3]
+    return {
+        "model": MODELS[model],
+        "width": resolution[0],
+        "height": resolution[1],
+        "focal": intrinsics[:2],
+        "centre": intrinsics[2:],
+        "distortion": distortion if MODELS[model] != "pinhole" else [],
+        "position": p_BC.tolist(),
+        "orientation": so3.quat_from_matrix(R_BC).tolist()
+    }
+
+
+def _imu(source: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
+    if not isinstance(c, dict):
+        raise ConfigError(source, "", "is no mapping")
+    out = {ours: _number(source, theirs, _needed(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
+    out["rate"] = _number(source, "update_rate", c.get("update_rate", c.get("rate_hz")))
+    out["orientation"] = so3.quat_from_matrix(R_BI).tolist()
+    out["topic"] = str(c.get("rostopic", ""))
+    return out
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    """A YAML file, also one of OpenCV (with `%YAML:1.0` and `!!opencv-matrix`)."""
+    try:
+        text = path.read_text(errors="replace")
+    except OSError as error:
+        raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from None
+    text = re.sub(r"^%YAML.*$", "", text, count=1, flags=re.MULTILINE).replace("!!opencv-matrix", "")
+    content = parse_yaml(text, str(path))
+    if not isinstance(content, dict):
+        raise ConfigError(str(path), "", "is no mapping")
+    return content
+
+
+def _needed(source: str, c: dict[str, Any], key: str, dot: str = "") -> Any:
+    if key not in c:
+        raise ConfigError(source, f"{dot}{key}", "missing")
+    return c[key]
+
+
+def _number(source: str, key: str, value: Any) -> float:
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise ConfigError(source, key, f"{value!r} is not a number")
+    return float(value)
+
+
+def _transform(source: str, key: str, value: Any) -> np.ndarray:
+    """A rigid transform, (4, 4), whose rotation is made exact: files have some ten digits."""
+    try:
+        T = np.array(value["data"] if isinstance(value, dict) else value, float).reshape(4, 4)
+    except (KeyError, TypeError, ValueError):
+        raise ConfigError(source, key, "is not 4 x 4 numbers") from None
+    R = T[:3, :3]
+    if not np.isfinite(T).all() or np.abs(R @ R.T
+                                          - np.eye(3)).max() > RIGID or np.linalg.det(R) < 0.0 or not np.allclose(T[3], [0, 0, 0, 1]):
+        raise ConfigError(source, key, f"{np.round(T, 4).tolist()} is no rigid transform")
+    u, _, vt = np.linalg.svd(R)
+    T[:3, :3] = u @ vt
+    return T

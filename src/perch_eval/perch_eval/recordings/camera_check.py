@@ -1,0 +1,98 @@
+"""A camera's images judged: size, rate, clock, exposure, sharpness, texture."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from perch_core.sensors import Sensors
+from perch_eval.recordings.findings import Report, check_rhythm
+from perch_eval.recordings.recording import Event
+
+LOOKED_AT = 60  # images of each camera whose pixels are looked at
+
+
+class Looker:
+    """What is kept of a camera's images."""
+    def __init__(self, total: int) -> None:
+        self.stamps: list[int] = []
+        self.delays: list[int] = []
+        self.sizes: set[tuple[int, int]] = set()
+        self.looks: list[tuple[float, ...]] = []
+        self._every = max(1, total // LOOKED_AT)
+
+    def take(self, event: Event) -> None:
+        """An image."""
+        image = event.value
+        if len(self.stamps) % self._every == 0:
+            pixels = image.pixels()
+            if pixels is not None:
+                self.sizes.add((pixels.shape[1], pixels.shape[0]))
+                self.looks.append(look_at(pixels))
+        self.stamps.append(image.stamp)
+        self.delays.append(event.arrived - image.stamp)
+
+
+def look_at(pixels: np.ndarray) -> tuple[float, ...]:
+    """Brightness, share of saturated pixels, width of its sharper edges [px], number of corners of an image uint8 (h, w) or (h, w, 3).
+
+    The width of an edge is its step, over three pixels to either side, by its steepest slope; the median of the image's steepest.
+    """
+    grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    slope = 0.125 * cv2.magnitude(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    box = np.ones((7, 7), np.uint8)
+    step = cv2.subtract(cv2.dilate(grey, box), cv2.erode(grey, box)).astype(np.float32)
+    edges = (slope > np.percentile(slope, 98)) & (step > 20)
+    width = float(np.median(step[edges] / slope[edges])) if edges.sum() > 50 else np.nan
+    corners = cv2.goodFeaturesToTrack(cv2.GaussianBlur(grey, (0, 0), 1.5), 400, 0.01, 15)
+    return float(grey.mean()), float((grey >= 250).mean()), width, float(0 if corners is None else len(corners))
+
+
+def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarray, sensors: Sensors | None) -> None:
+    sensor = sensors.cameras.get(name) if sensors else None
+    stamps, about = np.array(looker.stamps, np.int64), f"camera {name}"
+    if len(stamps) == 0:
+        report.say(about, "no image", fails=True)
+        return
+    if sensor is not None and looker.sizes - {(sensor.width, sensor.height)}:
+        sizes = ", ".join(f"{w} x {h}" for w, h in sorted(looker.sizes))
+        report.say(about, f"images of {sizes} px, the calibration is of {sensor.width} x {sensor.height}", fails=True)
+    if not looker.looks:
+        report.say(about, "no image could be decoded", fails=True)
+        return
+    if len(imu_stamps):
+        if not (np.diff(stamps) > 0).all():
+            report.say(f"{about} stamps", f"{int((np.diff(stamps) <= 0).sum())} are not newer than the one before", warning=True)
+        if len(stamps) > 2:
+            check_rhythm(report, about, np.unique(stamps), least=5.0, wanted=10.0, told=None)
+        outside = float(((stamps < imu_stamps[0]) | (stamps > imu_stamps[-1])).mean())
+        if outside > 0.02:
+            gap = 1e-9 * max(imu_stamps[0] - stamps[0], stamps[-1] - imu_stamps[-1])
+            report.say(f"{about} clock",
+                       f"{100 * outside:.0f} % of the images lie outside the IMU's time, by up to {gap:.3f} s",
+                       warning=outside < 0.5,
+                       fails=outside >= 0.5)
+        delays = 1e-9 * np.array(looker.delays)
+        if np.any(delays != 0.0):
+            report.say(
+                f"{about} delay",
+                f"recorded {1e3 * np.median(delays):.0f} ms after the stamp (median; 99 % within {1e3 * np.percentile(delays, 99):.0f} ms)",
+                warning=bool(np.median(delays) < -1e-3 or np.percentile(delays, 99) > 0.5))
+    brightness, bright, width, corners = (np.array(column) for column in zip(*looker.looks))
+    report.figures[f"{name}_corners"] = float(np.median(corners))
+    report.say(f"{about} exposure",
+               f"mean brightness {np.median(brightness):.0f} of 255, {100 * np.median(bright):.1f} % of the pixels saturated",
+               warning=bool(np.median(brightness) < 25 or np.median(bright) > 0.2),
+               fails=bool(np.median(brightness) < 5))
+    if np.isfinite(width).any():
+        worst, blurred = float(np.nanpercentile(width, 90)), float(np.nanmedian(width))
+        report.figures[f"{name}_edge_px"] = blurred
+        why = ": out of focus, or moved while exposed" if blurred > 6.0 else ""
+        report.say(f"{about} sharpness",
+                   f"edges are {blurred:.1f} px wide in the median, {worst:.1f} px in the worst tenth of the images{why}",
+                   warning=blurred > 6.0)
+    few = float((corners < 30).mean())
+    report.say(f"{about} texture",
+               f"{np.median(corners):.0f} corners in the median" + (f"; under 30 in {100 * few:.0f} % of the images" if few else ""),
+               warning=few > 0.1,
+               fails=few > 0.8)

@@ -1,0 +1,48 @@
+"""What would make perception fail on a recording, said before it fails: rates, gaps, jitter, units, noise, exposure, blur, clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from perch_eval.recordings.camera_check import Looker, check_camera
+from perch_eval.recordings.clocks import check_clocks
+from perch_eval.recordings.findings import Report
+from perch_eval.recordings.imu_check import check_imu
+from perch_eval.recordings.recording import IMU, Event, Recording
+
+
+def check(recording: Recording, watched: Callable[[Iterator[Event]], Iterator[Event]] = lambda events: events) -> Report:
+    """Read a recording once and judge it.
+
+    Args:
+        recording: what is judged, against its sensor file where it has one.
+        watched: what the events pass through, for a progress bar.
+    """
+    report, sensors = Report(), recording.sensors
+    stamps, samples = [], []
+    lookers = {name: Looker(n) for name, n in recording.images.items()}
+    for event in watched(recording.events()):
+        if event.source == IMU:
+            stamps.append(event.value.stamp)
+            samples.append((*event.value.w_B, *event.value.f_B))
+        else:
+            lookers[event.source].take(event)
+    if recording.damage:
+        report.say("recording", f"cannot be read to its end: {recording.damage}", warning=True)
+    if not stamps:
+        report.say("imu", "there is no IMU: only single images can be looked at", warning=True)
+    imu = np.array(samples).reshape(-1, 6)
+    times = np.array(stamps, np.int64)
+    if len(times) > 10:
+        check_imu(report, times, imu, sensors.imu if sensors else None)
+    elif len(times):
+        report.say("imu", f"{len(times)} samples are nothing to go by", fails=True)
+    for name, looker in lookers.items():
+        check_camera(report, name, looker, times, sensors)
+    if sensors is None:
+        report.say("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
+    elif len(times) > 10 and sensors.imu is not None:
+        check_clocks(report, recording, times, imu, sensors)
+    return report

@@ -1,0 +1,311 @@
+"""Perception on a recording: VIO, estimator, target localiser and powerline mapper, with a report."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perch_core.errors import ConfigError, PerchError
+from perch_core.processes import one_thread_for_sums
+from perch_core.sensors import Sensors, load_sensors
+from perch_core.tag_board import load_board
+from perch_eval.arguments import output_folder
+from perch_eval.node_launch import parse_overrides
+from perch_eval.recordings import report
+from perch_eval.recordings.calibration import to_yaml
+from perch_eval.recordings.check import check
+from perch_eval.recordings.evaluation import Evaluation, evaluate
+from perch_eval.recordings.gallery import Gallery
+from perch_eval.recordings.opening import open_recording
+from perch_eval.recordings.perception import Choice, Perception
+from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
+from perch_eval.recordings.recording import Reading, Recording
+from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
+from perch_perception.images import ImageError
+from perch_perception.line_mapping import LineDetectionConfig
+
+NODES = ("vio", "estimator", "target_localizer", "powerline_mapper")
+OPTIONAL = NODES[2:]
+EXAMPLES = """examples:
+  python3 scripts/perceive.py V1_01_easy --out out/v101                 EuRoC's folder: calibration and truth are in it
+  python3 scripts/perceive.py flight.mcap --sensors mine.yaml --truth mocap.tum --out out/flight
+  python3 scripts/perceive.py bag_folder --sensors mine.yaml --truth /vicon/pose --out out/bag
+  python3 scripts/perceive.py photos --out out/photos                   images: tags and wires in each
+  python3 scripts/perceive.py V1_01_easy --out out/few -p vio.filter.clones:=8
+
+writes report.html, report.json, vio.tum, estimator.tum, target.tum, truth.tum, powerlines.json; of images detections.json
+exit code: 0 done, 1 VIO never gave a pose (or no image could be looked at), 2 the caller's mistake, 130 interrupted"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="perceive.py",
+                                  description=__doc__,
+                                  epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out.add_argument("recording",
+                     type=Path,
+                     metavar="RECORDING",
+                     help="rosbag2 folder, .mcap, .db3, ROS 1 .bag, EuRoC or TUM-VI folder, images")
+    out.add_argument("--sensors",
+                     metavar="FILE",
+                     help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
+    out.add_argument("--truth", metavar="FILE", help="true motion: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
+    out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    out.add_argument("--camera", metavar="NAME", help="camera of VIO (default: down, or the first)")
+    out.add_argument("--front", metavar="NAME", help="camera of target localiser and powerline mapper (default: front, or that of VIO)")
+    out.add_argument("--board",
+                     default="pad_four_tags",
+                     metavar="FILE",
+                     help="tag board, or its name in config/boards (default: %(default)s)")
+    out.add_argument("--without", choices=OPTIONAL, nargs="+", default=[], metavar="NODE", help=f"leave out: {', '.join(OPTIONAL)}")
+    out.add_argument("-p", "--parameter", action="append", default=[], metavar="NODE.NAME:=VALUE", help="change a parameter of a node")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    try:
+        return _perceive(args)
+    except (PerchError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
+
+
+def _perceive(args: argparse.Namespace) -> int:
+    one_thread_for_sums()
+    overrides = parse_overrides(args.parameter)
+    for node in overrides:
+        if node not in NODES:
+            raise PerchError(f"-p {node}: is not one of {', '.join(NODES)}")
+    recording = open_recording(args.recording, load_sensors(args.sensors) if args.sensors else None)
+    load_board(args.board)
+    truth = read_truth(recording, args.truth)
+    output_folder(args.out)
+    for stale in ("report.html", "report.json"):  # of an earlier recording
+        (args.out / stale).unlink(missing_ok=True)
+    sensors = recording.sensors
+    if recording.samples == 0 or sensors is None or sensors.imu is None:
+        if recording.samples and sensors is None:
+            raise PerchError(f"{args.recording}: has an IMU and no calibration: give --sensors FILE, made by `scripts/sensors.py import`")
+        return _look_at_pictures(args, recording)
+    return _run(args, recording, sensors, truth, overrides)
+
+
+def _choose(sensors: Sensors, recording: Recording, given: str | None, preferred: str, option: str) -> str:
+    """A camera: the one that is given, else one with the usual name, else the first."""
+    there = [name for name in sensors.cameras if recording.images.get(name)]
+    if not there:
+        raise PerchError(f"{recording.path}: there is no image")
+    if given is not None and given not in there:
+        raise ConfigError(option, given, f"is not one of {', '.join(there)}")
+    return given or (preferred if preferred in there else there[0])
+
+
+# -- recordings with an IMU ------------------------------------------------------------------------------------------
+
+
+def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth: Trajectory | None,
+         overrides: dict[str, dict[str, Any]]) -> int:
+    down = _choose(sensors, recording, args.camera, "down", "--camera")
+    front = _choose(sensors, recording, args.front, "front", "--front") if args.front or "front" in recording.images else down
+    file = args.out / "sensors.yaml"  # what was used, beside what came of it
+    file.write_text(to_yaml(sensors, f"of {recording.path.name}"))
+    perception = Perception(sensors, Choice(str(file), down, front, args.board, overrides, tuple(args.without)))
+    for event in Reading(recording).read(recording.events()):
+        perception.take(event)
+    findings = check(recording)
+    figures, rows, plots, vio = _figures(perception, truth)
+    if not args.without or "powerline_mapper" not in args.without:
+        _write_lines(args.out, perception)
+    _write_trajectories(args.out, perception, vio, truth)
+    content = {
+        "recording": str(recording.path),
+        "camera": down,
+        "front": front,
+        "images": recording.images,
+        "imu_samples": recording.samples,
+        "damage": recording.damage,
+        **figures, "findings": [vars(f) for f in findings.findings],
+        "sensors": findings.figures
+    }
+    rows = [("recording", str(recording.path.resolve())),
+            ("sensors", f"{sensors.name}: VIO looks through {down}, the others through {front}"), *rows]
+    if recording.damage:
+        rows.append(("damage", recording.damage))
+    pictures = {"Tracks": perception.vio.gallery.shown}
+    if perception.target is not None:
+        pictures |= {"The board": perception.target.found.shown, "Without a board": perception.target.missed.shown[:3]}
+    if perception.wires is not None:
+        pictures |= {"Wires": perception.wires.gallery.shown}
+    _write(args.out, recording.path.name, content, rows, findings.findings, plots, pictures, perception.log)
+    print("\n".join(f"{name}: {text}" for name, text in rows))
+    for finding in findings.findings:
+        if finding.level != "ok":
+            print(f"{finding.level}: {finding.about}: {finding.text}")
+    print(f"report: {args.out / 'report.html'}")
+    return 0 if perception.states else 1
+
+
+def _figures(perception: Perception, truth: Trajectory | None) -> tuple[dict[str, Any], list[tuple[str, str]], dict[str, Any], Trajectory]:
+    """What is told of a run: for JSON, for the table, as plots; and VIO's trajectory."""
+    frames, states = perception.vio.frames, perception.states
+    outcomes = {name: sum(f.outcome == name for f in frames) for name in dict.fromkeys(f.outcome for f in frames)}
+    cost = 1e3 * np.array([f.cost for f in frames]) if frames else np.zeros(1)
+    figures: dict[str, Any] = {
+        "frames": outcomes,
+        "restarts": frames[-1].restarts if frames else 0,
+        "vio_frame_ms": {
+            "median": float(np.median(cost)),
+            "p99": float(np.percentile(cost, 99))
+        }
+    }
+    rows = [("VIO frames", ", ".join(f"{n} {name.lower()}" for name, n in outcomes.items()) or "none"),
+            ("restarts", str(figures["restarts"])),
+            ("VIO, CPU time of a frame", f"{np.median(cost):.1f} ms in the median, {np.percentile(cost, 99):.1f} ms p99")]
+    plots: dict[str, Any] = {}
+    vio = _trajectory([(s.stamp, s.p_WB, s.q_WB) for s in states])
+    compared = None
+    if len(vio) > 1:
+        moved = np.linalg.norm(vio.p - vio.p[0], axis=1)
+        figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
+        rows.append(
+            ("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
+        if truth is not None:
+            compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
+            figures["vio"] |= compared.figures()
+            rows += _evaluation_rows("VIO", compared)
+            odometry = perception.odometry[::max(1, len(perception.odometry) // 5000)]
+            against = evaluate(_trajectory([(o.stamp, o.p_WB, o.q_WB) for o in odometry if o.stamp >= vio.stamps[0]]), truth)
+            figures["estimator"] = against.figures()
+            rows += _evaluation_rows("estimator", against)[:1]
+        plots["The path"] = report.path_figure(vio, compared)
+        if compared is not None:
+            index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}
+            plots["Error and covariance"] = report.error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
+        plots["Biases"] = report.bias_figure(perception)
+    if frames:
+        plots["Tracks"] = report.frames_figure(frames)
+    if perception.sightings:
+        seen = [s for s in perception.sightings if s.pose_camera is not None]
+        rms = [s.reprojection_rms for s in seen]
+        figures["target"] = {
+            "images": len(perception.sightings),
+            "found": len(seen),
+            "poses": len(perception.targets),
+            "reprojection_rms_px": float(np.median(rms)) if rms else np.nan,
+            **_spread(perception)
+        }
+        rows.append(("board", f"found in {len(seen)} of {len(perception.sightings)} images" +
+                     (f", residual {np.median(rms):.2f} px" if rms else "") + _spread_words(figures["target"])))
+    if perception.lines is not None:
+        figures["powerlines"] = len(perception.lines.lines)
+        rows.append(("powerlines", f"{len(perception.lines.lines)} segments" +
+                     (f"; {perception.lines.message}" if perception.lines.message else "")))
+    return figures, rows, plots, vio
+
+
+def _spread(perception: Perception) -> dict[str, float]:
+    """By how much the board, which does not move, moves in the map [m]."""
+    p = np.array([target.p_WS for target in perception.targets]).reshape(-1, 3)
+    return {"spread_m": float(np.sqrt(((p - np.median(p, axis=0))**2).sum(axis=1).mean()))} if len(p) > 1 else {}
+
+
+def _spread_words(figures: dict[str, Any]) -> str:
+    return f"; its place in the map scatters by {100 * figures['spread_m']:.1f} cm rms" if "spread_m" in figures else ""
+
+
+def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
+    f = e.figures()
+    drift = f"{f['drift_percent']:.2f} % of the path" if np.isfinite(f["drift_percent"]) else "a path too short for a share"
+    return [(f"{name}: ATE (evo)", f"{100 * e.ate:.2f} cm, {e.ate_deg:.2f} deg rms over {e.duration:.1f} s and {e.path:.1f} m"),
+            (f"{name}: from the start on", f"{100 * f['final_error_m']:.1f} cm off at the end ({drift}), "
+             f"{100 * f['largest_error_m']:.1f} cm at most; attitude {f['attitude_rms_deg']:.2f} deg rms"),
+            (f"{name}: RPE (evo)", f"{100 * e.rpe:.2f} cm, {e.rpe_deg:.2f} deg rms over {e.rpe_delta:g} m"),
+            (f"{name}: scale", f"{e.scale:.4f}"),
+            (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (honest: 3)")]
+
+
+def _trajectory(rows: list[tuple[int, Any, Any]]) -> Trajectory:
+    return Trajectory(np.array([row[0] for row in rows], np.int64),
+                      np.array([row[1] for row in rows], float).reshape(-1, 3),
+                      np.array([row[2] for row in rows], float).reshape(-1, 4))
+
+
+def _write_trajectories(folder: Path, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
+    write_tum(folder / "vio.tum", vio)
+    first = vio.stamps[0] if len(vio) else 0
+    write_tum(folder / "estimator.tum",
+              _trajectory([(o.stamp, o.p_WB, o.q_WB) for o in perception.odometry if o.stamp >= first and len(vio)]))
+    write_tum(folder / "target.tum", _trajectory([(t.stamp, t.p_WS, t.q_WS) for t in perception.targets]))
+    if truth is not None:
+        write_tum(folder / "truth.tum", truth)
+
+
+def _write_lines(folder: Path, perception: Perception) -> None:
+    lines = perception.lines.lines if perception.lines is not None else ()
+    rows = [{
+        "id": line.id,
+        "start": list(line.start),
+        "end": list(line.end),
+        "radius": line.radius,
+        "covariance": line.covariance.tolist(),
+        "observations": line.observations
+    } for line in lines]
+    (folder / "powerlines.json").write_text(json.dumps(report.plain(rows), indent=1) + "\n")
+
+
+def _write(folder: Path, title: str, content: dict[str, Any], rows: list[tuple[str, str]], findings: Any, plots: dict[str, Any],
+           pictures: dict[str, Any], log: Any) -> None:
+    (folder / "report.json").write_text(json.dumps(report.plain(content), indent=1) + "\n")
+    (folder / "report.html").write_text(report.page(title, rows, findings, plots, pictures, log))
+
+
+# -- images alone ----------------------------------------------------------------------------------------------------
+
+
+def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
+    board, gallery, problems, seen = load_board(args.board), Gallery(24), [], {}
+    for event in Reading(recording).read(recording.events()):
+        image, name = event.value, getattr(event.value, "path", Path(str(event.value.stamp))).name
+        sensor = recording.sensors.cameras.get(event.source) if recording.sensors else None
+        mount = sensor.mount(event.source) if sensor else guessed_mount(event.source, image.width, image.height)
+        wires = LineDetectionConfig(appearance="red" if sensor and sensor.colour else "dark")
+        try:
+            found = look(image, mount, board, wires, sensor is not None)
+        except ImageError as error:
+            problems.append(f"{name}: {error}")
+            continue
+        seen[name] = found.figures()
+        if gallery.due():
+            gallery.add(drawn(image, found, board, name))
+        else:
+            gallery.pass_by()
+    problems += [recording.damage] if recording.damage else []
+    tags, poses = sum(len(s["tags"]) for s in seen.values()), sum("board" in s for s in seen.values())
+    rows = [("recording", str(recording.path.resolve())),
+            ("images", f"{len(seen)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
+            ("board", f"posed in {poses}"), ("wires", str(sum(len(s["wires"]) for s in seen.values())))]
+    rows += [("problem", problem) for problem in problems]
+    (args.out / "detections.json").write_text(json.dumps(report.plain(seen), indent=1) + "\n")
+    _write(args.out, recording.path.name, {
+        "images": len(seen),
+        "tags": tags,
+        "boards": poses,
+        "problems": problems
+    }, rows, (), {}, {"What was found": gallery.shown}, {})
+    print("\n".join(f"{name}: {text}" for name, text in rows) + f"\nreport: {args.out / 'report.html'}")
+    return 0 if seen else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""An estimated trajectory against the true one: ATE and RPE by `evo`, drift, and covariance against error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import so3
+from perch_eval.recordings.recording import RecordingError
+from perch_eval.recordings.trajectory import Trajectory
+
+LEAST_POSES = 5
+LEAST_PATH = 0.1  # of a motion whose shape can be compared [m]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How far an estimate is from the truth.
+
+    Attributes:
+        duration: compared [s].
+        path: length of the true path [m].
+        ate: absolute trajectory error after the best rigid alignment, rms [m]; nan: the motion is too short to be aligned.
+        ate_deg: the same of the attitude [deg].
+        rpe: error of the motion over `rpe_delta` of path, rms [m]; nan likewise.
+        rpe_deg: of the attitude [deg].
+        rpe_delta: [m].
+        scale: of the estimate against the truth; nan likewise.
+        stamps: of the compared poses [ns], shape (n,).
+        error: estimate minus truth of the position, in the estimate's W, both beginning together with the same heading [m], shape (n, 3).
+        turn: rotation vector in W of the estimate against the truth, likewise [rad], shape (n, 3).
+        nees: e^T P^-1 e of the position, 3 in the mean for an honest filter, shape (n,); nan where there is no covariance.
+        truth_W: the true path in the estimate's W, shape (n, 3).
+    """
+
+    duration: float
+    path: float
+    ate: float
+    ate_deg: float
+    rpe: float
+    rpe_deg: float
+    rpe_delta: float
+    scale: float
+    stamps: np.ndarray
+    error: np.ndarray
+    turn: np.ndarray
+    nees: np.ndarray
+    truth_W: np.ndarray
+
+    @property
+    def final(self) -> float:
+        """Distance from the truth at the end [m]."""
+        return float(np.linalg.norm(self.error[-1]))
+
+    def figures(self) -> dict[str, float]:
+        """For a table or JSON."""
+        return {
+            "compared_s": self.duration,
+            "path_m": self.path,
+            "ate_rmse_m": self.ate,
+            "ate_rmse_deg": self.ate_deg,
+            "rpe_rmse_m": self.rpe,
+            "rpe_rmse_deg": self.rpe_deg,
+            "rpe_delta_m": self.rpe_delta,
+            "scale": self.scale,
+            "final_error_m": self.final,
+            "drift_percent": 100.0 * self.final / self.path if self.path > LEAST_PATH else np.nan,
+            "largest_error_m": float(np.linalg.norm(self.error, axis=1).max()),
+            "attitude_rms_deg": float(np.degrees(np.sqrt((self.turn**2).sum(axis=1).mean()))),
+            "nees_position_mean": float(np.nanmean(self.nees)) if np.isfinite(self.nees).any() else np.nan
+        }
+
+
+def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | None = None) -> Evaluation:
+    """Compare an estimate with the truth.
+
+    Args:
+        estimate: n poses.
+        truth: of the same body, at any stamps of the same clock.
+        covariances: of the estimate's position in its W [m^2], shape (n, 3, 3).
+
+    Raises:
+        RecordingError: hardly any pose has a true one at its stamp.
+    """
+    true, kept = truth.at(estimate.stamps)
+    if kept.sum() < LEAST_POSES:
+        raise RecordingError(f"the truth ({_span(truth)}) and the estimate ({_span(estimate)}) have {int(kept.sum())} stamps in common")
+    estimate = estimate.chosen(kept)
+    # both begin in the same place with the same heading: what VIO cannot know is taken away, tilt is left
+    turn0 = so3.quat_to_matrix(estimate.q[0]) @ so3.quat_to_matrix(true.q[0]).T
+    R = so3.exp(np.array([0.0, 0.0, np.arctan2(turn0[1, 0] - turn0[0, 1], turn0[0, 0] + turn0[1, 1])]))
+    truth_W = (true.p - true.p[0]) @ R.T + estimate.p[0]
+    error = estimate.p - truth_W
+    turn = so3.quat_log(so3.quat_multiply(estimate.q, so3.quat_conjugate(so3.quat_multiply(so3.quat_from_matrix(R), true.q))))
+    nees = np.full(len(error), np.nan)
+    if covariances is not None:
+        P = covariances[kept] + 1e-12 * np.eye(3)
+        nees[1:] = np.einsum("ni,ni->n", error[1:], np.linalg.solve(P[1:], error[1:, :, None])[..., 0])
+    delta = max(0.1, round(0.1 * true.length, 1))
+    return Evaluation(1e-9 * float(true.stamps[-1] - true.stamps[0]),
+                      true.length,
+                      *_by_evo(estimate, true, delta),
+                      truth_W=truth_W,
+                      stamps=true.stamps,
+                      error=error,
+                      turn=turn,
+                      nees=nees)
+
+
+def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float, ...]:
+    """ATE [m], ATE [deg], RPE [m], RPE [deg], its delta [m], scale; nan where the motion is too short."""
+    from evo.core import metrics
+    from evo.core.geometry import GeometryException
+    from evo.core.metrics import MetricsException, PoseRelation, Unit
+    from evo.core.trajectory import PoseTrajectory3D
+
+    def of(t: Trajectory) -> PoseTrajectory3D:
+        return PoseTrajectory3D(t.p.copy(), t.q[:, [3, 0, 1, 2]].copy(), 1e-9 * (t.stamps - true.stamps[0]))
+
+    def rms(metric: metrics.PE, ours: PoseTrajectory3D) -> float:
+        metric.process_data((of(true), ours))
+        return float(metric.get_statistic(metrics.StatisticsType.rmse))
+
+    if true.length < LEAST_PATH:
+        return (np.nan, ) * 4 + (delta, np.nan)
+    ours = of(estimate)
+    try:
+        scale = float(of(estimate).align(of(true), correct_scale=True)[2])
+        ours.align(of(true))
+        ate = [rms(metrics.APE(relation), ours) for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)]
+    except GeometryException:  # along a line, or on the spot
+        ate, scale = [np.nan, np.nan], np.nan
+    try:
+        rpe = [
+            rms(metrics.RPE(relation, delta, Unit.meters, rel_delta_tol=0.2, all_pairs=True, pairs_from_reference=True), of(estimate))
+            for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)
+        ]
+    except MetricsException:
+        rpe = [np.nan, np.nan]
+    return *ate, *rpe, delta, 1.0 / scale if scale else np.nan
+
+
+def _span(trajectory: Trajectory) -> str:
+    return f"{1e-9 * trajectory.stamps[0]:.2f} to {1e-9 * trajectory.stamps[-1]:.2f} s" if len(trajectory) else "no pose"

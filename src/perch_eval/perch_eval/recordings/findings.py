@@ -1,0 +1,62 @@
+"""Findings of a check: what would make perception fail, and what it rests on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+OK, WARNING, FAILS = "ok", "warning", "fails"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the check: `ok`, `warning` or `fails`, what it is about, and what was found."""
+
+    level: str
+    about: str
+    text: str
+
+
+@dataclass
+class Report:
+    """All findings, and the figures behind them."""
+
+    findings: list[Finding] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    def say(self, about: str, text: str, warning: bool = False, fails: bool = False) -> None:
+        """Add a finding."""
+        self.findings.append(Finding(FAILS if fails else WARNING if warning else OK, about, text))
+
+    @property
+    def fails(self) -> bool:
+        """Whether something would make perception fail."""
+        return any(finding.level == FAILS for finding in self.findings)
+
+
+def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> tuple[float, float]:
+    """Rate [Hz] and jitter (1 sigma of an interval, in periods) of ascending stamps."""
+    intervals = 1e-9 * np.diff(stamps)
+    period = float(np.median(intervals))
+    rate = 1.0 / period
+    usual = intervals[intervals < 1.5 * period]
+    jitter, gaps = float(usual.std() / period) if len(usual) else np.nan, intervals[intervals > 1.8 * period]
+    report.figures[f"{about} rate_hz"] = rate
+    wrong = told is not None and not 0.8 < rate / told < 1.25
+    report.say(f"{about} rate",
+               f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {told:g} Hz in the sensor file" if wrong else "") +
+               (f": at least {wanted:g} Hz are wanted" if rate < wanted else ""),
+               warning=rate < wanted or wrong,
+               fails=rate < least)
+    report.say(f"{about} jitter",
+               f"{1e3 * jitter * period:.2f} ms (1 sigma), {100 * jitter:.0f} % of the period" +
+               (": stamps are taken on arrival, or in batches; stamp where the sensor is sampled" if jitter > 0.1 else ""),
+               warning=jitter > 0.1)
+    if len(gaps):
+        lost = round(float((gaps / period - 1.0).sum()))
+        report.say(f"{about} gaps",
+                   f"{len(gaps)}, the longest {1e3 * gaps.max():.0f} ms; {lost} missing ({100 * lost / (len(stamps) + lost):.1f} %)",
+                   warning=True)
+    return rate, jitter

@@ -1,0 +1,133 @@
+"""An IMU's samples judged: units, range, rest, biases and noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.sensors import ImuSensor
+from perch_core.vehicle import GRAVITY
+from perch_eval.recordings.findings import Report, check_rhythm
+
+STILL_WINDOW = 0.2  # [s]
+STILL_MEAN = (0.02, 0.2)  # by how much a window's mean may differ from those before it, at rest [rad/s, m/s^2]
+STILL_SIGMA = (0.3, 2.0)  # 1 sigma within a window: rotors that idle shake the vehicle, but do not move it [rad/s, m/s^2]
+
+
+def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSensor | None) -> None:
+    order = np.diff(stamps) > 0
+    if not order.all():
+        report.say("imu stamps", f"{int((~order).sum())} of {len(stamps)} are not newer than the one before", warning=True)
+        keep = np.concatenate([[True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]])
+        stamps, imu = stamps[keep], imu[keep]
+    rate, jitter = check_rhythm(report, "imu", stamps, least=50.0, wanted=100.0, told=sensor.rate if sensor else None)
+    if not np.isfinite(imu).all():
+        report.say("imu values", "some are not finite", fails=True)
+        imu = np.nan_to_num(imu)
+    gyro, accel = imu[:, :3], imu[:, 3:]
+    force = float(np.median(np.linalg.norm(accel, axis=1)))
+    if 0.8 < force < 1.2:
+        report.say("imu units", f"the specific force is {force:.2f}: in g, where m/s^2 is wanted", fails=True)
+    elif force < 5.0:
+        report.say("imu units", f"the specific force is {force:.2f} m/s^2: gravity has been taken off, or the vehicle falls", fails=True)
+    elif abs(force - GRAVITY) > 1.0:
+        report.say("imu units", f"the specific force is {force:.2f} m/s^2 in the median, far from {GRAVITY}", warning=True)
+    if np.percentile(np.abs(gyro).max(axis=1), 90) > 35.0:
+        report.say("imu units", "90 % of the angular rates exceed 35 rad/s: they may be in deg/s", fails=True)
+    if sensor is not None:
+        clipped = (np.abs(gyro) >= 0.99 * sensor.gyro_range).any(axis=1) | (np.abs(accel) >= 0.99 * sensor.accel_range).any(axis=1)
+        if clipped.any():
+            report.say("imu range", f"{int(clipped.sum())} samples are at the range of the sensor", warning=True)
+    first, last = longest_still(stamps, imu)
+    duration = 1e-9 * float(stamps[last] - stamps[first]) if last > first else 0.0
+    report.figures["still_s"] = duration
+    at_start = last > first and stamps[first] - stamps[0] < 0.5e9
+    if duration < 0.5:
+        report.say("rest", "never still for half a second: VIO has to start in motion, and the biases are learnt on the way", warning=True)
+        return
+    report.say("rest",
+               f"still for {duration:.1f} s from {1e-9 * (stamps[first] - stamps[0]):.1f} s on" +
+               ("" if at_start else ": not at the start, so that VIO begins in motion"),
+               warning=not at_start)
+    bias = gyro[first:last].mean(axis=0)
+    report.figures |= {"gyro_bias": bias.tolist(), "force_at_rest": float(np.linalg.norm(accel[first:last].mean(axis=0)))}
+    report.say("gyro bias", f"{np.linalg.norm(bias):.4f} rad/s at rest", warning=bool(np.linalg.norm(bias) > 0.2))
+    _check_noise(report, imu[first:last], rate, sensor)
+
+
+def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor | None) -> None:
+    """Noise densities at rest, from the Allan deviation, against those of the sensor file."""
+    if len(imu) < 100:
+        return
+    tau, deviation = allan_deviation(imu, rate)
+    short = tau <= max(0.2, tau[0])  # where white noise has the say
+    white = np.median(deviation[short] * np.sqrt(tau[short])[:, None], axis=0)
+    density = {"gyro": float(white[:3].max()), "accel": float(white[3:].max())}
+    report.figures |= {
+        "gyro_noise_density": density["gyro"],
+        "accel_noise_density": density["accel"],
+        "allan_tau_s": tau.tolist(),
+        "allan_gyro": deviation[:, :3].max(axis=1).tolist(),
+        "allan_accel": deviation[:, 3:].max(axis=1).tolist()
+    }
+    if tau[-1] >= 5.0:
+        report.say(
+            "bias stability",
+            f"gyro {deviation[:, :3].max(axis=1).min():.1e} rad/s, accelerometer {deviation[:, 3:].max(axis=1).min():.1e} "
+            "m/s^2 (least Allan deviation)")
+    for name, unit in (("gyro", "rad/s/sqrt(Hz)"), ("accel", "m/s^2/sqrt(Hz)")):
+        text = f"{density[name]:.1e} {unit} at rest"
+        if sensor is None:
+            report.say(f"{name} noise", text)
+            continue
+        told = getattr(sensor, f"{name}_noise_density")
+        report.say(f"{name} noise",
+                   f"{text}, {told:.1e} in the sensor file" +
+                   (": the filter will be surer than the sensor is" if density[name] > 2.0 * told else ""),
+                   warning=density[name] > 2.0 * told)
+
+
+def longest_still(stamps: np.ndarray, imu: np.ndarray) -> tuple[int, int]:
+    """The longest stretch at rest.
+
+    At rest the mean over a window stays what it was. A bias, however large, does not count, nor does the shaking of idling rotors.
+
+    Args:
+        stamps: ascending [ns], shape (n,).
+        imu: angular rate [rad/s] and specific force [m/s^2], shape (n, 6).
+
+    Returns:
+        Index of its first sample, and of the one after its last; equal where there is none.
+    """
+    edges = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], round(STILL_WINDOW * 1e9)))
+    parts = [imu[a:b] for a, b in zip(edges[:-1], edges[1:])]
+    if len(parts) < 2:
+        return 0, 0
+    limit, shaking = np.repeat(STILL_MEAN, 3), np.repeat(STILL_SIGMA, 3)
+    quiet = np.array([len(part) > 3 and bool((part.std(axis=0) < shaking).all()) for part in parts])
+    means = np.array([part.mean(axis=0) if len(part) else np.full(6, np.nan) for part in parts])
+    best, begin = (0, 0), 0
+    for k in range(len(parts) + 1):
+        same = k < len(parts) and quiet[k] and (k == begin or bool((np.abs(means[k] - means[begin:k].mean(axis=0)) < limit).all()))
+        if not same:
+            best = max(best, (begin, k), key=lambda span: span[1] - span[0])
+            begin = k if k < len(parts) and quiet[k] else k + 1
+    return int(edges[best[0]]), int(edges[best[1]])
+
+
+def allan_deviation(samples: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Overlapping Allan deviation, sigma^2(tau) = 1/2 <(mean_{k+1} - mean_k)^2> over neighbouring means of length tau.
+
+    Args:
+        samples: shape (n, m).
+        rate: [Hz].
+
+    Returns:
+        tau [s], shape (k,), and the deviations, shape (k, m); tau doubles, up to a fifth of the samples.
+    """
+    total = np.vstack([np.zeros(samples.shape[1]), np.cumsum(samples, axis=0)])
+    lengths = [1 << k for k in range(32) if 5 * (1 << k) <= len(samples)]
+    out = []
+    for m in lengths:
+        means = (total[m:] - total[:-m]) / m
+        out.append(np.sqrt(0.5 * np.mean((means[m:] - means[:-m])**2, axis=0)))
+    return np.array(lengths) / rate, np.array(out)

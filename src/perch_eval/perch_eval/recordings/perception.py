@@ -1,0 +1,220 @@
+"""The components of perception in a row, as the graph has them: whoever emits is heard at once, and nothing waits for a clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from perch_core import config
+from perch_core.component import Component, LogLine
+from perch_core.sensors import Sensors
+from perch_core.tag_board import load_board
+from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, InertialState, OdometryState, PowerlineMap, TargetPose,
+                               TargetSighting)
+from perch_eval.in_process.parameters import nested
+from perch_eval.node_launch import flattened, read_parameters
+from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_wires
+from perch_eval.recordings.gallery import Gallery, Shown
+from perch_eval.recordings.recording import IMU, Event
+from perch_perception.estimator_component import StateEstimator
+from perch_perception.line_mapping import detect_lines
+from perch_perception.images import mono_image, rgb_image
+from perch_perception.powerline_mapper import PowerlineMapper
+from perch_perception.target_localizer import TargetLocalizer
+from perch_perception.vio_component import VioComponent
+
+TAIL = 8  # frames that a picture of tracks looks back
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Who looks through which camera, and at what.
+
+    Attributes:
+        sensors: name or file of the sensors.
+        down: camera of VIO.
+        front: camera of target localiser and powerline mapper.
+        board: tag board, config/boards/<name>.yaml or a file.
+        overrides: node -> parameter -> value, over `config/<node>.yaml`.
+        without: nodes that are left out.
+    """
+
+    sensors: str
+    down: str
+    front: str
+    board: str
+    overrides: Mapping[str, Mapping[str, Any]]
+    without: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What VIO made of a frame.
+
+    Attributes:
+        stamp: of the image [ns].
+        outcome: name of the `FrameOutcome`.
+        features, used, refused: tracks, and observations that changed the state or were refused.
+        nis, nis_dimension: of all observations.
+        restarts: so far.
+        cost: CPU time [s].
+        message: for people.
+    """
+
+    stamp: int
+    outcome: str
+    features: int
+    used: int
+    refused: int
+    nis: float
+    nis_dimension: int
+    restarts: int
+    cost: float
+    message: str
+
+
+class _Vio(VioComponent):
+    """Notes every frame, and draws some."""
+
+    frames: list[Frame]
+    gallery: Gallery
+
+    def use(self, image: CameraImage) -> None:
+        """As it does."""
+        due, soon = self.gallery.due(), self.gallery.due(TAIL)
+        drawn: list[CameraImage] = []
+        self.debug_image.receivers[:] = [drawn.append] if soon else []
+        begin = time.process_time()
+        super().use(image)
+        r = self.result
+        self.frames.append(
+            Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, float(r.nis), r.nis_dimension, r.restarts,
+                  time.process_time() - begin, r.message))
+        if due and drawn:
+            self.gallery.add(Shown(image.stamp, f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used", drawn[-1].pixels()))
+        else:
+            self.gallery.pass_by()
+
+
+class _Target(TargetLocalizer):
+    """Draws some of the images in which it finds the board, and a few in which it does not."""
+
+    found: Gallery
+    missed: Gallery
+
+    def look(self, image: CameraImage, exposed: float) -> None:
+        """As it does."""
+        sightings: list[TargetSighting] = []
+        self.sighting.receivers.append(sightings.append)
+        super().look(image, exposed)
+        self.sighting.receivers.pop()
+        seen = sightings[-1]
+        gallery = self.missed if seen.pose_camera is None else self.found
+        if not gallery.due():
+            gallery.pass_by()
+            return
+        camera = self.mounted.mount.camera
+        drawn = canvas(mono_image(image, camera))
+        text = seen.message
+        if seen.pose_camera is not None:
+            draw_board(drawn, camera, load_board(self.config.board), seen.pose_camera, seen.ids)
+            text = f"tags {list(seen.ids)}, {np.linalg.norm(seen.pose_camera.p_WS):.2f} m, rms {seen.reprojection_rms:.2f} px"
+        gallery.add(Shown(image.stamp, text, caption(drawn, text[:80])))
+
+
+class _Wires(PowerlineMapper):
+    """Draws some of the images, with the wires that are detected in them."""
+
+    gallery: Gallery
+
+    def look(self, image: CameraImage, exposed: float) -> None:
+        """As it does."""
+        super().look(image, exposed)
+        if not self.gallery.due():
+            self.gallery.pass_by()
+            return
+        camera = self.mounted.mount.camera
+        pixels = rgb_image(image, camera) if self.config.detection.appearance == "red" else mono_image(image, camera)
+        wires = detect_lines(pixels, camera, self.config.detection)
+        drawn = canvas(mono_image(image, camera))
+        draw_wires(drawn, camera, wires)
+        self.gallery.add(Shown(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires")))
+
+
+class Perception:
+    """VIO, estimator, target localiser and powerline mapper, and what they have said.
+
+    Attributes:
+        vio: the component of VIO.
+        states: of VIO.
+        odometry: the estimator's, one for each IMU sample.
+        health: the estimator's word on itself.
+        sightings, targets: of the target localiser.
+        lines: the last map; None: there is none.
+        log: (node, level, text), each text once.
+    """
+    def __init__(self, sensors: Sensors, choice: Choice) -> None:
+        """
+        Raises:
+            ConfigError: a parameter or a camera is refused.
+        """
+        self._sensors, self._choice = sensors, choice
+        common = {"sensors": choice.sensors}
+        down, front = common | {"camera": choice.down}, common | {"camera": choice.front}
+        wires = "red" if sensors.cameras[choice.front].colour else "dark"
+        self.vio: _Vio = self._make("vio", _Vio, down | {"level_ground": False})
+        self.vio.frames, self.vio.gallery = [], Gallery()
+        self.estimator: StateEstimator = self._make("estimator", StateEstimator, common)
+        self.target: _Target | None = self._make("target_localizer", _Target, front | {"board": choice.board})
+        self.wires: _Wires | None = self._make("powerline_mapper", _Wires, front | {"detection.appearance": wires})
+        self.states: list[InertialState] = []
+        self.odometry: list[OdometryState] = []
+        self.health: list[EstimatorHealth] = []
+        self.sightings: list[TargetSighting] = []
+        self.targets: list[TargetPose] = []
+        self.lines: PowerlineMap | None = None
+        self.log: dict[tuple[str, str, str], int] = {}
+        self.vio.state.receivers += [self.states.append, self.estimator.on_vio_state]
+        self.vio.odometry.receivers.append(self.estimator.on_vio_odometry)
+        self.estimator.status.receivers.append(self.health.append)
+        self.estimator.odometry.receivers.append(self.odometry.append)
+        if self.target is not None:
+            self.target.found, self.target.missed = Gallery(), Gallery(4)
+            self.target.sighting.receivers.append(self.sightings.append)
+            self.target.pose.receivers.append(self.targets.append)
+            self.estimator.odometry.receivers.append(self.target.on_odometry)
+        if self.wires is not None:
+            self.wires.gallery = Gallery(6)
+            self.wires.powerlines.receivers.append(lambda lines: setattr(self, "lines", lines))
+            self.estimator.odometry.receivers.append(self.wires.on_odometry)
+
+    def take(self, event: Event) -> None:
+        """Give the components what a sensor said."""
+        if event.source == IMU:
+            self.estimator.on_imu(event.value)
+            self.vio.on_imu(event.value)
+            return
+        for camera, components in ((self._choice.down, (self.vio, )), (self._choice.front, (self.target, self.wires))):
+            if camera != event.source:
+                continue
+            for component in filter(None, components):
+                component.on_camera_info(CameraModel(event.value.stamp, event.value.frame, self._sensors.cameras[camera].camera))
+                component.on_image(event.value)
+
+    def _make(self, node: str, cls: type[Component[Any]], given: Mapping[str, Any]) -> Any:
+        """A component with the parameters of its node; None where it is left out."""
+        if node in self._choice.without:
+            return None
+        parameters = flattened(read_parameters(node)) | dict(given) | flattened(self._choice.overrides.get(node, {}))
+        component = cls(config.from_mapping(cls.config_type, nested(parameters), node))
+        component.log.receivers.append(lambda line: self._note(node, line))
+        return component
+
+    def _note(self, node: str, line: LogLine) -> None:
+        key = (node, line.level, line.text)
+        if line.level != "info" and (key in self.log or len(self.log) < 200):
+            self.log[key] = self.log.get(key, 0) + 1

@@ -1,0 +1,129 @@
+"""What single images show: tags and the board, wires; without an IMU, and where there is no calibration without a camera either."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perch_core import so3
+from perch_core.camera import CameraMount, PinholeCamera
+from perch_core.tag_board import TagBoard
+from perch_core.values import CameraImage, TargetPose
+from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_tags, draw_wires
+from perch_eval.recordings.gallery import Shown
+from perch_perception.images import mono_image
+from perch_perception.line_mapping import LineDetectionConfig, LineSighting, detect_lines
+from perch_perception.tags import BoardLocalizer, BoardPose
+from perch_perception.tags.detector import SEARCH_WINDOWS
+
+GUESSED_FOCAL = 0.8  # of a camera that nobody has calibrated, as a share of the image's width
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one image shows.
+
+    Attributes:
+        tags: numbers and corners [px], shape (4, 2), of all tags of the family.
+        board: pose of the board in the camera; None: it was not found.
+        message: why it was not, for people.
+        wires: arcs of straight wires.
+        mount: the camera, guessed where nobody calibrated it.
+    """
+
+    tags: Sequence[tuple[int, np.ndarray]]
+    board: BoardPose | None
+    message: str
+    wires: Sequence[LineSighting]
+    mount: CameraMount
+
+    def figures(self) -> dict[str, Any]:
+        """For JSON: lengths in m, angles as quaternions xyzw, pixels as OpenCV counts them."""
+        out: dict[str, Any] = {
+            "tags": [{
+                "id": number,
+                "corners": np.round(corners, 3).tolist()
+            } for number, corners in self.tags],
+            "message": self.message,
+            "wires": [{
+                "pixels": np.round(self.mount.camera.project(wire.rays_C)[0], 2).tolist(),
+                "length_px": round(wire.length, 1)
+            } for wire in self.wires]
+        }
+        if self.board is not None:
+            out["board"] = {
+                "position": self.board.p_CS.tolist(),
+                "orientation": so3.quat_from_matrix(self.board.R_CS).tolist(),
+                "sigma": np.sqrt(np.diag(self.board.covariance)).tolist(),
+                "rms_px": self.board.rms,
+                "ids": list(self.board.ids)
+            }
+        return out
+
+
+def guessed_mount(name: str, width: int, height: int) -> CameraMount:
+    """A camera without distortion, as a webcam has it."""
+    focal = GUESSED_FOCAL * width
+    return CameraMount(name, PinholeCamera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), np.zeros(3), np.eye(3))
+
+
+def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDetectionConfig, calibrated: bool) -> Seen:
+    """Look at one image.
+
+    Args:
+        image: of the camera's size.
+        mount: the camera.
+        board: whose pose is wanted.
+        wires: what counts as a wire.
+        calibrated: the camera is known; otherwise no pose can be told.
+
+    Raises:
+        ImageError: it is not of the camera's size or has no pixels.
+    """
+    grey = mono_image(image, mount.camera)
+    tags = find_tags(grey)
+    if calibrated:
+        found = BoardLocalizer(board, mount).process(grey, 0.0)
+        pose, message = found.board, found.message
+    else:
+        pose, message = None, "the camera is not calibrated: no pose"
+    return Seen(tags, pose, message, detect_lines(grey if wires.appearance == "dark" else image.pixels()[..., ::-1], mount.camera, wires),
+                mount)
+
+
+def find_tags(grey: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """Number and corners (TL, TR, BR, BL) [px], (4, 2), of every tag 36h11 in a grey image, several with one number included.
+
+    OpenCV's detector on the image enlarged twice, with each of the localiser's threshold windows: a tag that one loses, another finds.
+    """
+    large, found = cv2.resize(grey, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), []
+    for window in SEARCH_WINDOWS:
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window
+        parameters.minMarkerPerimeterRate = 0.01
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
+        corners, ids, _ = detector.detectMarkers(large)
+        for number, corner in zip(() if ids is None else np.ravel(ids).tolist(), corners):
+            corner = (np.reshape(corner, (4, 2)) - 0.5) / 2.0  # cv2.resize maps the centre u of a pixel to 2 u + 0.5
+            side = np.linalg.norm(corner[0] - corner[1])
+            if all(np.linalg.norm(corner.mean(axis=0) - other.mean(axis=0)) > 0.3 * side for _, other in found):
+                found.append((int(number), corner))
+    return found
+
+
+def drawn(image: CameraImage, seen: Seen, board: TagBoard, name: str) -> Shown:
+    """The image with what was found in it."""
+    picture = canvas(mono_image(image, seen.mount.camera))
+    draw_wires(picture, seen.mount.camera, seen.wires)
+    draw_tags(picture, seen.tags)
+    text = f"{name}: {len(seen.tags)} tags, {len(seen.wires)} wires"
+    if seen.board is not None:
+        pose = TargetPose(image.stamp, seen.board.p_CS, so3.quat_from_matrix(seen.board.R_CS), seen.board.covariance)
+        draw_board(picture, seen.mount.camera, board, pose, seen.board.ids)
+        text += f", board at {np.linalg.norm(seen.board.p_CS):.2f} m"
+    return Shown(image.stamp, text, caption(picture, text[:80]))

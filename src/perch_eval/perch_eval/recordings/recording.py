@@ -1,0 +1,124 @@
+"""A recording as its readers give it: what the IMU and the cameras said, in the order in which it arrived."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from perch_core.errors import PerchError
+from perch_core.sensors import CameraSensor, Sensors
+from perch_core.urdf import optical_frame
+from perch_core.values import CameraImage, ImuSample
+from perch_eval.campaign.progress import Progress, span
+
+IMU = "imu"
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
+
+
+class RecordingError(PerchError):
+    """A recording, or a file that belongs to it, cannot be read, or does not hold what is asked for."""
+
+
+class Event(NamedTuple):
+    """Something that a sensor said.
+
+    Attributes:
+        source: `imu`, or the name of the camera.
+        arrived: when it was recorded [ns]; its stamp where that is not known.
+        value: what it said, in the sensor's own axes.
+    """
+
+    source: str
+    arrived: int
+    value: ImuSample | CameraImage
+
+
+class Reading(Progress):
+    """How far a recording has been read."""
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording.samples + sum(recording.images.values()), what="messages")
+
+    def read(self, events: Iterable[Event]) -> Iterator[Event]:
+        """The events, counted on their way."""
+        for event in events:
+            yield event
+            self.add(True)
+        self.close()
+
+    def line(self, now: float) -> str:
+        """The bar, and the time that is left."""
+        share = min(1.0, self._done / max(self._total, 1))
+        left = span((1.0 - share) / share * (now - self._began)) if share > 0.0 else "?"
+        return f"  [{'#' * round(30 * share):30}] {100 * share:3.0f} %, {self._done}/{self._total} {self._what}, {left} left"
+
+
+class Recording(ABC):
+    """One recording.
+
+    Attributes:
+        path: of the folder or file.
+        sensors: its calibration; None: there is none.
+        images: number of images by camera.
+        samples: number of IMU samples.
+        damage: why it could not be read to its end, known once it has been read; empty: it could.
+    """
+    def __init__(self, path: Path, sensors: Sensors | None) -> None:
+        self.path, self.sensors = path, sensors
+        self.images: dict[str, int] = {}
+        self.samples = 0
+        self.damage = ""
+
+    @abstractmethod
+    def events(self) -> Iterator[Event]:
+        """Everything in the order in which it arrived; each call begins anew."""
+
+    @property
+    def truth(self) -> Path | None:
+        """The file with the true motion that it brings along; None: none."""
+        return None
+
+
+class _Picture(CameraImage):
+    """An image on file, decoded when somebody looks at it."""
+
+    __slots__ = ("path", )
+
+
+def picture(path: Path, stamp: int, name: str, camera: CameraSensor | None) -> CameraImage:
+    """An image file as a camera's image; grey unless the camera delivers colour, 16 bits as their upper 8.
+
+    Args:
+        path: of the file; one that cannot be decoded is found out when somebody looks.
+        stamp: [ns].
+        name: of the camera.
+        camera: what it is; None: as the file has it.
+
+    Raises:
+        RecordingError: the size is not given and the file cannot be read.
+    """
+    flag, encoding = (cv2.IMREAD_COLOR, "bgr8") if camera is None or camera.colour else (cv2.IMREAD_GRAYSCALE, "mono8")
+    if camera is None:
+        pixels = decoded(path, flag)
+        if pixels is None:
+            raise RecordingError(f"{path}: is no image that can be read")
+        width, height = pixels.shape[1], pixels.shape[0]
+    else:
+        width, height = camera.width, camera.height
+    image = _Picture(stamp, optical_frame(name), width, height, encoding, cache(lambda region=None: decoded(path, flag)))
+    image.path = path
+    return image
+
+
+def decoded(path: Path, flag: int) -> np.ndarray | None:
+    """The pixels of an image file, uint8; None: it cannot be read. `flag`: OpenCV's IMREAD_GRAYSCALE or IMREAD_COLOR."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError:
+        return None
+    return cv2.imdecode(data, flag | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None

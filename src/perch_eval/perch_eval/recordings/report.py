@@ -1,0 +1,172 @@
+"""`report.html` of a recording: what was found, how far off it was, and what it looked like."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from perch_eval.plots import encode
+from perch_eval.recordings.findings import Finding
+from perch_eval.recordings.evaluation import Evaluation
+from perch_eval.recordings.gallery import Shown
+from perch_eval.recordings.perception import Frame, Perception
+from perch_eval.recordings.trajectory import Trajectory
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; } td, th { padding: 3px 20px 3px 0; text-align: left; vertical-align: top; }
+th { font-weight: 600; white-space: nowrap; }
+.ok { color: #17692b; } .warning { color: #9a6700; } .fails { color: #a11; } img { max-width: 100%; }
+.pictures { display: grid; grid-template-columns: repeat(3, 1fr); gap: 10px; }
+figure { margin: 0; } figcaption { font-size: 12px; color: #555; }
+"""
+COLOURS = {
+    "TRACKING": "#2ca02c",
+    "RESTING": "#1f77b4",
+    "LEAVING": "#17becf",
+    "BLIND": "#d62728",
+    "LOST": "#8c564b",
+    "INITIALISING": "#bbbbbb"
+}
+
+
+def page(title: str, summary: Sequence[tuple[str, str]], findings: Sequence[Finding], figures: Mapping[str, Figure],
+         pictures: Mapping[str, Sequence[Shown]], log: Mapping[tuple[str, str, str], int]) -> str:
+    """The page.
+
+    Args:
+        title: of the recording.
+        summary: rows of the first table: name and figure.
+        findings: of the check.
+        figures: title -> figure.
+        pictures: title -> pictures.
+        log: (node, level, text) -> how often.
+    """
+    def row(*cells: str, css: str = "") -> str:
+        return f"<tr><th{css}>{html.escape(cells[0])}</th>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells[1:]) + "</tr>"
+
+    body = [f"<h1>{html.escape(title)}</h1><table>{''.join(row(*pair) for pair in summary)}</table>"]
+    body += [f'<h2>{name}</h2><img src="data:image/png;base64,{encode(figure)}">' for name, figure in figures.items()]
+    for name, shown in pictures.items():
+        if shown:
+            body.append(f'<h2>{name}</h2><div class="pictures">{"".join(map(_picture, shown))}</div>')
+    if findings:
+        rows = "".join(row(f.level, f.about, f.text, css=f' class="{f.level}"') for f in findings)
+        body.append(f"<h2>The sensors</h2><table>{rows}</table>")
+    if log:
+        lines = "".join(row(f"{node}: {level}", text, f"{n} times" if n > 1 else "") for (node, level, text), n in log.items())
+        body.append(f"<h2>What the components said</h2><table>{lines}</table>")
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
+    return f'<!doctype html><html lang="en">{head}{"".join(body)}</html>\n'
+
+
+def _picture(shown: Shown) -> str:
+    pixels = shown.pixels
+    scale = min(1.0, 640.0 / pixels.shape[1])
+    if scale < 1.0:
+        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    data = base64.b64encode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()).decode()
+    text = f"{1e-9 * shown.stamp:.3f} s: {html.escape(shown.caption)}"
+    return f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{text}</figcaption></figure>'
+
+
+def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:
+    """The path from above and from the side."""
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    for axes, (i, j) in zip(figure.subplots(1, 2), ((0, 1), (0, 2))):
+        if evaluation is not None:
+            axes.plot(evaluation.truth_W[:, i], evaluation.truth_W[:, j], color="0.3", lw=1.6, label="truth")
+        axes.plot(estimate.p[:, i], estimate.p[:, j], color="C1", lw=1.2, label="VIO")
+        axes.plot(*estimate.p[0, [i, j]], "o", color="C1", ms=5)
+        axes.set_xlabel(f"{'xyz'[i]} [m]")
+        axes.set_ylabel(f"{'xyz'[j]} [m]")
+        axes.axis("equal")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    return figure
+
+
+def frames_figure(frames: Sequence[Frame]) -> Figure:
+    """Tracks over time; the background says what VIO made of each frame."""
+    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    axes = figure.subplots()
+    t = 1e-9 * np.array([f.stamp - frames[0].stamp for f in frames])
+    for name in ("features", "used", "refused"):
+        axes.plot(t, [getattr(f, name) for f in frames], lw=1.0, label=name)
+    edges = [0, *(k for k in range(1, len(frames)) if frames[k].outcome != frames[k - 1].outcome), len(frames)]
+    named: set[str] = set()
+    for a, b in zip(edges[:-1], edges[1:]):
+        outcome = frames[a].outcome
+        axes.axvspan(t[a],
+                     t[min(b,
+                           len(t) - 1)],
+                     color=COLOURS.get(outcome, "#888888"),
+                     alpha=0.15,
+                     lw=0,
+                     label=None if outcome in named else outcome.lower())
+        named.add(outcome)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("tracks, observations")
+    axes.legend(fontsize=8, ncol=4)
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def bias_figure(perception: Perception) -> Figure:
+    """The biases as VIO estimates them, with 3 sigma."""
+    states = perception.states
+    t = 1e-9 * np.array([s.stamp - states[0].stamp for s in states])
+    sigma = np.sqrt(np.array([np.diag(s.covariance) for s in states]))
+    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    for axes, name, first, unit in zip(figure.subplots(1, 2), ("gyro_bias", "accel_bias"), (9, 12), ("rad/s", "m/s^2")):
+        values = np.array([getattr(s, name) for s in states])
+        for i in range(3):
+            axes.plot(t, values[:, i], color=f"C{i}", lw=1.2, label="xyz"[i])
+            band = 3.0 * sigma[:, first + i]
+            axes.fill_between(t, values[:, i] - band, values[:, i] + band, color=f"C{i}", alpha=0.12, lw=0)
+        axes.set_ylabel(f"{name.replace('_', ' ')} [{unit}]")
+        axes.set_xlabel("time [s]")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    return figure
+
+
+def error_figure(evaluation: Evaluation, sigma: np.ndarray) -> Figure:
+    """Position error along each axis within 3 sigma, and the attitude's error.
+
+    Args:
+        evaluation: of VIO's trajectory.
+        sigma: 1 sigma of the position at its stamps [m], shape (n, 3).
+    """
+    t = 1e-9 * (evaluation.stamps - evaluation.stamps[0])
+    figure = Figure(figsize=(11, 5.5), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True).ravel()
+    for i, axes in enumerate(panels[:3]):
+        axes.fill_between(t, -300.0 * sigma[:, i], 300.0 * sigma[:, i], color="C1", alpha=0.2, lw=0, label="3 sigma")
+        axes.plot(t, 100.0 * evaluation.error[:, i], color="C0", lw=1.2, label="error")
+        axes.set_ylabel(f"{'xyz'[i]} [cm]")
+        axes.legend(fontsize=8)
+    panels[3].plot(t, np.degrees(np.linalg.norm(evaluation.turn, axis=1)), lw=1.2)
+    panels[3].set_ylabel("attitude [deg]")
+    for axes in panels:
+        axes.grid(alpha=0.3)
+    for axes in panels[2:]:
+        axes.set_xlabel("time [s]")
+    return figure
+
+
+def plain(value: Any) -> Any:
+    """For JSON, which has no nan: null says that a figure could not be had."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,125 @@
+"""Sensor files: made of a calibration, and a recording checked against one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.errors import ConfigError, PerchError
+from perch_core.sensors import load_sensors
+from perch_eval.recordings.asl import root_of
+from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
+from perch_eval.recordings.check import check
+from perch_eval.recordings.opening import open_recording
+from perch_eval.recordings.recording import Reading
+
+EXAMPLES = """examples:
+  python3 scripts/sensors.py import kalibr camchain-imucam.yaml imu.yaml --out mine.yaml
+  python3 scripts/sensors.py import euroc V1_01_easy --out euroc.yaml
+  python3 scripts/sensors.py import kalibr camchain-imucam.yaml imu.yaml --rename cam0=down cam1=front --imu-orientation 0 0.7071 0 0.7071
+  python3 scripts/sensors.py check flight.mcap --sensors mine.yaml
+
+exit code: 0 done (nothing would fail), 1 something would make perception fail, 2 the caller's mistake, 130 interrupted"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = argparse.ArgumentParser(prog="sensors.py",
+                                  description=__doc__,
+                                  epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = out.add_subparsers(dest="verb", required=True, metavar="import|check")
+    read = verbs.add_parser("import",
+                            help="a sensor file of a calibration",
+                            epilog=EXAMPLES,
+                            formatter_class=argparse.RawDescriptionHelpFormatter)
+    read.add_argument("kind", choices=("kalibr", "euroc"))
+    read.add_argument("files",
+                      nargs="+",
+                      type=Path,
+                      metavar="FILE",
+                      help="kalibr: camchain-imucam.yaml [imu.yaml]; euroc: the recording's folder")
+    read.add_argument("--out", type=Path, metavar="FILE", help="where to write (default: the terminal)")
+    read.add_argument("--name", help="of the sensors (default: of the file)")
+    read.add_argument("--rename", nargs="+", default=[], metavar="OLD=NEW", help="names of the cameras, as cam0=down")
+    read.add_argument("--imu-orientation",
+                      nargs=4,
+                      type=float,
+                      default=(0.0, 0.0, 0.0, 1.0),
+                      metavar=("X", "Y", "Z", "W"),
+                      help="axes of the IMU in the body (forward, left, up), as a quaternion (default: the body has the IMU's axes)")
+    judge = verbs.add_parser("check", help="what would make perception fail on a recording")
+    judge.add_argument("recording", type=Path, metavar="RECORDING")
+    judge.add_argument("--sensors",
+                       metavar="FILE",
+                       help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
+    return out
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    args = parser().parse_args(arguments)
+    try:
+        return _import(args) if args.verb == "import" else _check(args)
+    except (PerchError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
+
+
+def _import(args: argparse.Namespace) -> int:
+    q = np.array(args.imu_orientation)
+    if not abs(np.linalg.norm(q) - 1.0) < 1e-2:
+        raise ConfigError("--imu-orientation", " ".join(map(str, args.imu_orientation)), "is no unit quaternion")
+    R_BI, first = so3.quat_to_matrix(q / np.linalg.norm(q)), args.files[0]
+    if args.kind == "kalibr":
+        if len(args.files) > 2:
+            raise ConfigError("import kalibr", str(args.files[2]), "is one file too many: camchain-imucam.yaml [imu.yaml]")
+        sensors = from_kalibr(first, args.files[1] if len(args.files) > 1 else None, args.name or first.stem, R_BI)
+    else:
+        root = root_of(first)
+        if root is None or len(args.files) > 1:
+            raise ConfigError("import euroc", str(args.files[-1]), "is no folder with mav0/cam0")
+        sensors = from_asl(root, R_BI)
+    text = to_yaml(
+        _renamed(sensors, args), f"Made by `scripts/sensors.py import {args.kind}` of {', '.join(file.name for file in args.files)}.\n"
+        "1 sigma of the calibration (`sigma`) and turn-on biases are defaults: look into the reports and data sheets.")
+    if args.out is None:
+        print(text, end="")
+    else:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(text)
+        load_sensors(args.out)
+        print(f"sensor file: {args.out}")
+    return 0
+
+
+def _renamed(sensors, args: argparse.Namespace):
+    """The sensors with the names that are wanted."""
+    from dataclasses import replace
+
+    names = dict(pair.split("=", 1) if "=" in pair else (pair, "") for pair in args.rename)
+    for old, new in names.items():
+        if old not in sensors.cameras or not new.isidentifier():
+            raise ConfigError("--rename", f"{old}={new}", f"is not OLD=NEW with one of {', '.join(sensors.cameras)}")
+    cameras = {names.get(name, name): camera for name, camera in sensors.cameras.items()}
+    return replace(sensors, cameras=cameras, name=args.name or sensors.name)
+
+
+def _check(args: argparse.Namespace) -> int:
+    recording = open_recording(args.recording, load_sensors(args.sensors) if args.sensors else None)
+    found = check(recording, Reading(recording).read)
+    width = max(len(finding.about) for finding in found.findings)
+    for finding in found.findings:
+        print(f"{finding.level:8} {finding.about:{width}}  {finding.text}")
+    return 1 if found.fails else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

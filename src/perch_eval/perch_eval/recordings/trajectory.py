@@ -1,0 +1,145 @@
+"""Trajectories over time, their files (TUM, EuRoC's ground truth), and one at the stamps of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perch_core import so3
+from perch_eval.recordings.asl import table
+from perch_eval.recordings.bag import BagRecording
+from perch_eval.recordings.recording import Recording, RecordingError
+
+MAX_GAP = 0.1  # poses further apart than this are not interpolated [s]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of B in W.
+
+    Attributes:
+        stamps: ascending, int64 [ns], shape (n,).
+        p: position [m], shape (n, 3).
+        q: attitude xyzw, shape (n, 4).
+    """
+
+    stamps: np.ndarray
+    p: np.ndarray
+    q: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def length(self) -> float:
+        """Of the path [m]."""
+        return float(np.linalg.norm(np.diff(self.p, axis=0), axis=1).sum())
+
+    def chosen(self, rows: np.ndarray) -> Trajectory:
+        """Some of its poses, by index or mask."""
+        return Trajectory(self.stamps[rows], self.p[rows], self.q[rows])
+
+    def at(self, stamps: np.ndarray) -> tuple[Trajectory, np.ndarray]:
+        """Interpolated poses.
+
+        Args:
+            stamps: ascending [ns], shape (m,).
+
+        Returns:
+            The poses at those of the stamps that are neither outside nor inside a gap, and the mask of these, shape (m,).
+        """
+        if len(self) < 2:
+            return self.chosen(np.zeros(0, int)), np.zeros(len(stamps), bool)
+        right = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self) - 1)
+        left = right - 1
+        span = self.stamps[right] - self.stamps[left]
+        good = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]) & (span <= MAX_GAP * 1e9)
+        left, right, span, stamps = left[good], right[good], span[good], stamps[good]
+        share = ((stamps - self.stamps[left]) / span)[:, None]
+        turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(self.q[left]), self.q[right]))
+        q = so3.quat_multiply(self.q[left], so3.quat_exp(share * turn))
+        return Trajectory(stamps, (1.0 - share) * self.p[left] + share * self.p[right], q), good
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write `stamp [s] x y z qx qy qz qw`, one pose a line."""
+    rows = zip(trajectory.stamps.tolist(), np.hstack([trajectory.p, trajectory.q]).tolist())
+    path.write_text("# stamp [s] x y z [m] qx qy qz qw\n"
+                    + "".join(f"{stamp // 10**9}.{stamp % 10**9:09d} {' '.join(f'{x:.9f}' for x in row)}\n" for stamp, row in rows))
+
+
+def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
+    """The true motion of a recording.
+
+    Args:
+        recording: the one that was read.
+        given: a file in TUM's or EuRoC's format, or a topic of the bag; None: what the recording brings along.
+
+    Returns:
+        The motion; None: none is known.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
+    if given is None:
+        return None if recording.truth is None else read_trajectory(recording.truth)
+    if Path(given).is_file():
+        return read_trajectory(Path(given))
+    if isinstance(recording, BagRecording) and given.startswith("/"):
+        rows = [(stamp, *_pose(pose)) for stamp, pose in recording.poses(given)]
+        return _checked(f"{recording.path}: {given}", np.array([row[0] for row in rows], np.int64),
+                        np.array([row[1:] for row in rows], float))
+    raise RecordingError(f"--truth {given}: is no file{', and no topic' if isinstance(recording, BagRecording) else ''}")
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """A file in TUM's format (seconds, x y z, qx qy qz qw) or in EuRoC's (nanoseconds, x, y, z, qw, qx, qy, qz, ...).
+
+    Raises:
+        RecordingError: it cannot be read, or is neither.
+    """
+    try:
+        first = next((line for line in path.read_text(errors="replace").splitlines() if line.strip() and line.lstrip()[0] not in "#"), "")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    if "," in first:
+        stamps, values = table(path, 8)
+        values = values[:, [0, 1, 2, 4, 5, 6, 3]]
+    else:
+        try:
+            rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.lstrip().startswith("#")]
+            stamps = np.array([_nanoseconds(row[0]) for row in rows], np.int64)
+            values = np.array([row[1:8] for row in rows], float)
+        except (ValueError, IndexError, OverflowError):
+            raise RecordingError(f"{path}: is no trajectory: neither TUM's (stamp [s] x y z qx qy qz qw) nor EuRoC's format") from None
+    return _checked(str(path), stamps, values)
+
+
+def _nanoseconds(text: str) -> int:
+    """Seconds as they are written, in whole nanoseconds; OpenVINS writes 1.40e18 nanoseconds into some of its files."""
+    whole, _, part = text.partition(".")
+    if "e" in text.lower():
+        value = float(text)
+        return round(value if value > 1e14 else value * 1e9)
+    return int(whole) * 10**9 + int((part + "0" * 9)[:9])
+
+
+def _checked(source: str, stamps: np.ndarray, values: np.ndarray) -> Trajectory:
+    """Poses in the order of their stamps, each stamp once, quaternions of length one."""
+    if values.ndim != 2 or values.shape[1] != 7 or len(stamps) < 2:
+        raise RecordingError(f"{source}: is no trajectory of two poses or more")
+    stamps, order = np.unique(stamps, return_index=True)
+    values = values[order]
+    finite = np.isfinite(values).all(axis=1)
+    stamps, values, norms = stamps[finite], values[finite], np.linalg.norm(values[finite, 3:], axis=1)
+    if not len(norms) or np.abs(norms - 1.0).max() > 0.01:
+        raise RecordingError(f"{source}: columns 5 to 8 are no unit quaternions")
+    return Trajectory(stamps, values[:, :3], values[:, 3:] / norms[:, None])
+
+
+def _pose(pose: object) -> tuple[float, ...]:
+    """x y z qx qy qz qw of a geometry_msgs Pose or Transform."""
+    p, q = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
