@@ -23,8 +23,9 @@ ARMING_REASONS = (
     "throttle is not low", "tilted beyond small_angle", "starting up (BOOT_GRACE_TIME)", "no pre-arm", "processor overload", "calibrating", "CLI is open",
     "CMS menu is open", "OSD menu is open", "BST", "MSP connection blocks arming (configurator)", "paralyzed", "GPS rescue has no fix",
     "RESC", "RPM filter without telemetry", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated", "motor protocol is not set",
-    "arming switch was on too early: switch it off first")
-"""Why the firmware refuses to arm: by bit of its flags, 4.3 to 4.6."""
+    "crash flip", "altitude hold", "position hold")
+"""Why the firmware refuses to arm: by bit of its flags. Their number differs from 4.3 to 4.6, and the last one is always the same."""
+TOO_EARLY = "arming switch was on too early: switch it off first"
 
 
 class MspError(PerchError):
@@ -167,9 +168,8 @@ def status(frame: Frame) -> Status:
     if len(frame.payload) < at + 5:
         raise MspError(f"MSP {frame.command}: {len(frame.payload)} bytes, needs {at + 5}")
     count, flags = struct.unpack_from("<BI", frame.payload, at)
-    return Status(modes, tuple(
-        ARMING_REASONS[bit] if bit < len(ARMING_REASONS) and bit != count - 1 else ARMING_REASONS[-1] if bit == count - 1 else f"flag {bit}"
-        for bit in range(32) if flags >> bit & 1))
+    words = (*ARMING_REASONS[:count - 1], TOO_EARLY)
+    return Status(modes, tuple(words[bit] if bit < len(words) else f"flag {bit}" for bit in range(32) if flags >> bit & 1))
 
 
 class Battery(NamedTuple):

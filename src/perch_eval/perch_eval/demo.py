@@ -7,10 +7,13 @@ import math
 import os
 import sys
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
+from perch_autopilot import firmware
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
+from perch_core.vehicle import load_vehicle
 from perch_eval.arguments import open_network, output_folder
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
@@ -26,6 +29,7 @@ EXAMPLES = """examples:
   python3 scripts/demo.py                                    perch on the wall of paper M, 1.7 m away
   python3 scripts/demo.py --scenario surface_60_far --seed 4 --out /tmp/flight
   python3 scripts/demo.py --scenario my_surface.yaml         your own scenario file
+  python3 scripts/demo.py --vehicle betaflight               behind Betaflight's own firmware, which is built on first use
 """
 
 
@@ -34,6 +38,7 @@ def parser() -> argparse.ArgumentParser:
     out = argparse.ArgumentParser(prog="demo.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     out.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a YAML file (default: %(default)s)")
+    out.add_argument("--vehicle", default="", help="name in config/vehicles, or a YAML file (default: the scenario's)")
     out.add_argument("--seed", type=int, default=1, help="seed of noise, calibration and textures (default: %(default)s)")
     out.add_argument("--out", type=Path, default=Path("out"), help="folder for report, recording and logs (default: ./%(default)s)")
     layout = out.add_mutually_exclusive_group()
@@ -48,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FAST_NODES, realtime: bool = False,
-        verbose: bool = False) -> dict:
+        verbose: bool = False, vehicle: str = "") -> dict:
     """Fly a scenario once; the report's content is returned and written to `out`.
 
     Args:
@@ -58,6 +63,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         composed: nodes that share a process; the others have one each.
         realtime: paced by the wall clock instead of lockstep.
         verbose: show the nodes' output.
+        vehicle: name in config/vehicles, or a file; empty: the scenario's.
 
     Raises:
         ConfigError: the scenario, the seed or the folder is refused.
@@ -66,7 +72,11 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
     """
     source = config.find("scenarios", scenario_name)
     scenario = load_scenario(source)
+    if vehicle:
+        scenario = replace(scenario, vehicle=str(config.find("vehicles", vehicle).resolve()) if vehicle.endswith((".yaml", ".yml")) else vehicle)
     check_flight(scenario, source)
+    if load_vehicle(scenario.vehicle).actuation.firmware:
+        firmware.ensured()
     if not 0 <= seed < 2**31:
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
     (output_folder(out) / "flight.mcap").unlink(missing_ok=True)  # of an earlier flight: this one may end before it records
@@ -107,7 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     try:
         open_network(args.network)
-        report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose)
+        report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose, args.vehicle)
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

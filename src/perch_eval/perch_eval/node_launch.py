@@ -208,7 +208,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         controller["nmpc.lines.watched"] = list(scenario.inspection.watched)
     return {
         "viewer": {"scenario": source}, "description": vehicle,
-        "vehicle": {"scenario": source, "seed": seed, "participants": participants or [""]},
+        "vehicle": vehicle | {"scenario": source, "seed": seed, "participants": participants or [""]},
         "vio": vehicle | {"start_position": list(scenario.start.position), "start_yaw_deg": scenario.start.yaw_deg},
         # in lockstep the schedule lets what it says count later
         "vio_model": vehicle | {"seed": seed, "latency": 0.0 if lockstep else scenario.latency.vio}, "powerline_mapper": vehicle,

@@ -14,6 +14,7 @@ class VehicleParameters:
     """All are read once, at the start."""
 
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
+    vehicle: str = text("", doc="config/vehicles/<name>.yaml, or a file; empty: the scenario's")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
     participants: tuple[str, ...] = text(
         ("controller",), doc="nodes that the lockstep waits for: controller, vio, vio_model, target_localizer, "

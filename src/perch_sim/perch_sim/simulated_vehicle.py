@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
-    Transform, nanoseconds, rotated)
+    Transform, limits, nanoseconds, rotated)
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing, DrawnInProcesses
@@ -47,8 +48,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
     config_type = VehicleParameters
 
     motor_command = Input(MotorCommand, "motor_command", answered=True)
-    rates_thrust = Input(RatesThrust, "rates_thrust_command")
-    attitude_thrust = Input(AttitudeThrust, "attitude_thrust_command")
+    rates_thrust = Input(RatesThrust, "rates_thrust_command", answered=True)
+    attitude_thrust = Input(AttitudeThrust, "attitude_thrust_command", answered=True)
     pace = Wake(CONTROL_PERIOD)
     imu = Output(ImuSample, "imu/data_raw")
     truth = Output(OdometryState, "ground_truth/odometry")
@@ -72,7 +73,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
             PerchError: the vehicle's firmware is not on this machine, or does not start.
         """
         super().__init__(config)
-        self.scenario = scenario = load_scenario(config.scenario) if scenario is None else scenario
+        scenario = load_scenario(config.scenario) if scenario is None else scenario
+        self.scenario = scenario = replace(scenario, vehicle=config.vehicle) if config.vehicle else scenario
         cameras = CAMERAS[config.cameras]
         self._drawing = drawing(scenario, config.seed, cameras) if cameras else None
         try:
@@ -124,6 +126,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
         try:
             if kind != simulation.vehicle.actuation.type:
                 raise MotorCommandError(f"{simulation.vehicle.name} takes {simulation.vehicle.actuation.type}, not {kind}: ignored")
+            if simulation.loop is not None and command.armed and (said := limits.problem(command)):
+                raise MotorCommandError(f"{kind}: {said}")
             if simulation.loop is None:
                 simulation.motors.command(self.time, command.armed, *content)
             else:

@@ -1,0 +1,239 @@
+"""What is said to autopilots: MSP, sticks, axes, the watchdog, the configuration. No firmware is needed here."""
+
+from __future__ import annotations
+
+import os
+import pty
+import struct
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from perch_autopilot import firmware, frames, msp
+from perch_autopilot.configuration import differences, load_configuration
+from perch_autopilot.rates import RateCurve, Sticks, rate_curves
+from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
+from perch_autopilot.wire import Wire, WireError
+from perch_core.config import config_dir
+from perch_core.errors import ConfigError
+from perch_core.vehicle import load_vehicle
+from scipy.spatial.transform import Rotation
+
+VEHICLE = load_vehicle("betaflight")
+VECTORS = st.lists(st.floats(-50, 50), min_size=3, max_size=3).map(np.array)
+ROTATIONS = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3).map(lambda q: Rotation.from_quat(q))
+
+
+def answer(command: int, payload: bytes, direction: bytes = b">") -> bytes:
+    """A frame as the firmware sends it, its checksum computed apart from the code under test."""
+    body = bytes((len(payload), command)) + payload
+    return b"$M" + direction + body + bytes((int(np.bitwise_xor.reduce(np.frombuffer(body, np.uint8))),))
+
+
+# -- MSP -------------------------------------------------------------------------------------------------------------
+
+@given(payloads=st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=60)), max_size=5), noise=st.lists(st.binary(max_size=9), min_size=5, max_size=5),
+       cuts=st.lists(st.integers(1, 40), min_size=1, max_size=20))
+@settings(max_examples=100, deadline=None)
+def test_frames_are_found_in_whatever_pieces_and_between_noise(payloads, noise, cuts):
+    noise = [piece.replace(b"$", b"#") for piece in noise]
+    stream = b"".join(piece + answer(*frame) for piece, frame in zip(noise, payloads))
+    parser, found, at = msp.Parser(), [], 0
+    while at < len(stream):
+        size = cuts[at % len(cuts)]
+        found += parser.feed(stream[at:at + size])
+        at += size
+    assert [(frame.command, frame.payload) for frame in found] == payloads and parser.torn == 0
+
+
+def test_a_torn_frame_is_counted_and_the_next_one_is_found():
+    whole = answer(msp.ANALOG, b"\x7b\x01\x02\x03\x04\x05\x06")
+    torn = bytearray(whole)
+    torn[7] ^= 0x40
+    parser = msp.Parser()
+    found = parser.feed(bytes(torn) + whole)
+    assert [frame.command for frame in found] == [msp.ANALOG] and parser.torn == 1
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_leave_the_parser_ready(data):
+    parser = msp.Parser()
+    parser.feed(data + bytes(300))  # zeros complete or break whatever had begun
+    assert [frame.command for frame in parser.feed(answer(1, b"x"))][-1:] == [1]
+
+
+@pytest.mark.parametrize("variant, number, words", [
+    (b"INAV", (7, 1, 0), "INAV 7.1.0"), (b"BTFL", (4, 2, 9), "BTFL 4.2.9"), (b"BTFL", (26, 6, 0), "BTFL 26.6.0")])
+def test_another_firmware_is_refused_by_name(variant, number, words):
+    with pytest.raises(msp.MspError, match=words):
+        msp.version(msp.Frame(msp.FC_VARIANT, variant, False), msp.Frame(msp.FC_VERSION, bytes(number), False))
+
+
+def test_every_reason_not_to_arm_is_named():
+    for count in (27, 29):  # 4.4 and 4.6
+        for bit in range(count):
+            payload = struct.pack("<HHHIBHBBBBIB", 0, 0, 0, 0, 0, 0, 3, 0, 0, count, 1 << bit, 0)
+            refusal, = msp.status(msp.Frame(msp.STATUS, payload, False)).refusals
+            assert refusal == (msp.TOO_EARLY if bit == count - 1 else msp.ARMING_REASONS[bit])
+
+
+def test_short_and_refused_answers_are_typed_errors():
+    for read in (msp.status, msp.battery, msp.attitude, lambda frame: msp.inertial(frame, 512.0)):
+        for frame in (msp.Frame(1, b"\x01", False), msp.Frame(1, bytes(40), True)):
+            with pytest.raises(msp.MspError):
+                read(frame)
+
+
+def test_channels_are_a_request_with_their_pulse_widths():
+    data = msp.channels((1500, 1600, 1000, 1400, 1900))
+    assert data == b"$M<" + answer(msp.SET_RAW_RC, struct.pack("<5H", 1500, 1600, 1000, 1400, 1900))[3:]
+
+
+# -- sticks ----------------------------------------------------------------------------------------------------------
+
+@given(centre=st.floats(10, 1500), more=st.floats(0, 1000), expo=st.floats(0, 1), share=st.floats(-1, 1))
+def test_the_rate_curve_is_inverted(centre, more, expo, share):
+    curve = RateCurve(centre, centre + more, expo)
+    wanted = share * curve.rate(1.0)
+    assert curve.rate(curve.stick(wanted)) == pytest.approx(wanted, abs=0.003 * (centre + 6 * more) + 1e-6)
+
+
+def test_sticks_have_the_directions_of_a_pilot():
+    sticks = Sticks(VEHICLE, rate_curves(load_configuration("betaflight").settings, ""))
+    centre = sticks.channels((0.0, 0.0, 0.0), 9.81)
+    roll_right, nose_down, nose_left = (sticks.channels(tuple(np.eye(3)[k]), 9.81) for k in range(3))
+    assert centre[0] == centre[1] == centre[3] == 1500 and 1000 < centre[2] < 2000
+    assert roll_right[0] > 1500 and nose_down[1] > 1500 and nose_left[3] < 1500
+
+
+@given(st.floats(0.5, 17.0))
+def test_throttle_gives_the_thrust(thrust):
+    share = Sticks(VEHICLE, (RateCurve(400, 900, 0),) * 3).throttle(thrust)
+    speed = VEHICLE.speed_min + share * (VEHICLE.speed_max - VEHICLE.speed_min)
+    least, most = (4 * VEHICLE.thrust_coefficient * limit**2 for limit in (VEHICLE.speed_min, VEHICLE.speed_max))
+    assert 4 * VEHICLE.thrust_coefficient * speed**2 == pytest.approx(min(max(thrust * VEHICLE.mass, least), most))
+
+
+# -- axes ------------------------------------------------------------------------------------------------------------
+
+NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+FRD = Rotation.from_matrix(np.diag([1, -1, -1]))
+
+
+@given(VECTORS, ROTATIONS)
+def test_changes_of_axes_agree_with_scipy_and_are_their_own_inverse(v, R):
+    assert frames.world(v) == pytest.approx(NED.apply(v)) and frames.body(v) == pytest.approx(FRD.apply(v))
+    q = frames.attitude(R.as_quat())
+    assert (NED * R * FRD.inv() * Rotation.from_quat(q).inv()).magnitude() < 1e-6 and q[3] >= 0.0
+    assert (Rotation.from_quat(frames.attitude(q)) * R.inv()).magnitude() < 1e-6
+    for turn, axes in ((frames.world_covariance, NED.as_matrix()), (frames.body_covariance, FRD.as_matrix())):
+        P = np.outer(v, v) + np.diag([1.0, 2.0, 3.0])
+        assert turn(P) == pytest.approx(axes @ P @ axes.T)
+
+
+# -- watchdog --------------------------------------------------------------------------------------------------------
+
+STICKS = (1510, 1520, 1600, 1530)
+
+
+def watchdog() -> Watchdog:
+    return Watchdog(WatchdogSettings(), hover=1450, descent=1420)
+
+
+def test_a_fresh_command_goes_on_and_a_stale_one_never_does():
+    dog = watchdog()
+    dog.command(10.0, True, STICKS)
+    ages = np.arange(0.0, 6.0, 0.004)
+    sent = [dog.channels(10.0 + age) for age in ages]
+    for age, channels in zip(ages, sent):
+        assert (channels[:4] == STICKS) == (age <= 0.1)
+        if 0.101 < age <= 0.3:
+            assert channels[4:] == (ON, ON) and channels[:2] == (1500, 1500)  # levels within 0.3 s
+        if 1.0 < age:
+            assert channels[4] == OFF or channels[2] < 1450  # descends or is off within 1 s
+    assert sent[-1][4] == OFF and sent[-1][2] == 1000
+
+
+def test_after_motors_were_taken_away_only_a_new_arming_turns_them_on():
+    dog = watchdog()
+    dog.command(0.0, True, STICKS)
+    assert dog.channels(9.0)[4] == OFF
+    dog.command(9.1, True, STICKS)
+    assert dog.channels(9.1)[4] == OFF and dog.mode is Mode.DISARMED
+    dog.command(9.2, False, STICKS)
+    dog.command(9.3, True, STICKS)
+    assert dog.channels(9.3) == (*STICKS, ON, OFF)
+
+
+def test_a_link_that_comes_back_in_time_flies_on():
+    dog = watchdog()
+    dog.command(0.0, True, STICKS)
+    assert dog.channels(0.6)[2] == 1420 and dog.mode is Mode.DESCENDING
+    dog.command(0.7, True, STICKS)
+    assert dog.channels(0.75) == (*STICKS, ON, OFF)
+
+
+def test_a_clock_that_jumps_back_turns_the_motors_off():
+    dog = watchdog()
+    dog.command(100.0, True, STICKS)
+    assert dog.channels(50.0)[4] == OFF
+
+
+# -- wire ------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
+def test_a_wire_that_is_none_is_one_line(address):
+    with pytest.raises(WireError, match=address.replace("[", ".")) as error:
+        Wire(address)
+    assert "\n" not in str(error.value)
+
+
+def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
+    ours, theirs = pty.openpty()
+    wire = Wire(os.ttyname(theirs) + "@921600")
+    try:
+        wire.write(b"$M<")
+        assert os.read(ours, 10) == b"$M<" and wire.read() == b""
+        os.write(ours, bytes(range(256)))
+        got, last = b"", time.monotonic() + 5.0
+        while len(got) < 256 and time.monotonic() < last:
+            got += wire.read(0.1)
+        assert got == bytes(range(256))  # raw: nothing is translated
+        os.close(theirs)
+        os.close(ours)
+        with pytest.raises(WireError, match="has ended"):
+            wire.read(1.0)
+    finally:
+        wire.close()
+
+
+# -- configuration ---------------------------------------------------------------------------------------------------
+
+def test_what_is_set_otherwise_is_named():
+    wanted = ("feature AIRMODE", "set p_roll = 180", "aux 0 0 0 1700 2100 0 0")
+    assert differences(wanted, ["feature AIRMODE", "set p_roll = 180", "aux 0 0 0 1700 2100 0 0", "set other = 1"]) == []
+    assert differences(wanted, ["feature AIRMODE", "set p_roll = 45"]) == ["p_roll is 45, not 180", "aux 0 0 0 1700 2100 0 0 is missing"]
+
+
+@pytest.mark.parametrize("text, words", [("", "has no line"), ("rm -rf /", "is none of"), ("set p_roll 5", "is none of")])
+def test_a_configuration_that_is_none_is_refused(tmp_path, text, words):
+    file = tmp_path / "mine.txt"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        load_configuration(str(file))
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_configuration(str(tmp_path / "none.txt"))
+
+
+def test_rates_of_another_type_are_refused():
+    with pytest.raises(ConfigError, match="BETAFLIGHT is not ACTUAL"):
+        rate_curves({"rates_type": "BETAFLIGHT"}, "x")
+    with pytest.raises(ConfigError, match="roll_srate"):
+        rate_curves({"rates_type": "ACTUAL", "roll_rc_rate": "40"}, "x")
+
+
+def test_the_firmware_that_is_built_is_the_one_that_is_locked():
+    lock = (config_dir().resolve().parent / "requirements" / "autopilot.lock").read_text().splitlines()
+    assert firmware.REQUIREMENT.split()[0] in lock
