@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import subprocess
 import sys
@@ -93,6 +94,7 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
             folder = logs / case.name.replace(", ", "_").replace(" ", "_")
             for old in folder.glob("*.log"):
                 old.unlink()
+            gc.collect()  # goals of the flight before are cycles that hold its DDS participant
             try:
                 row = fly(case, nursery, folder, commit()).as_json()
             except PerchError as error:

@@ -122,6 +122,7 @@ class Group:
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []
         self._memory = SharedMemory()
+        self._before = self._ports()
 
     @staticmethod
     def _place(one: NodeLaunch) -> str:
@@ -169,12 +170,13 @@ class Group:
 
     def left(self) -> tuple[str, ...]:
         """What is left when all have been stopped, the pilot included, in words; shared memory is cleaned first."""
-        end = time.monotonic() + STOPPING[1]
-        while (found := [pid for leader in self._sessions for pid in session(leader)]) and time.monotonic() < end:
-            time.sleep(0.05)
-        seen = self._memory.seen
-        self._memory.clean()
-        return (*(f"process {pid}" for pid in found), *self._sockets(), *self._shared_memory(seen))
+        end, seen = time.monotonic() + STOPPING[1], self._memory.seen
+        while True:  # threads of a process that has ended may hold what it had open for a moment
+            self._memory.clean()
+            found = (*(f"process {pid}" for leader in self._sessions for pid in session(leader)), *self._sockets(), *self._shared_memory(seen))
+            if not found or time.monotonic() > end:
+                return found
+            time.sleep(0.1)
 
     def _sockets(self) -> list[str]:
         mine = f"perch-lockstep-{os.getuid()}-{self._domain}-"
@@ -182,11 +184,14 @@ class Group:
 
     def _shared_memory(self, seen: frozenset[str]) -> list[str]:
         """Segments of these processes, or of a port of their domain, that no process uses any more."""
-        ports = range(PORTS + DOMAIN_PORTS * self._domain, PORTS + DOMAIN_PORTS * (self._domain + 1))
         used = SharedMemory().used()
-        found = {file for file in Path("/dev/shm").iterdir() if (of := _PORT.match(file.name)) and int(of[1]) in ports}
-        found |= {Path(name) for name in seen if Path(name).exists()}
+        found = (self._ports() - self._before) | {Path(name) for name in seen if Path(name).exists()}
         return [f"shared memory {file.name}" for file in sorted(found) if re.sub("_[es]l$", "", str(file)) not in used]
+
+    def _ports(self) -> set[Path]:
+        """Segments of the domain's ports."""
+        ports = range(PORTS + DOMAIN_PORTS * self._domain, PORTS + DOMAIN_PORTS * (self._domain + 1))
+        return {file for file in Path("/dev/shm").iterdir() if (of := _PORT.match(file.name)) and int(of[1]) in ports}
 
 
 class _Director:
