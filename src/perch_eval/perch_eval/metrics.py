@@ -126,6 +126,9 @@ def thrust_history(flight: Flight, vehicle: Vehicle) -> tuple[np.ndarray, np.nda
     t, thrust = flight.vectors("rotor_state", lambda r: float(np.sum(r.thrust)))
     tc, commanded = flight.vectors(
         "motor_command", lambda c: vehicle.thrust_coefficient * float(np.sum(np.square(c.rotor_speed))) if c.armed else 0.0)
+    for channel in ("rates_thrust_command", "attitude_thrust_command") if len(tc) == 0 else ():
+        if flight.values(channel):
+            tc, commanded = flight.vectors(channel, lambda c: vehicle.mass * c.thrust if c.armed else 0.0)
     if len(t) == 0 or len(tc) == 0:
         return np.empty(0), np.empty(0), np.empty(0)
     return t, thrust, np.interp(t, tc, commanded)

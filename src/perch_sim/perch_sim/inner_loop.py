@@ -18,7 +18,6 @@ from perch_core.registry import resolved
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
 from perch_sim.imu import ImuSample
-from perch_sim.motors import MotorCommandError
 
 FIRMWARE = "perch_autopilot.loop:FirmwareLoop"  # an optional extra, loaded where a vehicle names it
 
@@ -119,15 +118,13 @@ class InnerLoop:
         self._rates, self._attitude = np.zeros(4), None
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
-        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop;
-        whether it is armed is the motors' business.
-
-        Raises:
-            MotorCommandError: not finite, or no attitude.
-        """
-        values = np.array([*rates, max(thrust, 0.0) * self._mass], float)
-        if not np.isfinite(values).all() or attitude is not None and not abs(np.linalg.norm(attitude) - 1.0) < 1e-2:
-            raise MotorCommandError(f"inner loop: rates {list(rates)}, thrust {thrust}, attitude {attitude} are no command: ignored")
+        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop; one that is
+        not armed ends all before it."""
+        if not armed:
+            self._coming.clear()
+            self._rates, self._attitude = np.zeros(4), None
+            return
+        values = np.array([*rates, thrust * self._mass], float)
         self._coming.append((now + self._delay, values, None if attitude is None else np.array(attitude, float)))
 
     def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: ImuSample | None = None) -> np.ndarray:

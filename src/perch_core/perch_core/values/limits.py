@@ -16,7 +16,7 @@ import numpy as np
 from perch_core.camera import EquidistantCamera, PinholeCamera, RadialTangentialCamera
 from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.values.flight import ChooseLaw, ControllerCommand, ControllerStatus, MotorCommand, TrajectoryOrder
+from perch_core.values.flight import AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, MotorCommand, RatesThrust, TrajectoryOrder
 from perch_core.values.mission import PerchGoal
 from perch_core.values.perching import MappedPowerline, PowerlineMap, TargetPose
 from perch_core.values.planning import PerchPlanRequest, PowerlinePlanRequest
@@ -180,6 +180,7 @@ PLAN_LINES_MAX = 100
 STAMP = Limit(0, (2**31 - 1) * NANOSECONDS, "ns")
 POSITION, VELOCITY, ACCELERATION = _vector(1e4, "m"), _vector(100.0, "m/s"), _vector(1e3, "m/s^2")
 TURN_RATE = _vector(100.0, "rad/s")  # gyroscopes end at 70 rad/s (4000 deg/s)
+_SPECIFIC_THRUST = Limit(0.0, 1e3, "m/s^2")
 FRAME = Text(256)
 ID = Limit(0, 2**32 - 1)
 _PIXELS = Limit(1, 1e4, "px")
@@ -207,6 +208,8 @@ LIMITS: dict[type, dict[str, Any]] = {
         "direction_sigma": Limit(0.0, inf, "rad")},
     PowerlineMap: {"stamp": STAMP, "lines": Each(MappedPowerline, 500)},
     MotorCommand: {"rotor_speed": Limit(0.0, 1e4, "rad/s", (4,))},
+    RatesThrust: {"w_B": TURN_RATE, "thrust": _SPECIFIC_THRUST},
+    AttitudeThrust: {"q_WB": Unit(), "w_B": TURN_RATE, "thrust": _SPECIFIC_THRUST},
     ControllerCommand: {"command": Limit(0, 5)},
     TrajectoryOrder: {
         "id": ID, "at_end": Limit(0, 3), "contact_time": Limit(0.0, 60.0, "s"), "recovery_start": Limit(-inf, 3600.0, "s"),
