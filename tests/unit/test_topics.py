@@ -8,7 +8,7 @@ import pytest
 from perch_core.component import Action, Client, Component, Input, Output, Service, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
-from perch_core.values import ImuSample, MotorCommand, OdometryState
+from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
 from perch_eval.node_launch import NODES
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -26,6 +26,8 @@ def _odometry(frame="map"):
 FAST = [("imu/data_raw", ImuSample(1_234_567_891, _floats(3), _floats(3), frame)) for frame in ("imu_link", "", "a", "abcdefgh")]
 FAST += [("odometry", _odometry(frame)) for frame in ("map", "odom", "x")]
 FAST += [("motor_command", MotorCommand(77, armed, _floats(4))) for armed in (True, False)]
+FAST += [("rates_thrust_command", RatesThrust(77, armed, _floats(3), 9.5)) for armed in (True, False)]
+FAST += [("attitude_thrust_command", AttitudeThrust(77, armed, _floats(4), _floats(3), 9.5)) for armed in (True, False)]
 
 
 def same(a, b):
