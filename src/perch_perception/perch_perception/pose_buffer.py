@@ -15,8 +15,10 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.errors import PerchError
+from perch_core.values import limits
 
 SLOW = 1.0  # speed up to which the odometry's position is smoother than the integral of its velocity [m/s]
+_COVARIANCE = limits.Covariance(6)  # at 500 Hz its variances alone are looked at
 MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
 
 
@@ -95,8 +97,14 @@ class PoseBuffer:
         """The state at a time.
 
         Raises:
-            StampError: no states yet, older than the history, newer than the newest state, or inside a gap.
+            StampError: no states yet, older than the history, newer than the newest state, inside a gap, or with a covariance that is none.
         """
+        state = self._at(time)
+        if said := _COVARIANCE.problem(state.covariance):
+            raise StampError(f"stamp {time:.4f} s: the odometry's covariance {said}")
+        return state
+
+    def _at(self, time: float) -> BodyState:
         if not self._times:
             raise StampError("no odometry yet")
         newest, oldest = self._times[-1], self._times[0]

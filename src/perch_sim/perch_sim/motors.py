@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from perch_core.errors import PerchError
+from perch_core.values import MotorCommand, limits
+
+_SPEEDS = limits.LIMITS[MotorCommand]["rotor_speed"]
 
 
 class MotorCommandError(PerchError):
@@ -42,13 +44,13 @@ class Motors:
             speeds: rotor speeds (4,) [rad/s], limited to the armed range.
 
         Raises:
-            MotorCommandError: a speed is not finite, or there are not four; the command before it stays until it times out.
+            MotorCommandError: a speed is nonsense, or there are not four; the command before it stays until it times out.
         """
         values = [float(s) for s in speeds]
         if len(values) != 4:
             raise MotorCommandError(f"motor_command: rotor_speed has {len(values)} entries, needs 4")
-        if armed and not math.isfinite(sum(values)):
-            raise MotorCommandError(f"motor_command: rotor_speed {values} is not finite")
+        if armed and (said := _SPEEDS.problem(np.abs(values))):
+            raise MotorCommandError(f"motor_command: rotor_speed: {said}")
         self.starts += armed and not self._armed and not self.timed_out
         self._armed, self._received, self.timed_out = armed, now, False
         if armed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,7 +13,6 @@ from perch_core.ros import qos, topics
 from perch_core.ros.component_node import ComponentNode
 from perch_core.values import CameraImage, Serialized
 from rclpy.clock import Clock, ClockType
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 TAKE = 0.02  # lazy inputs are taken this often where nothing else asks for them [s]
@@ -48,22 +48,20 @@ class Intake:
             return
         profile = row.qos.subscribe
         if port.value is Serialized:
-            receive, raw, profile = partial(self._receive_raw, row, resolved, handler), True, qos.kept(row.qos)
-        elif row.unpack is not None:
-            receive, raw = partial(self._receive, channel, row.unpack, handler), True
+            receive, profile = partial(self._receive_raw, row, resolved, handler), qos.kept(row.qos)
         else:
-            receive, raw = partial(self._receive, channel, row.to_value, handler), False
+            receive = _Reader(node, channel, row, handler)
         if port.lazy:
             if not self._lazy:
                 node.create_timer(TAKE, lambda: self._wiring.enter(self.take_lazy), clock=Clock(clock_type=ClockType.STEADY_TIME))
             subscription = node.create_unwatched(row.message, channel, profile)
-            self._lazy.append((subscription, receive if raw else partial(self._decode, row, receive)))
+            self._lazy.append((subscription, receive))
         else:
-            node.create_subscription(row.message, channel, partial(self._arrived, receive), profile, raw=raw)
+            node.create_subscription(row.message, channel, partial(self._arrived, receive), profile, raw=True)
         if port.value is CameraImage and channel.endswith("image_raw"):
             packed = topics.topic(channel + COMPRESSED)
-            receive = partial(self._receive, channel + COMPRESSED, packed.to_value, handler)
-            node.create_subscription(packed.message, channel + COMPRESSED, partial(self._arrived, receive), packed.qos.subscribe)
+            receive = _Reader(node, channel + COMPRESSED, packed, handler)
+            node.create_subscription(packed.message, channel + COMPRESSED, partial(self._arrived, receive), packed.qos.subscribe, raw=True)
 
     def take_lazy(self) -> None:
         """Take what waits in the middleware."""
@@ -78,24 +76,39 @@ class Intake:
             return handler
         return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))
 
-    def _arrived(self, receive: Callable[[Any], None], msg: Any) -> None:
+    def _arrived(self, receive: Callable[[bytes], None], data: bytes) -> None:
         """A message that wakes the node: what waits goes first."""
         self._wiring.enter(self.take_lazy)
-        self._wiring.enter(receive, msg)
-
-    @staticmethod
-    def _decode(row: topics.Topic, receive: Callable[[Any], None], data: bytes) -> None:
-        receive(deserialize_message(data, row.message))
-
-    def _receive(self, channel: str, to_value: Callable[[Any], Any], handler: Callable[[Any], None], msg: Any) -> None:
-        try:
-            value = to_value(msg)
-        except Exception as error:
-            self._node.refused(channel, error)
-            return
-        for one in value if isinstance(value, list) else (value,):
-            handler(one)
+        self._wiring.enter(receive, data)
 
     @staticmethod
     def _receive_raw(row: topics.Topic, topic: str, handler: Callable[[Any], None], data: bytes) -> None:
         handler(Serialized(topic, topics.stamp_of(row.message, data), data, row.message))
+
+
+class _Reader:
+    """Reads the messages of a topic, no more of them in a second than its row allows."""
+
+    def __init__(self, node: ComponentNode, channel: str, row: topics.Topic, handler: Callable[[Any], None]) -> None:
+        self._node, self._channel, self._row, self._handler = node, channel, row, handler
+        self._second, self._count = 0, 0
+
+    def __call__(self, data: bytes) -> None:
+        """Hand on what a serialised message holds."""
+        try:
+            if self._row.often:
+                self._count_it()
+            value = self._row.read(data)
+        except Exception as error:
+            self._node.refused(self._channel, error)
+            return
+        for one in value if isinstance(value, list) else (value,):
+            self._handler(one)
+
+    def _count_it(self) -> None:
+        second = int(time.monotonic())
+        if second != self._second:
+            self._second, self._count = second, 0
+        self._count += 1
+        if self._count > self._row.often:
+            raise PerchError(f"more than {self._row.often} messages in a second")

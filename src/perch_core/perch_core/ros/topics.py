@@ -37,6 +37,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 Convert = Callable[[Any], Any]
+IMAGE_MAX, TRAJECTORY_MAX = 64 << 20, 1 << 20  # bytes; a trajectory of that size is read in 0.2 s
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class Topic:
         to_message: value to message.
         to_value: message to value, or to a list of them; raises PerchError where it cannot be one.
         observed: nobody who flies waits for it.
+        largest: bytes of a message that is read.
+        often: messages per second that are read by one node; 0: all, of which the newest count.
         pack, unpack: value to serialised message and back without rclpy's objects, for topics of 500 Hz.
         """
 
@@ -61,6 +64,18 @@ class Topic:
     pack: Callable[[Any], bytes] | None = None
     unpack: Callable[[bytes], Any] | None = None
     observed: bool = False
+    largest: int = 256 << 10
+    often: int = 0
+
+    def read(self, data: bytes) -> Any:
+        """The value of a serialised message, or a list of them.
+
+        Raises:
+            PerchError: it is larger than allowed, or cannot be a value.
+        """
+        if len(data) > self.largest:
+            raise PerchError(f"{len(data)} bytes are more than {self.largest}")
+        return self.unpack(data) if self.unpack is not None else self.to_value(deserialize_message(data, self.message))
 
     @property
     def latched(self) -> bool:
@@ -71,22 +86,23 @@ class Topic:
 TOPICS = (
     Topic("imu/data_raw", Imu, qos.SENSOR, sensing.imu_message, sensing.imu_value,
           fast.pack_imu, fast.unpack_imu),
-    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value),
-    Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value),
-    Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value),
-    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value),
+    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value, largest=IMAGE_MAX, often=300),
+    Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value, largest=IMAGE_MAX,
+          often=300),
+    Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, often=300),
+    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value, largest=IMAGE_MAX),
     Topic("vio/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
           fast.pack_odometry, fast.unpack_odometry),
     Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
     Topic("odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
           fast.pack_odometry, fast.unpack_odometry),
     Topic("estimator/status", EstimatorStatus, qos.STATE, states.health_message, states.health_value),
-    Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value),
+    Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value, often=500),
     Topic("target/detections", TargetDetection, qos.STATE, perching.sighting_message, perching.sighting_value),
-    Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value),
-    Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value),
-    Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value),
-    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value),
+    Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value, often=100),
+    Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value, largest=TRAJECTORY_MAX, often=50),
+    Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value, largest=TRAJECTORY_MAX, often=50),
+    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value, often=500),
     Topic("controller/status", ControllerStatus, qos.STATE, flight.status_message, flight.status_value),
     Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
     Topic("motor_command", MotorCommand, qos.SENSOR, flight.motor_message, flight.motor_value,
@@ -195,7 +211,7 @@ def decode(channel: str, data: bytes) -> Any:
         PerchError: the message cannot be a value.
     """
     row = topic(channel)
-    value = row.unpack(data) if row.unpack is not None else row.to_value(deserialize_message(data, row.message))
+    value = row.read(data)
     if isinstance(value, list):
         if not value:
             raise PerchError(f"{channel}: the message is empty")

@@ -173,7 +173,7 @@ def _rows(size: float, unit: str, width: int, most: int) -> Limit:
 
 
 VARIANCE_MAX = 1e8  # of a variance beyond that nobody can say anything, and its square would not be a number
-SEGMENTS_MAX, DEGREE_MAX, SAMPLES_MAX = 1000, 20, 20_000  # of a trajectory; 20 s at a sample per ms
+SEGMENTS_MAX, DEGREE_MAX, SAMPLES_MAX = 1000, 20, 5000  # of a trajectory: 5 s at a sample per ms, 20 s at what the planner gives
 PLAN_LONGEST, PLAN_SEGMENTS_MAX = 600.0, 101  # of what is planned on [s]
 PLAN_LINES_MAX = 100
 

@@ -115,9 +115,9 @@ def _changed(old: Any, kind: str, value: Any) -> Any:
     if kind == "=":
         return value
     if kind == "*":
-        return float(old * value)
+        return float(old) * value
     if kind == "+":
-        return float(old + value)
+        return float(old) + value
     if kind in ("stamp", "shift"):
         stamp = STAMPS[value] if kind == "stamp" else old.sec * SECOND + old.nanosec + value
         old.sec, old.nanosec = min(max(stamp // SECOND, -(2**31)), FAR), stamp % SECOND
@@ -138,7 +138,11 @@ def _changed(old: Any, kind: str, value: Any) -> Any:
 
 def _matrix(flat: np.ndarray, how: str) -> np.ndarray:
     n = math.isqrt(len(flat))
-    C = flat.reshape(n, n).copy()
+    with np.errstate(all="ignore"):
+        return _spoilt_matrix(flat.reshape(n, n).copy(), n, how)
+
+
+def _spoilt_matrix(C: np.ndarray, n: int, how: str) -> np.ndarray:
     if how == "uneven":
         C[0, 1] += 1.0 + abs(C[0, 1])
     elif how == "indefinite":

@@ -57,6 +57,7 @@ def component(flight: str, name: str) -> Component[Any]:
     if name == "vehicle":
         return SimulatedVehicle(VehicleParameters(seed=SEED, cameras="none"), scenario, DrawnOnDemand)
     made = NodeParameters(scenario, SEED).component(name)
+    made.warm_up()
     for port in ports(type(made), Client):
         setattr(made, port.name, lambda request, due: None)  # answers are of the stream
     return made
