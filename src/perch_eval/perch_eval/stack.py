@@ -120,7 +120,7 @@ class Stack:
             time.sleep(_POLL_S)
         self.raise_if_ended()
         self._ready = True
-        self._memory.observe(self.pids.values())
+        self._memory.observe((*self.pids.values(), os.getpid()))
 
     def wait(self, done: Callable[[], bool] = lambda: False) -> tuple[Ending, ...]:
         """Wait until `done`, or until a program ends.

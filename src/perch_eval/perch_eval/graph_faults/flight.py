@@ -154,8 +154,8 @@ class Group:
         return [line for name in self._commands for line in (self._folder / f"{name}.log").read_text(errors="replace").splitlines()]
 
     def stop(self) -> None:
-        """End everything."""
-        self._memory.observe(self.pids.values())
+        """End everything. The pilot must still be there: shared memory of this process is cleaned, too, when it has left."""
+        self._memory.observe((*self.pids.values(), os.getpid()))
         running = [pid for pid in self.pids.values() if alive(pid)]
         for number, patience in zip((signal.SIGINT, signal.SIGKILL), STOPPING):
             for pid in running:
@@ -185,11 +185,11 @@ class Group:
     def _shared_memory(self, seen: frozenset[str]) -> list[str]:
         """Segments of these processes, or of a port of their domain, that no process uses any more."""
         used = SharedMemory().used()
-        found = (self._ports() - self._before) | {Path(name) for name in seen if Path(name).exists()}
+        found = (self._ports() - self._before) | {Path(name) for name in seen if Path(name).exists() and not _PORT.match(Path(name).name)}
         return [f"shared memory {file.name}" for file in sorted(found) if re.sub("_[es]l$", "", str(file)) not in used]
 
     def _ports(self) -> set[Path]:
-        """Segments of the domain's ports."""
+        """Segments of the domain's ports; others are shared with other domains."""
         ports = range(PORTS + DOMAIN_PORTS * self._domain, PORTS + DOMAIN_PORTS * (self._domain + 1))
         return {file for file in Path("/dev/shm").iterdir() if (of := _PORT.match(file.name)) and int(of[1]) in ports}
 
