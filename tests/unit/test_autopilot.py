@@ -139,7 +139,18 @@ STICKS = (1510, 1520, 1600, 1530)
 
 
 def watchdog() -> Watchdog:
-    return Watchdog(WatchdogSettings(), hover=1450, descent=1420)
+    """One that has been told to arm a second ago."""
+    dog = Watchdog(WatchdogSettings(), hover=1450, descent=1420)
+    dog.command(-1.0, True, STICKS)
+    return dog
+
+
+def test_it_arms_with_the_throttle_down():
+    dog = Watchdog(WatchdogSettings(), hover=1450, descent=1420)
+    dog.command(5.0, True, STICKS)
+    assert dog.channels(5.05) == (1500, 1500, 1000, 1500, ON, OFF)
+    dog.command(5.25, True, STICKS)
+    assert dog.channels(5.25) == (*STICKS, ON, OFF)
 
 
 def test_a_fresh_command_goes_on_and_a_stale_one_never_does():
@@ -164,7 +175,8 @@ def test_after_motors_were_taken_away_only_a_new_arming_turns_them_on():
     assert dog.channels(9.1)[4] == OFF and dog.mode is Mode.DISARMED
     dog.command(9.2, False, STICKS)
     dog.command(9.3, True, STICKS)
-    assert dog.channels(9.3) == (*STICKS, ON, OFF)
+    dog.command(9.6, True, STICKS)
+    assert dog.channels(9.6) == (*STICKS, ON, OFF)
 
 
 def test_a_link_that_comes_back_in_time_flies_on():

@@ -28,7 +28,7 @@ class BetaflightParameters:
     vehicle: str = text("betaflight", doc="config/vehicles/<name>.yaml, or a file")
     wire: str = text("/dev/ttyACM0", doc="/dev/ttyACM0, /dev/ttyACM0@921600, tcp:HOST:PORT")
     configuration: str = text("betaflight", doc="what the autopilot is set to: config/autopilot/<name>.txt, or a file")
-    one_g: float = quantity(512.0, above=0.0, high=1e4, doc="reading of its accelerometer at rest (RAW_IMU); 256 in the firmware as a program")
+    one_g: float = quantity(2048.0, above=0.0, high=1e4, doc="reading of its accelerometer at rest (RAW_IMU): 2048, before 4.6 512")
     watchdog: WatchdogSettings = part(WatchdogSettings)
 
 

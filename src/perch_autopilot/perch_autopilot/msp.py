@@ -3,7 +3,7 @@
     '$' 'M' direction  size  command  payload  checksum        direction: '<' request, '>' answer, '!' refused
                        u8    u8       size     xor of size, command and payload
 
-Numbers are little-endian. Axes of what the firmware sends are FRD, but `RAW_IMU` is as its sensors give it: see `inertial`.
+Numbers are little-endian. Axes of `RAW_IMU` are FLU, those of `ATTITUDE` FRD.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from perch_core.errors import PerchError
 
 API_VERSION, FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, RC, ATTITUDE, STATUS, SET_RAW_RC, REBOOT = 1, 2, 3, 110, 102, 105, 108, 150, 200, 68
 LONGEST = 255
+GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000 deg/s
 VERSIONS = ((4, 3), (4, 6))
 """Firmware with which the messages below have been read; later ones turn yaw's polarity."""
 ARMING_REASONS = (
@@ -207,14 +208,14 @@ def inertial(frame: Frame, one_g: float) -> tuple[tuple[float, float, float], tu
 
     Args:
         frame: the answer.
-        one_g: reading of the accelerometer at rest (512 with the usual sensors, 256 in the simulated one).
+        one_g: reading of the accelerometer at rest (2048 with the usual sensors, 512 before 4.6, 256 in the simulated one).
 
     Raises:
         MspError: it is too short.
     """
     *force, p, q, r = _unpacked("<6h", frame)
     x, y, z = (9.81 * value / one_g for value in force)
-    return (x, y, z), (radians(p), radians(q), radians(r))
+    return (x, y, z), (radians(p / GYRO_LSB), radians(q / GYRO_LSB), radians(r / GYRO_LSB))
 
 
 def channels(values: tuple[int, ...]) -> bytes:

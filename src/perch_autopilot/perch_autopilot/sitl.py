@@ -160,6 +160,11 @@ class Sitl:
         except TimeoutError:
             return b""
 
+    @property
+    def file(self) -> int:
+        """File number of its serial port, for another that speaks MSP."""
+        return self._running.stream.fileno()
+
     def status(self) -> msp.Status:
         """Of the firmware, as MSP tells it."""
         parser, last = msp.Parser(), time.monotonic() + _ANSWER

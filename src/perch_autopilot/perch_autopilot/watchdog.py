@@ -10,6 +10,7 @@ from perch_core.config import quantity
 STICKS = 4
 CENTRED = (1500, 1500, 1000, 1500)
 ON, OFF = 1900, 1000  # of a switch [us]
+ARMING = 0.2          # the throttle stays down so long, as the firmware arms with it down only [s]
 Channels = tuple[int, ...]
 
 
@@ -49,7 +50,7 @@ class Watchdog:
         self._settings, self._hover, self._descent = settings, hover, descent
         self.mode = Mode.DISARMED
         self._sticks: Channels = CENTRED
-        self._wanted, self._came = False, 0.0
+        self._wanted, self._came, self._since = False, 0.0, 0.0
         self._locked = False  # motors were taken away: only a command to disarm allows the next to arm
 
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
@@ -60,6 +61,8 @@ class Watchdog:
             armed: whether the motors shall turn.
             sticks: roll, pitch, throttle, yaw [us].
         """
+        if armed and not self._wanted:
+            self._since = now
         self._wanted, self._came, self._sticks = armed, now, sticks
         self._locked = self._locked and armed
 
@@ -71,7 +74,7 @@ class Watchdog:
             self.mode = Mode.DISARMED
         elif age <= limits.stale_after:
             self.mode = Mode.FOLLOWING
-            return (*self._sticks, ON, OFF)
+            return (*(self._sticks if now - self._since >= ARMING else CENTRED), ON, OFF)
         elif age <= limits.disarm_after:
             self.mode = Mode.LEVEL if age <= limits.descend_after else Mode.DESCENDING
             return (1500, 1500, self._hover if self.mode is Mode.LEVEL else self._descent, 1500, ON, ON)

@@ -1,0 +1,203 @@
+"""Betaflight's own firmware: deterministic in the loop, flown through, spoken to over MSP. Skipped where it has not been built."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from perch_autopilot import firmware, msp
+from perch_autopilot.betaflight import Betaflight, BetaflightParameters
+from perch_autopilot.configuration import Cli, CliError, Configuration, load_configuration
+from perch_autopilot.loop import FirmwareLoop
+from perch_autopilot.namespace import NamespaceError
+from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
+from perch_autopilot.watchdog import OFF, ON
+from perch_core.component import Output, ports
+from perch_core.values import RatesThrust
+from perch_core.vehicle import load_vehicle
+from perch_eval.in_process import fly
+from perch_sim.scenario import load_scenario
+
+try:
+    firmware.found()
+except firmware.FirmwareError as missing:
+    pytest.skip(str(missing), allow_module_level=True)
+
+VEHICLE = load_vehicle("betaflight")
+STILL = (0.0, 0.0, 0.0)
+
+
+def started(make):
+    """What runs in a namespace; a machine that gives none skips the test."""
+    try:
+        return make()
+    except NamespaceError as error:
+        pytest.skip(str(error))
+
+
+class Reading:
+    def __init__(self, gyro):
+        self.gyro, self.accel = np.array(gyro), np.array(GRAVITY)
+
+
+def outputs() -> list[np.ndarray]:
+    """Rotor speeds of a firmware that is shaken for 0.6 s after it was armed."""
+    loop, rng, state = started(lambda: FirmwareLoop(VEHICLE)), np.random.default_rng(1), np.r_[np.zeros(6), 1.0, np.zeros(6)]
+    try:
+        said = []
+        for k in range(300):
+            loop.command(0, True, (0.3 * np.sin(k / 20), 0.0, 0.1), 9.81)
+            said.append(loop.speeds(0, state, np.zeros(4), Reading(0.05 * rng.standard_normal(3))))
+        return said
+    finally:
+        loop.close()
+
+
+def test_two_runs_agree_to_the_last_bit_and_a_turn_drives_the_right_rotors():
+    first, second = outputs(), outputs()
+    assert np.array_equal(first, second) and min(first[-1]) >= VEHICLE.speed_min
+    loop, state = started(lambda: FirmwareLoop(VEHICLE)), np.r_[np.zeros(6), 1.0, np.zeros(6)]
+    try:
+        for axis in range(3):
+            for sign in (1.0, -1.0):
+                for k in range(60):
+                    loop.command(0, True, tuple(sign * np.eye(3)[axis] * (k >= 40)), 9.81)
+                    speeds = loop.speeds(0, state, np.zeros(4), Reading(STILL))
+                moments = VEHICLE.allocation @ speeds**2
+                assert np.argmax(np.abs(moments[1:] / VEHICLE.allocation[1:, 0])) == axis and sign * moments[1 + axis] > 0.0
+                for _ in range(60):
+                    loop.command(0, True, STILL, 9.81)
+                    loop.speeds(0, state, np.zeros(4), Reading(STILL))
+        loop.command(0, False, STILL, 9.81)
+        assert not [loop.speeds(0, state, np.zeros(4), Reading(STILL)) for _ in range(5)][-1].any()
+    finally:
+        loop.close()
+
+
+def test_a_wall_is_perched_on_through_the_firmware():
+    trace = started(lambda: fly(replace(load_scenario("surface_90"), vehicle="betaflight"), 1))
+    assert trace.outcome == "perched", trace.message
+
+
+def test_the_configuration_is_read_back_and_what_differs_is_named():
+    loaded = load_configuration("betaflight")
+    sitl = started(lambda: Sitl(loaded))
+    try:
+        cli = Cli(sitl.send, sitl.receive)
+        cli.check(loaded)
+        wrong = Configuration("mine.txt", (*loaded.lines, "set p_roll = 1"))
+        with pytest.raises(CliError, match="p_roll is 180, not 1"):
+            cli.check(wrong)
+        with pytest.raises(CliError, match="mine.txt: set no_such = 1: the firmware refuses it"):
+            cli.apply(Configuration("mine.txt", ("set no_such = 1",)))
+    finally:
+        sitl.close()
+
+
+# -- the node's component, over the firmware's MSP ---------------------------------------------------------------------
+
+class Vehicle:
+    """A firmware on a bench that lives by the wall clock, with a pilot's radio."""
+
+    def __init__(self, calibrated: bool) -> None:
+        self.sitl = started(lambda: FirmwareLoop(VEHICLE).sitl if calibrated else Sitl(load_configuration("betaflight")))
+        self.radio = [1500, 1500, 1000, 1500, OFF, OFF, ON]  # the last one hands over to the companion computer
+        self.motors, self.gyro, self._on = (0.0,) * 4, STILL, True
+        self.history: list[tuple[float, tuple[float, ...]]] = []
+        self._thread = threading.Thread(target=self._live, daemon=True)
+        self._thread.start()
+
+    def _live(self) -> None:
+        while self._on:
+            self.motors = self.sitl.step(self.gyro, GRAVITY, LEVEL, tuple(self.radio))
+            self.history.append((time.monotonic(), self.motors))
+            time.sleep(0.002)
+
+    @property
+    def turning(self) -> bool:
+        return min(self.motors) > 0.02
+
+    def close(self) -> None:
+        self._on = False
+        self._thread.join()
+        self.sitl.close()
+
+
+def until(what, seconds=20.0, often=lambda: None):
+    """Wait for something, doing what has to be done meanwhile."""
+    last = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < last, "it does not come"
+        often()
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def vehicle(request):
+    one = Vehicle(getattr(request, "param", True))
+    yield one
+    one.close()
+
+
+def component(vehicle) -> tuple[Betaflight, dict]:
+    node = Betaflight(BetaflightParameters(wire=f"fd:{vehicle.sitl.file}", one_g=256.0))
+    got: dict = {}
+    for port in ports(Betaflight, Output):
+        getattr(node, port.name).receivers.append(got.setdefault(port.name, []).append)
+    return node, got
+
+
+def test_the_node_arms_flies_levels_and_hands_over(vehicle):
+    node, got = component(vehicle)
+    try:
+        assert str(node.version) == "BTFL 4.6.0"
+
+        def poll(armed=None, thrust=9.81):
+            if armed is not None:
+                node.on_rates_thrust(RatesThrust(0, armed, STILL, thrust))
+            node.on_poll(time.monotonic_ns())
+
+        poll(False)
+        until(lambda: vehicle.turning, often=lambda: poll(True))
+        until(lambda: min(vehicle.motors) > 0.2, often=lambda: poll(True))        # and the throttle follows
+        vehicle.gyro = (0.5, 0.0, 0.0)
+        until(lambda: got["imu"] and abs(got["imu"][-1].w_B[0] - 0.5) < 0.02, often=lambda: poll(True))
+        assert got["imu"][-1].f_B[2] == pytest.approx(9.81, abs=0.3)
+        vehicle.gyro = STILL
+        vehicle.radio[6], vehicle.radio[4] = OFF, ON                              # the pilot takes over, armed, throttle down
+        until(lambda: max(vehicle.motors) < 0.1 and vehicle.turning, often=lambda: poll(True))
+        vehicle.radio[6] = ON
+        until(lambda: min(vehicle.motors) > 0.2, often=lambda: poll(True))        # and gives it back
+        node.close()                                                              # as a node that is killed
+        began = time.monotonic()
+        until(lambda: not vehicle.turning)
+        assert 1.0 < time.monotonic() - began < 15.0                              # not at once, but in the end
+    finally:
+        node.close()
+
+
+@pytest.mark.parametrize("vehicle", [False], indirect=True)
+def test_why_it_does_not_arm_is_said(vehicle):
+    node, got = component(vehicle)
+    try:
+        def poll():
+            node.on_rates_thrust(RatesThrust(0, True, STILL, 9.81))  # before its sensors are calibrated, and never down
+            node.on_poll(time.monotonic_ns())
+
+        until(lambda: any("refuses to arm" in line.text for line in got["log"]), often=poll)
+        assert not vehicle.turning
+    finally:
+        node.close()
+
+
+def test_an_autopilot_that_does_not_answer_is_refused():
+    import socket
+    ours, theirs = socket.socketpair()
+    theirs.send(b"\x00\xff\x13garbage")
+    with pytest.raises(msp.MspError, match="no autopilot answers .* bytes came that are no MSP"):
+        Betaflight(BetaflightParameters(wire=f"fd:{ours.fileno()}"))
+    ours.close()
+    theirs.close()
