@@ -36,7 +36,8 @@ class SharedMemory:
         return frozenset(self._seen)
 
     def clean(self) -> list[str]:
-        """Remove the remembered segments that no process uses any more, with their lock files.
+        """Remove the remembered segments that no process uses any more, with their lock files; one that a process which is about to end
+        has made anew is removed by the next call.
 
         Returns:
             The files that were removed.
@@ -52,7 +53,6 @@ class SharedMemory:
                     removed.append(str(file))
                 except OSError:  # gone already, or another user's
                     continue
-        self._seen &= used
         return removed
 
     def used(self) -> set[str]:
