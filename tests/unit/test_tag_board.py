@@ -8,7 +8,7 @@ import pytest
 
 from perch_core import config
 from perch_core.errors import ConfigError
-from perch_core.tag_board import Tag, TagBoard, load_board
+from perch_core.tag_board import FAMILIES, Tag, TagBoard, TagGrid, load_board
 
 PIXELS_PER_METRE = 1000.0
 
@@ -59,7 +59,11 @@ def test_standard_board_is_the_papers_pad():
     ("pad_size: [0.6, 0.6]\ntags: [{id: 0, centre: [0.28, 0], size: 0.16}]", "beyond the pad"),
     ("pad_size: [0.6, 0.6]\ntags: [{id: 999, centre: [0, 0], size: 0.16}]", "999"),
     ("pad_size: [0.6, 0.6]\ntags: [{id: 0, centre: [0, 0], size: -0.1}]", "size"),
-    ("pad_size: [0.6, 0.6]\nfamily: 25h9\ntags: [{id: 0, centre: [0, 0], size: 0.1}]", "25h9"),
+    ("pad_size: [0.6, 0.6]\nfamily: 25h9\ntags: [{id: 35, centre: [0, 0], size: 0.1}]", "35 is outside .* 25h9"),
+    ("pad_size: [0.6, 0.6]\nfamily: 41h12\ntags: [{id: 0, centre: [0, 0], size: 0.1}]", "41h12"),
+    ("pad_size: [0.6, 0.6]\ngrid: {columns: 6, rows: 6, size: 0.088}", "beyond the pad"),
+    ("pad_size: [0.9, 0.9]\ngrid: {columns: 30, rows: 30, size: 0.01}", "899 is outside"),
+    ("pad_size: [0.6, 0.6]\ntags: [{id: 1, centre: [0, 0], size: 0.1}]\ngrid: {columns: 1, rows: 1, size: 0.1}", "not both"),
     ("pad_size: [0.6, 0.6]\ncolour: red\ntags: [{id: 0, centre: [0, 0], size: 0.1}]", "colour")])
 def test_impossible_boards_are_refused(tmp_path, text, message):
     path = tmp_path / "board.yaml"
@@ -67,6 +71,22 @@ def test_impossible_boards_are_refused(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message) as caught:
         load_board(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_families_have_the_modules_and_numbers_that_opencv_gives_them(family):
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_APRILTAG_{family}"))
+    assert FAMILIES[family] == (dictionary.markerSize, len(dictionary.bytesList))
+
+
+def test_a_grid_counts_along_its_rows_from_the_lower_left():
+    """Kalibr's AprilGrid of 6 x 6 tags of 88 mm with gaps of 30 %: seen from outside, left is +s2 and up +s1."""
+    board = TagBoard((0.8, 0.8), border=2, corner_squares=True, grid=TagGrid(6, 6, 0.088, 0.3, first_id=100))
+    centres = dict(zip(board.ids, board.corners_S.mean(axis=1)))
+    assert board.ids == tuple(range(100, 136)) and board.modules == 10
+    np.testing.assert_allclose(centres[101] - centres[100], [0.0, -0.1144, 0.0], atol=1e-12)
+    np.testing.assert_allclose(centres[106] - centres[100], [0.1144, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(centres[100] + centres[135], 0.0, atol=1e-12)
 
 
 def test_unknown_board_lists_those_there_are():

@@ -15,11 +15,12 @@ from perch_core.camera import Camera
 from perch_core.tag_board import TagBoard
 from perch_perception.tags.view import VirtualView
 
-SEARCH_WINDOWS = (13, 9, 17)  # threshold windows, one per search: each finds tags that the others miss [px]
+SEARCH_WINDOWS = ((7, 12.0), (31, 7.0))  # threshold windows [px] and how much darker than its mean a tag is [grey values], one per search
 VIEW_TAG_SIDE = 60.0          # wanted side of a tag in a virtual view [px]
 VIEW_WINDOW = 11              # threshold window there: 1.5 modules of the tag [px]
 VIEW_LEAST = 0.1              # perimeter of what may be a tag there, as a share of the view's side: a tenth of a tag's. What is
                               # smaller is texture, and looking at it took three quarters of the time
+CUT = 2                       # what dark squares that touch at their corners lose on each side, so that they come apart [px]
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Detection:
     """Tags of the board in one image.
 
     Attributes:
-        ids: numbers of the tags, ascending.
+        ids: numbers of the tags, ascending; one that is seen several times is there several times.
         corners: pixels of their corners (TL, TR, BR, BL), shape (n, 4, 2), good to about 1 px.
         rejected: why other sightings were not used, for people.
     """
@@ -42,52 +43,61 @@ class TagDetector:
 
     def __init__(self, board: TagBoard, camera: Camera) -> None:
         self.board, self.camera = board, camera
-        self._search = [_detector(window) for window in SEARCH_WINDOWS]
-        self._view = _detector(VIEW_WINDOW, VIEW_LEAST)
+        self._search = [_detector(board, *window) for window in SEARCH_WINDOWS]
+        self._view = _detector(board, VIEW_WINDOW, least=VIEW_LEAST)
 
-    def search(self, image: np.ndarray, turn: int = 0) -> Detection:
+    def search(self, image: np.ndarray, turn: int | None = None) -> Detection:
         """Look for tags in the whole frame, enlarged twice.
 
         Args:
             image: mono8, shape (height, width).
-            turn: number of this search; successive searches use different threshold windows.
+            turn: number of this search: successive ones begin with different threshold windows, and end with the first that shows
+                a tag of the board. None: all windows are looked through.
         """
-        large = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
-        corners, ids, _ = self._search[turn % len(self._search)].detectMarkers(large)
+        large, found = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), []
+        for k in range(len(self._search)):
+            found.append(self._detect(self._search[(k + (turn or 0)) % len(self._search)], large))
+            if turn is not None and np.isin(found[-1][1], self.board.ids).any():
+                break
         # cv2.resize maps the centre u of a pixel to 2 u + 0.5
-        return self._select([(np.reshape(c, (4, 2)) - 0.5) / 2.0 for c in corners], ids)
+        return self._select([((corners - 0.5) / 2.0, ids) for corners, ids in found])
 
     def look(self, image: np.ndarray, view: VirtualView, origin: tuple[int, int] = (0, 0)) -> Detection:
         """Look for tags in a virtual view of the image (mono8), or of the part of it that begins at `origin` (column, row).
 
         Corners are returned in pixels of the camera.
         """
-        corners, ids, _ = self._view.detectMarkers(view.resample(image, self.camera, origin))
-        found = []
-        for corner in corners:
-            pixels, valid = self.camera.project(view.rays(np.reshape(corner, (4, 2))))
-            found.append(np.where(valid[:, None], pixels, np.nan))
-        return self._select(found, ids)
+        corners, ids = self._detect(self._view, view.resample(image, self.camera, origin))
+        pixels, valid = self.camera.project(view.rays(corners))
+        return self._select([(np.where(valid[..., None], pixels, np.nan), ids)])
 
-    def _select(self, corners: list[np.ndarray], ids: np.ndarray | None) -> Detection:
-        """Keep what belongs to the board: known numbers, each once, wholly inside the image."""
-        numbers = [] if ids is None else [int(i) for i in np.ravel(ids)]
-        rejected, kept = [], {}
-        for number in sorted(set(numbers)):
-            places = [c for c, n in zip(corners, numbers) if n == number]
+    def _detect(self, detector: cv2.aruco.ArucoDetector, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Corners (n, 4, 2) in pixels of the image and numbers (n,) of what a detector finds."""
+        if self.board.corner_squares:
+            image = cv2.dilate(image, np.ones((2 * CUT - 1,) * 2, np.uint8))
+        corners, ids, _ = detector.detectMarkers(image)
+        corners = np.array(corners, float).reshape(-1, 4, 2)
+        if self.board.corner_squares and len(corners):
+            out = corners - corners.mean(axis=1, keepdims=True)
+            corners = corners + (CUT - 1) * np.sqrt(2.0) * out / np.linalg.norm(out, axis=2, keepdims=True)
+        return corners, np.zeros(0, int) if ids is None else np.ravel(ids)
+
+    def _select(self, found: list[tuple[np.ndarray, np.ndarray]]) -> Detection:
+        """Keep what belongs to the board and is wholly inside the image; what several detectors see counts once."""
+        rejected, kept = [], []
+        for corners, number in ((c, int(n)) for places, ids in found for c, n in zip(places, ids)):
+            side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
             if number not in self.board.ids:
                 rejected.append(f"tag {number} does not belong to the board")
-            elif len(places) > 1:
-                # which one is ours cannot be known; the other tags decide
-                rejected.append(f"tag {number} is seen {len(places)} times")
-            elif not np.all(self.camera.contains(places[0], margin=1.0)):
+            elif not np.all(self.camera.contains(corners, margin=1.0)):
                 rejected.append(f"tag {number} reaches beyond the image")
-            else:
-                kept[number] = places[0]
-        return Detection(tuple(kept), np.array(list(kept.values())).reshape(-1, 4, 2), tuple(rejected))
+            elif not any(number == other and np.linalg.norm(corners.mean(axis=0) - c.mean(axis=0)) < 0.5 * side for other, c in kept):
+                kept.append((number, corners))
+        kept.sort(key=lambda entry: entry[0])
+        return Detection(tuple(n for n, _ in kept), np.array([c for _, c in kept]).reshape(-1, 4, 2), tuple(sorted(set(rejected))))
 
 
-def _detector(window: int, least: float = 0.03) -> cv2.aruco.ArucoDetector:
+def _detector(board: TagBoard, window: int, darker: float = 7.0, least: float = 0.03) -> cv2.aruco.ArucoDetector:
     """OpenCV's detector with a single threshold window [px] (three by default, at three times the cost).
 
     Contours are followed up from a perimeter of `least`, as a share of the image's longer side (OpenCV's own: 0.03).
@@ -95,9 +105,11 @@ def _detector(window: int, least: float = 0.03) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = least
     parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window
+    parameters.adaptiveThreshConstant = darker
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.markerBorderBits = board.border
     # Read each module in its middle quarter: near its border the blur mixes neighbours at 3 m.
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_APRILTAG_{board.family}"))
     return cv2.aruco.ArucoDetector(dictionary, parameters)

@@ -17,6 +17,7 @@ from perch_core.camera import CameraMount, Region
 from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.average import average_board
+from perch_perception.tags.consensus import consistent
 from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
 from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
@@ -123,7 +124,7 @@ class BoardLocalizer:
             result = self._follow(part, time, body, p_CS, R_CS)
             if result is None:
                 self._followed = 0
-                result = self._attempt(part, self._look(part, view), R_CS, False)
+                result = self._attempt(part, self._look(part, view), (p_CS, R_CS), False)
         elif time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
             return Localization(None, message="waiting for the next search")
         else:
@@ -135,11 +136,11 @@ class BoardLocalizer:
             self._last, self._last_body, self._last_time = result.board, body, time
         return result
 
-    def _attempt(self, part: _Part, detection: Detection, prior_R_CS: np.ndarray | None,
+    def _attempt(self, part: _Part, detection: Detection, expected: tuple[np.ndarray, np.ndarray] | None,
                  searched: bool) -> Localization:
         """Solve for a detection; a refusal becomes the message."""
         try:
-            return self._solve(part, detection, prior_R_CS, searched)
+            return self._solve(part, detection, expected, searched)
         except LocalizationRefusal as refusal:
             return Localization(None, searched=searched, message="; ".join([str(refusal), *detection.rejected]))
 
@@ -155,7 +156,7 @@ class BoardLocalizer:
         if len(ids) < FOLLOW_TAGS:
             return None
         try:
-            result = self._solve(part, Detection(ids, pixels[inside]), R_CS, False, start=(p_CS, R_CS))
+            result = self._solve(part, Detection(ids, pixels[inside]), (p_CS, R_CS), False, start=(p_CS, R_CS))
         except LocalizationRefusal:
             return None
         if result.message:
@@ -165,7 +166,7 @@ class BoardLocalizer:
 
     def _search(self, whole: _Part) -> Detection:
         """Search the frame, then look closer at what was found: the other tags are not far."""
-        first = self._detector.search(whole.pixels, self._searches)
+        first = self._distinct(self._detector.search(whole.pixels, self._searches))
         self._searches += 1
         if not first.ids:
             return first
@@ -176,10 +177,20 @@ class BoardLocalizer:
         seen = [self.board.ids.index(number) for number in first.ids]
         centre_S = self.board.corners_S[seen].reshape(-1, 3).mean(axis=0)
         radius = float(np.linalg.norm(self.board.corners_S - centre_S, axis=-1).max())
-        closer = self._look(whole, self._aim(distance * direction / np.linalg.norm(direction), radius))
+        closer = self._distinct(self._look(whole, self._aim(distance * direction / np.linalg.norm(direction), radius)))
         best = closer if len(closer.ids) >= len(first.ids) else first
         rejected = tuple(dict.fromkeys(first.rejected + closer.rejected))
         return Detection(best.ids, best.corners, rejected)
+
+    def _distinct(self, detection: Detection, expected: tuple[np.ndarray, np.ndarray] | None = None) -> Detection:
+        """Each tag once: of several sightings the one that agrees with the others, or with where the board is expected."""
+        twice = sorted({i for i in detection.ids if detection.ids.count(i) > 1})
+        if not twice:
+            return detection
+        numbers = np.array([self.board.ids.index(i) for i in detection.ids])
+        chosen = consistent(self.mount.camera, self.board.corners_S, numbers, detection.corners, expected)
+        notes = tuple(f"tag {i} is seen {detection.ids.count(i)} times" for i in twice)
+        return Detection(tuple(detection.ids[k] for k in chosen), detection.corners[chosen], detection.rejected + notes)
 
     def _look(self, part: _Part, view: VirtualView) -> Detection:
         return self._detector.look(part.pixels, view, part.origin)
@@ -200,33 +211,36 @@ class BoardLocalizer:
         p_WC_now, R_WC_now = self.mount.pose(now.p_WB, now.R_WB)
         return R_WC_now.T @ (p_WC + R_WC @ p - p_WC_now), R_WC_now.T @ R_WC @ R
 
-    def _solve(self, part: _Part, detection: Detection, prior_R_CS: np.ndarray | None, searched: bool,
+    def _solve(self, part: _Part, detection: Detection, expected: tuple[np.ndarray, np.ndarray] | None, searched: bool,
                start: tuple[np.ndarray, np.ndarray] | None = None) -> Localization:
         """Refine the corners and solve for the pose, from `start` (p_CS, R_CS) where that is known.
+
+        `expected` is the pose at which the board should be.
 
         Raises:
             LocalizationRefusal: no usable tag, or no plausible pose.
         """
         if not detection.ids:
             raise LocalizationRefusal("no tag of the board found")
-        refined = refine_corners(part.pixels, self.mount.camera, detection.corners, origin=part.origin)
-        blurred = [i for i, valid in zip(detection.ids, refined.valid) if not valid]
-        if len(blurred) == len(detection.ids):
-            raise LocalizationRefusal(f"the edges of tags {blurred} cannot be measured")
-        ids = tuple(i for i, valid in zip(detection.ids, refined.valid) if valid)
-        corners_S = self.board.corners_S[[self.board.ids.index(i) for i in ids]]
-        rays, sigma = refined.rays_C[refined.valid], refined.sigma[refined.valid]
-        pose = solve_board(self.mount.camera, corners_S, rays, sigma, ids, prior_R_CS, start, self._lens_sigma)
+        detection, camera = self._distinct(detection, expected), self.mount.camera
+        notes, ids = list(detection.rejected), detection.ids
+        if not ids:
+            raise LocalizationRefusal("no tag of the board that is seen once")
+        refined = refine_corners(part.pixels, camera, detection.corners, origin=part.origin, modules=self.board.modules)
+        blurred = [i for i, measured in zip(ids, refined.measured) if not measured.all()]
+        if blurred:
+            notes.append(f"the edges of tags {blurred} cannot be measured")
+            if start is not None:  # these are not detected, only expected
+                raise LocalizationRefusal(notes[-1])
+        corners_S, rays, sigma = self.board.corners_S[[self.board.ids.index(i) for i in ids]], refined.rays_C, refined.sigma
+        pose = solve_board(camera, corners_S, rays, sigma, ids, None if expected is None else expected[1], start, self._lens_sigma)
         distance = float(np.linalg.norm(pose.p_CS))
         if not self.settings.min_range <= distance <= self.settings.max_range:
             raise LocalizationRefusal(
                 f"the tags' size puts the board at {distance:.2f} m, outside "
                 f"[{self.settings.min_range:g}, {self.settings.max_range:g}] m: not a board of this size")
         complete = len(pose.ids) == len(self.board.ids)
-        average = average_board(self.mount.camera, corners_S, rays, ids) if self._averaging and complete else None
-        notes = list(detection.rejected)
-        if blurred:
-            notes.append(f"the edges of tags {blurred} cannot be measured")
+        average = average_board(camera, corners_S, rays, ids) if self._averaging and complete else None
         if pose.dropped:
             notes.append(f"tags {list(pose.dropped)} contradict the others")
         return Localization(pose, average, complete, searched, "; ".join(notes))

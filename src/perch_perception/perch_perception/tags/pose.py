@@ -14,10 +14,12 @@ the covariance of geometry_msgs/PoseWithCovariance means.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from scipy.stats import chi2
 
 from perch_core import so3
 from perch_core.camera import Camera
@@ -26,9 +28,10 @@ from perch_core.errors import PerchError
 MAX_ITERATIONS = 12
 SAME_POSE = np.radians(0.5)        # branches closer than this are one and the same minimum [rad]
 PRIOR_SIGMA = np.radians(10.0)     # how far the attitude may have turned since it was predicted [rad]
-MAX_OUTLIER_RATIO = 5.0            # residuals beyond this many sigma (RMS) mean that a tag is not where it should be
-MAX_RESIDUAL = 0.35                # ... if they also exceed this [px] ...
-CALIBRATION_SHARE = 0.005          # ... and this share of the corners' extent: the lens is not known better
+CONSISTENT = 0.999                 # share of boards that pass where corners are off by what is expected
+MODEL_SHARE = 0.005                # print, paper and lens put corners where they belong within this share of the tag's longest side
+OUTLIER = 10.0                     # a tag that is so many times less consistent than the others is not where it should be
+SUSPECTS = 4                       # tags that are tried one by one as the one that is not
 EXACT_LENS = np.zeros(4)
 
 
@@ -46,6 +49,7 @@ class BoardPose:
         covariance: of (dp, dtheta) in the axes of C [m, rad], shape (6, 6), from the corners' noise alone.
         ids: tags used.
         rms: residual of the corners, per image axis [px].
+        misfit: chi^2 over the degrees of freedom, 1 where the corners are off by their sigmas.
         by_intrinsics: derivative of (dp, dtheta) by errors of the lens's fx, fy (relative) and cx, cy [px] that the
             solution does not know of, shape (6, 4).
         branch_gap: by how much chi^2 of the second-best pose is worse; inf where there is only one.
@@ -60,6 +64,7 @@ class BoardPose:
     by_intrinsics: np.ndarray
     branch_gap: float = np.inf
     dropped: tuple[int, ...] = ()
+    misfit: float = 1.0
 
 
 def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
@@ -80,25 +85,38 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
     Raises:
         LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
     """
+    keep, dropped = np.arange(len(ids)), []
     best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start)
-    extent = float(np.ptp(camera.project(rays_C)[0], axis=(0, 1)).max())
-    if not _contradicts(best, sigma, extent):
-        return best
-    if len(ids) >= 3:  # of two tags that disagree, either may be the wrong one
+    # of two tags that disagree, either may be wrong
+    while best.misfit > _limit(len(keep)) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
+        expected, seen = camera.project(corners_S[keep] @ best.R_CS.T + best.p_CS)[0], camera.project(rays_C[keep])[0]
+        off = np.linalg.norm(expected - seen, axis=2) / sigma[keep]
         trials = []
-        for out in range(len(ids)):
-            keep = np.arange(len(ids)) != out
-            rest = tuple(np.array(ids)[keep].tolist())
-            trial = _solve(camera, corners_S[keep], rays_C[keep], sigma[keep], rest, lens_sigma, prior_R_CS)
-            trials.append((trial.rms, out, trial))
-        _, out, trial = min(trials, key=lambda entry: entry[0])
-        if not _contradicts(trial, sigma, extent):
-            return BoardPose(**{**trial.__dict__, "dropped": (ids[out],)})
-    raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
+        for out in np.argsort(-np.nan_to_num(off, nan=np.inf).max(axis=1))[:SUSPECTS]:
+            rest = np.delete(keep, out)
+            some = tuple(ids[k] for k in rest)
+            trials.append((_solve(camera, corners_S[rest], rays_C[rest], sigma[rest], some, lens_sigma, prior_R_CS), keep[out], rest))
+        trial, out, rest = min(trials, key=lambda trial: trial[0].misfit)
+        explained = best.misfit * _freedom(len(keep)) - trial.misfit * _freedom(len(rest))
+        if explained / 8.0 < OUTLIER * max(trial.misfit, 1.0):
+            break
+        best, keep = trial, rest
+        dropped.append(ids[out])
+    pixels = camera.project(rays_C[keep])[0]
+    model = MODEL_SHARE * np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).max(axis=1, keepdims=True)
+    if best.misfit > _limit(len(keep)) * float(np.mean(1.0 + (model / sigma[keep]) ** 2)):
+        raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
+    return replace(best, dropped=tuple(sorted(dropped)))
 
 
-def _contradicts(pose: BoardPose, sigma: np.ndarray, extent: float) -> bool:
-    return pose.rms > max(MAX_RESIDUAL, MAX_OUTLIER_RATIO * float(np.sqrt(np.mean(sigma**2))), CALIBRATION_SHARE * extent)
+def _freedom(tags: int) -> int:
+    return 8 * tags - 6
+
+
+@lru_cache(maxsize=256)
+def _limit(tags: int) -> float:
+    """chi^2 over its degrees of freedom that `CONSISTENT` of the boards keep."""
+    return float(chi2.ppf(CONSISTENT, _freedom(tags))) / _freedom(tags)
 
 
 def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=None) -> BoardPose:
@@ -113,30 +131,30 @@ def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=
         refined = _refine(corners, p, R)
         if refined is None or refined[0][2] <= 0.0 and camera.max_angle <= np.pi / 2:
             continue
-        p, R, chi2 = refined
+        p, R, chi_square = refined
         if R[:, 2] @ p >= 0.0:
             continue  # the back of the board
-        cost = chi2
+        cost = chi_square
         if prior_R_CS is not None:
             cost += (np.linalg.norm(so3.log(R @ prior_R_CS.T)) / PRIOR_SIGMA) ** 2
-        branches.append((cost, chi2, p, R))
+        branches.append((cost, chi_square, p, R))
     if not branches:
         raise LocalizationRefusal(f"tags {list(ids)}: no pose shows the front of the board")
     branches.sort(key=lambda branch: branch[0])
-    cost, chi2, p, R = branches[0]
-    freedom = max(2 * len(points) - 6, 1)
+    cost, chi_square, p, R = branches[0]
     covariance, by_intrinsics = corners.errors(p, R)
-    covariance = covariance * max(1.0, chi2 / freedom)
+    covariance = covariance * max(1.0, chi_square / _freedom(len(ids)))
     gap = np.inf
     if len(branches) > 1:
         turn = so3.log(branches[1][3] @ R.T)
         if np.linalg.norm(turn) > SAME_POSE:
             # Two minima: the covariance of the mixture says how sure the choice is.
-            gap = branches[1][0] - cost
+            gap = (branches[1][0] - cost) / max(1.0, chi_square / _freedom(len(ids)))
             apart = np.concatenate([branches[1][2] - p, turn])
             share = 1.0 / (1.0 + np.exp(min(0.5 * gap, 500.0)))
             covariance = (1.0 - share) * covariance + share * (corners.errors(*branches[1][2:])[0] + np.outer(apart, apart))
-    return BoardPose(p, R, covariance, tuple(ids), corners.rms(p, R), by_intrinsics, float(gap))
+    return BoardPose(p, R, covariance, tuple(ids), corners.rms(p, R), by_intrinsics, float(gap),
+                     misfit=chi_square / _freedom(len(ids)))
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -119,7 +119,7 @@ class Scene:
             faces += _panel_faces(self.target, depth=PAD_THICKNESS if self.board else 0.0, moving=True)
         if self.board is not None:
             pad = PerchSurface(self.target.p_WS, self.target.R_WS, self.board.pad_size)
-            texel = self.board.tags[0].size / 8 / PAD_TEXELS_PER_MODULE
+            texel = self.board.tags[0].size / self.board.modules / PAD_TEXELS_PER_MODULE
             faces.append(_surface_face(pad, "pad", texel, moving=True))
         for panel in self.panels:
             faces += _panel_faces(panel, depth=0.0, moving=False)

@@ -75,16 +75,22 @@ def _print(board: TagBoard, rows: int, cols: int) -> tuple[np.ndarray, np.ndarra
     extent, shape = np.array(board.pad_size), (rows * OVERSAMPLING, cols * OVERSAMPLING)
     image, bare = np.zeros(shape, np.uint8), np.ones(shape, np.uint8)
     scale = np.array(shape[::-1]) / extent[::-1]  # samples per metre along u and v
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    dictionary, modules = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_APRILTAG_{board.family}")), board.modules
     for tag, corners_S in zip(board.tags, board.corners_S):
-        marker = cv2.aruco.generateImageMarker(dictionary, tag.id, 8)  # one texel per module
-        print_ = np.full((10, 10), WHITE, np.uint8)
-        print_[1:9, 1:9] = np.where(marker > 127, WHITE, BLACK)
+        marker = cv2.aruco.generateImageMarker(dictionary, tag.id, modules, borderBits=board.border)  # one texel per module
+        print_ = np.full((modules + 2, modules + 2), WHITE, np.uint8)
+        print_[1:-1, 1:-1] = np.where(marker > 127, WHITE, BLACK)
         corners = ((extent[::-1] / 2 - corners_S[:, [1, 0]]) * scale - 0.5).astype(np.float32)
-        black_border = np.array([[0.5, 0.5], [8.5, 0.5], [8.5, 8.5], [0.5, 8.5]], np.float32)
+        black_border = modules * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32) + np.float32(0.5)
         warp = cv2.getPerspectiveTransform(black_border, corners)
         mask = cv2.warpPerspective(np.full_like(print_, 255), warp, shape[::-1], flags=cv2.INTER_NEAREST)
         cv2.copyTo(cv2.warpPerspective(print_, warp, shape[::-1], flags=cv2.INTER_NEAREST), mask, image)
         bare[mask > 0] = 0
+    if board.corner_squares and board.grid is not None:  # black, between the corners of neighbouring tags
+        for tag, corners_S in zip(board.tags, board.corners_S):
+            for corner in corners_S[:, :2]:
+                ends = np.array([corner, corner + board.grid.spacing * tag.size * np.sign(corner - tag.centre)])
+                u, v = np.sort(np.rint((extent[::-1] / 2 - ends[:, ::-1]) * scale).astype(int), axis=0).clip(0, shape[::-1]).T
+                image[slice(*v), slice(*u)], bare[slice(*v), slice(*u)] = BLACK, 0
     return tuple(sum(samples[a::OVERSAMPLING, b::OVERSAMPLING].astype(np.uint16)
                      for a in range(OVERSAMPLING) for b in range(OVERSAMPLING)) for samples in (image, bare))
