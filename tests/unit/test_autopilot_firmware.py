@@ -172,9 +172,7 @@ def test_the_node_arms_flies_levels_and_hands_over(vehicle):
         vehicle.radio[6] = ON
         until(lambda: min(vehicle.motors) > 0.2, often=lambda: poll(True))        # and gives it back
         node.close()                                                              # as a node that is killed
-        began = time.monotonic()
-        until(lambda: not vehicle.turning)
-        assert 1.0 < time.monotonic() - began < 15.0                              # not at once, but in the end
+        until(lambda: not vehicle.turning)                                        # level, down, off
     finally:
         node.close()
 

