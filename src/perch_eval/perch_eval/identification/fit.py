@@ -1,0 +1,176 @@
+"""Models of first order fitted to a record: by their output, as the commands were really given, with the scatter between parts of the flight.
+
+    w' = (rate_gain w_cmd(t - delay) - w) / rate_lag        f_z = T - drag_z v_z / mass,  T' = (thrust_gain T_cmd(t - delay) - T) / thrust_lag
+    f_z = thrust_coefficient sum Omega^2 / mass - drag_z v_z / mass,  Omega' = (Omega_cmd - Omega) / motor_time_constant
+    f_x = -drag_x v_x / mass + bias                         likewise y
+
+A value that the record does not tell is refused with the reason, and not written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import exp, inf
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from perch_core.vehicle import GRAVITY, Vehicle
+from perch_eval.identification.record import Record
+
+PARTS = 6            # of the record, fitted one by one for the scatter
+LEAST_RATE = 0.3     # standard deviation of a command below which nothing can be seen in the answer [rad/s]
+LEAST_THRUST = 0.5   # [m/s^2]
+LEAST_SPEED = 0.25   # of the air along an axis, for its drag [m/s]
+EXPLAINED = 0.9      # share of the answer's variance that the model must explain
+CERTAIN = 0.2        # a value is told where its standard deviation is below this share of it ...
+DELAY_CERTAIN = 0.003  # ... and a delay below this [s]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A value of the vehicle file.
+
+    Attributes:
+        key: in the file, with the axis in brackets: `actuation.rate_lag[0]`.
+        value, sigma: with its standard deviation, in `unit`.
+        refused: why the record does not tell it; empty: it does.
+    """
+
+    key: str
+    value: float
+    sigma: float
+    unit: str
+    refused: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}" + (f"   not told: {self.refused}" if self.refused else "")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A command and its answer over time, for the page: title, unit, t [s], command, measured, model, each (n,)."""
+
+    title: str
+    unit: str
+    t: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    model: np.ndarray
+
+    @property
+    def explained(self) -> float:
+        """Share of the measured variance, after the noise between neighbouring samples, that the model explains."""
+        error, noise = self.measured - self.model, 0.5 * float(np.mean(np.diff(self.measured) ** 2))
+        return 1.0 - max(float(np.var(error)) - noise, 0.0) / max(float(np.var(self.measured)) - noise, 1e-12)
+
+
+def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
+    """First-order lag of a command given at each sample, (n, ...); it begins settled."""
+    fade = exp(-period / max(lag, 1e-6))
+    return lfilter([1.0 - fade], [1.0, -fade], u, axis=0, zi=fade * u[:1])[0]
+
+
+def _fitted(model: Callable[[np.ndarray, slice], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
+            high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters of `model(parameters, samples)` and their standard deviations: the scatter of fits to parts, over the root of their number."""
+    def fit(samples: slice, x0: Sequence[float]) -> np.ndarray:
+        return least_squares(lambda x: model(x, samples) - measured[samples], x0, bounds=(low, high), x_scale=np.maximum(np.abs(start), 1e-2),
+                             diff_step=1e-4).x
+
+    whole, cuts = fit(slice(None), start), np.linspace(0, len(measured), PARTS + 1).astype(int)
+    parts = np.array([fit(slice(a, b), whole) for a, b in zip(cuts, cuts[1:])])
+    weight = np.array([np.var(measured[a:b]) for a, b in zip(cuts, cuts[1:])])  # a part in which nothing happens tells nothing
+    weight /= weight.sum()
+    spread = np.sqrt(weight @ (parts - whole) ** 2)
+    return whole, spread / np.sqrt(1.0 / np.sum(weight**2))
+
+
+def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: float | None = None) -> Found:
+    bound = CERTAIN * abs(value) if bound is None else bound
+    if not why and sigma > bound:
+        why = f"its standard deviation of {sigma:.2g} {unit} is more than {bound:.2g}; fly longer and harder".replace("  ", " ")
+    return Found(key, float(value), float(sigma), unit, why)
+
+
+def rates(record: Record, axis: int) -> tuple[list[Found], Answer]:
+    """Lag, gain and delay of one axis of the rate loop."""
+    h, w = record.period, record.gyro[:, axis]
+
+    def model(x: np.ndarray, samples: slice) -> np.ndarray:
+        lag, gain, delay, offset = x
+        return lagged(gain * record.at(record.command_t, record.rates[:, axis], delay + h)[samples], lag, h) + offset
+
+    (lag, gain, delay, _), sigma = x, _ = _fitted(model, w, (0.04, 1.0, 0.005, 0.0), (1e-3, 0.2, -0.01, -0.5), (0.5, 5.0, 0.1, 0.5))
+    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, record.rates[:, axis], 0.0), w, model(x, slice(None)))
+    size, why = float(np.std(answer.command)), ""
+    if size < LEAST_RATE:
+        why = f"commands of {size:.2g} rad/s (1 sigma) are too small; {LEAST_RATE:g} are needed"
+    elif answer.explained < EXPLAINED:
+        why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
+    return [_judged(f"actuation.rate_lag[{axis}]", lag, sigma[0], "s", why), _judged(f"actuation.rate_gain[{axis}]", gain, sigma[1], "", why),
+            _judged(f"delay about {'xyz'[axis]}", max(delay, 0.0), sigma[2], "s", why, DELAY_CERTAIN)], answer
+
+
+def thrust(record: Record, vehicle: Vehicle, delay: float) -> tuple[list[Found], Answer]:
+    """Lag and gain of the thrust, and the drag along z; of the rotors where their speeds are commanded."""
+    h, f, rotors = record.period, record.accel[:, 2], record.rotor_speeds is not None
+    keys = ("motor_time_constant", "thrust_coefficient") if rotors else ("actuation.thrust_lag", "actuation.thrust_gain")
+    unit = vehicle.thrust_coefficient / vehicle.mass if rotors else 1.0
+    u = (record.at(record.command_t, record.rotor_speeds, h) if rotors else record.at(record.command_t, record.thrust, delay + h))
+
+    def model(x: np.ndarray, samples: slice) -> np.ndarray:
+        lag, gain, drag = x
+        felt = gain * unit * np.sum(lagged(u[samples], lag, h) ** 2, axis=1) if rotors else lagged(gain * u[samples], lag, h)
+        return felt - drag * record.v_B[samples, 2]
+
+    x, sigma = _fitted(model, f, (0.04, 1.0, 0.05), (1e-3, 0.2, -5.0), (0.5, 5.0, 5.0))
+    command = unit * np.sum(u**2, axis=1) if rotors else u
+    answer, why = Answer("specific thrust", "m/s^2", record.t, command, f, model(x, slice(None))), ""
+    if np.std(command) < LEAST_THRUST:
+        why = f"commands of {np.std(command):.2g} m/s^2 (1 sigma) are too small; {LEAST_THRUST:g} are needed"
+    elif answer.explained < EXPLAINED:
+        why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
+    scale = vehicle.thrust_coefficient if rotors else 1.0
+    certain = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's own offset looks like thrust
+    return [_judged(keys[0], x[0], sigma[0], "s", why), _judged(keys[1], scale * x[1], scale * certain, "N s^2/rad^2" if rotors else "", why),
+            _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], answer
+
+
+def drag(record: Record, vehicle: Vehicle, axis: int) -> Found:
+    """Linear drag along x or y: the only force there in free air."""
+    def model(x: np.ndarray, samples: slice) -> np.ndarray:
+        return x[1] - x[0] * record.v_B[samples, axis]
+
+    x, sigma = _fitted(model, record.accel[:, axis], (0.1, 0.0), (-5.0, -2.0), (5.0, 2.0))
+    return _drag(axis, vehicle.mass * x[0], vehicle.mass * sigma[0], record)
+
+
+def _drag(axis: int, value: float, sigma: float, record: Record) -> Found:
+    speed = float(np.std(record.v_B[:, axis]))
+    why = f"speeds of {speed:.2g} m/s (1 sigma) are too small; {LEAST_SPEED:g} are needed" if speed < LEAST_SPEED else ""
+    return _judged(f"drag[{axis}]", value, sigma, "N s/m", why or ("a negative drag" if value < 0.0 else ""))
+
+
+def identify(record: Record, vehicle: Vehicle) -> tuple[list[Found], list[Answer]]:
+    """Everything that the record can tell of a vehicle, and the answers for the page."""
+    found: list[Found] = []
+    answers: list[Answer] = []
+    delay = vehicle.actuation.delay
+    if record.rates is not None:
+        axes = [rates(record, axis) for axis in range(3)]
+        answers += [answer for _, answer in axes]
+        told = [part[2] for part, _ in axes if not part[2].refused]
+        found += [one for part, _ in axes for one in part[:2]]
+        weight = np.array([1.0 / max(one.sigma, 2e-4) ** 2 for one in told])
+        if told:
+            delay = float(weight @ [one.value for one in told] / weight.sum())
+            scatter = float(np.sqrt(weight @ [(one.value - delay) ** 2 for one in told] / weight.sum()))
+        found.append(_judged("actuation.delay", delay, max(scatter, float(weight.sum() ** -0.5)), "s", "", DELAY_CERTAIN) if told
+                     else Found("actuation.delay", delay, inf, "s", "no axis tells it"))
+    if record.thrust is not None or record.rotor_speeds is not None:
+        part, answer = thrust(record, vehicle, delay)
+        found, answers = [*found, *part[:2], drag(record, vehicle, 0), drag(record, vehicle, 1), part[2]], [*answers, answer]
+    return found, answers

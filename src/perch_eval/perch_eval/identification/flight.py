@@ -1,0 +1,67 @@
+"""The flight that tells: a hover, short moves along each axis and turns, at rest in between."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from perch_control.mission.parameters import MissionParameters
+from perch_control.modes import Command, State
+from perch_core.errors import PerchError
+from perch_core.trajectory import rest_to_rest
+from perch_eval.control_flights.pilot import LEAD, ScriptedPilot
+from perch_eval.flight import Flight
+from perch_eval.in_process import arrange
+from perch_eval.in_process.parameters import NodeParameters
+from perch_sim.scenario import Scenario
+
+HEIGHT = 1.5                                       # of the hover [m]
+MOVES = (((0.8, 0.0, 0.0), 0.0, 0.9), ((0.0, 0.8, 0.0), 0.0, 0.9), ((0.0, 0.0, 0.6), 0.0, 0.8), ((0.0, 0.0, 0.0), 1.2, 0.8),
+         ((1.5, 0.0, 0.4), -0.8, 1.3), ((0.0, -1.2, -0.3), 0.8, 1.1))
+"""Offset [m], turn [rad], duration [s]; each there and back."""
+ROUNDS = 2                                         # all of them
+PAUSE = 0.3                                        # between them [s]
+PATIENCE = 12.0                                    # for the estimator, and for the take-off [s]
+
+
+def fly(scenario: Scenario, vehicle: str, seed: int) -> Flight:
+    """Fly it in the simulator, with estimated state.
+
+    Args:
+        scenario: the room and how the real vehicle differs from its file.
+        vehicle: name or file; what the controller believes.
+        seed: of everything that is random.
+
+    Raises:
+        PerchError: the vehicle does not fly with this file.
+    """
+    scenario = replace(scenario, vehicle=vehicle)
+    pilot = ScriptedPilot(NodeParameters(scenario, seed).of("mission", MissionParameters))
+    loop = arrange(scenario, seed, without=("target_localizer", "powerline_mapper", "perching_planner", "powerline_planner"), pilot=pilot)
+    state = loop.components["controller"].flight.maneuvers
+
+    def go_on(duration: float) -> None:
+        until = loop.time + duration
+        while loop.time < until:
+            loop.step()
+
+    try:
+        while not pilot.ready and loop.time < PATIENCE:
+            loop.step()
+        if not pilot.ready:
+            raise PerchError("the estimator is not ready")
+        go_on(0.2)
+        pilot.order(Command.ARM, "identification")
+        go_on(0.1)
+        place, yaw = pilot.p_WB, 0.0
+        for offset, turn, duration in (((0.0, 0.0, HEIGHT), 0.0, 2.5), *(
+                (sign * np.array(offset), sign * turn, T) for offset, turn, T in ROUNDS * MOVES for sign in (1.0, -1.0))):
+            pilot.follow(rest_to_rest(place, place + offset, yaw, yaw + turn, duration, pilot.time + LEAD))
+            place, yaw = place + offset, yaw + turn
+            go_on(duration + LEAD + PAUSE)
+            if state.state is not State.HOVERING:
+                raise PerchError(f"the vehicle does not fly by its file: {state.message}; correct the file (mass, lags) or fly a calmer one")
+    finally:
+        loop.close()
+    return loop.trace.flight

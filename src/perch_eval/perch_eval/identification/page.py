@@ -1,0 +1,63 @@
+"""What was identified: entries for the vehicle file, and a page of plots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+
+from perch_core.vehicle import Vehicle  # noqa: E402
+from perch_eval.identification.fit import Answer, Found  # noqa: E402
+
+
+def entries(found: Sequence[Found], vehicle: Vehicle, base: str) -> str:
+    """A vehicle file that extends `base` by what was told; what was not stays as it is there, with the reason in a comment."""
+    values: dict[str, object] = {}
+    lines: list[str] = []
+    for key in dict.fromkeys(one.key.split("[")[0] for one in found):
+        group = [one for one in found if one.key.split("[")[0] == key]
+        owner = vehicle.actuation if key.startswith("actuation.") else vehicle
+        name = key.split(".")[-1]
+        old = getattr(owner, name, None)
+        if old is None:
+            continue
+        new = [old[i] if one.refused else one.value for i, one in enumerate(group)] if isinstance(old, tuple) else group[0].value
+        told = not all(one.refused for one in group)
+        remark = "; ".join(f"{'xyz'[i] + ' ' if len(group) > 1 else ''}" + (f"not told ({one.refused})" if one.refused else f"+- {one.sigma:.2g} {one.unit}".rstrip())
+                           for i, one in enumerate(group))
+        values[key] = new
+        text = f"[{', '.join(f'{x:.4g}' for x in new)}]" if isinstance(new, list) else f"{new:.5g}"
+        indent = "  " if key.startswith("actuation.") else ""
+        lines.append(f"{indent}{'' if told else '# '}{name}: {text}".ljust(45) + f"# {remark}")
+    mine, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]
+    head = [f"# Identified by scripts/identify.py; standard deviations beside the values.\nextends: {base}\nname: {vehicle.name}_identified"]
+    return "\n".join([*head, *mine, *(["actuation:", f"  type: {vehicle.actuation.type}", *inner] if inner else [])]) + "\n"
+
+
+def draw(file: Path, found: Sequence[Found], answers: Sequence[Answer], title: str) -> None:
+    """One row per answer: over time, and what the model leaves; the table below."""
+    figure, axes = plt.subplots(len(answers) + 1, 2, figsize=(13, 3.0 * len(answers) + 0.25 * len(found) + 1.0), squeeze=False,
+                                gridspec_kw={"height_ratios": [3.0] * len(answers) + [0.25 * len(found) + 0.5], "width_ratios": [3, 1]})
+    for (left, right), answer in zip(axes, answers):
+        t = answer.t - answer.t[0]
+        left.plot(t, answer.command, color="#999999", lw=0.7, label="command")
+        left.plot(t, answer.measured, color="#1f77b4", lw=0.5, label="measured")
+        left.plot(t, answer.model, color="#d62728", lw=0.9, label=f"model, explains {100 * answer.explained:.1f} %")
+        left.set(title=answer.title, xlabel="t [s]", ylabel=answer.unit)
+        left.legend(loc="upper right", fontsize=7)
+        right.plot(answer.model, answer.measured, ",", color="#1f77b4")
+        ends = np.array([answer.model.min(), answer.model.max()])
+        right.plot(ends, ends, color="#d62728", lw=0.9)
+        right.set(xlabel=f"model [{answer.unit}]", ylabel=f"measured [{answer.unit}]")
+    for axis in axes[-1]:
+        axis.axis("off")
+    axes[-1][0].text(0.0, 1.0, "\n".join(map(str, found)), family="monospace", fontsize=8, va="top")
+    figure.suptitle(title)
+    figure.tight_layout()
+    figure.savefig(file, dpi=95)
+    plt.close(figure)

@@ -1,0 +1,89 @@
+"""The part of a flight in the air as arrays on the IMU's times: commands, gyroscope, accelerometer, velocity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.errors import PerchError
+from perch_core.vehicle import GRAVITY
+from perch_eval.flight import Flight
+
+SHORTEST = 5.0   # of a record in the air [s]
+ALOFT = 0.6      # specific force along b3 that means flying, as a share of gravity
+BEGIN = 1.5      # after that, the ground no longer matters [s]
+
+
+@dataclass(frozen=True)
+class Record:
+    """A flight without its beginning and its end.
+
+    Attributes:
+        t: of the IMU's samples [s], (n,); `period` apart.
+        gyro, accel: [rad/s], [m/s^2], (n, 3).
+        v_B: velocity in B [m/s], (n, 3).
+        command_t: stamps of the commands [s], (m,).
+        rates: commanded [rad/s], (m, 3); None: rotor speeds or attitudes were.
+        thrust: commanded, per mass [m/s^2], (m,); None: rotor speeds were.
+        rotor_speeds: commanded [rad/s], (m, 4); None: rates and thrust were.
+    """
+
+    t: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+    v_B: np.ndarray
+    command_t: np.ndarray
+    rates: np.ndarray | None = None
+    thrust: np.ndarray | None = None
+    rotor_speeds: np.ndarray | None = None
+
+    @property
+    def period(self) -> float:
+        """Of the IMU [s]."""
+        return float(np.median(np.diff(self.t)))
+
+    def at(self, times: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
+        """Values as they were `delay` before each IMU sample, between their own times: (n, ...).
+
+        A command that is held for a period h and read between its ends is h / 2 too early, and an IMU that gives means over its own period
+        is as late: `delay` is the vehicle's + one period.
+        """
+        if values.ndim == 1:
+            return np.interp(self.t - delay, times, values)
+        return np.stack([np.interp(self.t - delay, times, column) for column in values.T], axis=1)
+
+
+def record_of(flight: Flight) -> Record:
+    """The record of a flight.
+
+    Raises:
+        PerchError: without IMU, odometry or commands, or too short in the air.
+    """
+    commands = {channel: [(t, c) for t, c in flight.values(channel) if c.armed]
+                for channel in ("rates_thrust_command", "attitude_thrust_command", "motor_command")}
+    channel = max(commands, key=lambda name: len(commands[name]))
+    imu, states, sent = flight.values("imu/data_raw"), flight.states("odometry"), commands[channel]
+    for name, values in (("imu/data_raw", imu), ("odometry", states and states.t), ("commands to the vehicle while armed", sent)):
+        if values is None or len(values) < 100:
+            raise PerchError(f"the flight has no {name}")
+    t = np.array([time for time, _ in imu])
+    f = np.array([sample.f_B for _, sample in imu])
+    w = np.array([sample.w_B for _, sample in imu])
+    command_t = np.array([time for time, _ in sent])
+    window = max(1, round(0.1 / float(np.median(np.diff(t)))))
+    aloft = np.convolve(f[:, 2], np.ones(window) / window, "same") > ALOFT * GRAVITY
+    moving = aloft & (t > command_t[0]) & (t < command_t[-1])
+    high = np.interp(t, states.t, states.p[:, 2])
+    moving &= high > high[0] + 0.3
+    if not moving.any() or t[moving][-1] - t[moving][0] < SHORTEST + BEGIN:
+        raise PerchError(f"less than {SHORTEST:g} s of it are in the air")
+    keep = (t > t[moving][0] + BEGIN) & (t < t[moving][-1] - 0.2)
+    velocity = np.array([value.v_B for _, value in sorted(flight.values("odometry"), key=lambda pair: pair[0])])
+    v_B = np.stack([np.interp(t[keep], states.t, column) for column in velocity.T], axis=1)
+    rotors = channel == "motor_command"
+    return Record(
+        t[keep], w[keep], f[keep], v_B, command_t,
+        rates=np.array([c.w_B for _, c in sent]) if channel == "rates_thrust_command" else None,
+        thrust=None if rotors else np.array([c.thrust for _, c in sent]),
+        rotor_speeds=np.array([c.rotor_speed for _, c in sent]) if rotors else None)

@@ -1,0 +1,122 @@
+"""Identification: what a record was made with is found, with honest deviations, and what it does not tell is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from perch_core import config
+from perch_core.errors import PerchError
+from perch_core.vehicle import load_vehicle
+from perch_eval.flight import Flight
+from perch_eval.identification import command
+from perch_eval.identification.fit import identify
+from perch_eval.identification.record import Record, record_of
+
+VEHICLE = load_vehicle("snapdragon_rates")
+LAG, GAIN, DELAY, THRUST_LAG, THRUST_GAIN, DRAG = (0.05, 0.04, 0.11), (1.0, 0.9, 1.05), 0.012, 0.07, 0.93, (0.05, 0.04, 0.03)
+PERIOD, FINE = 0.002, 20  # of commands and IMU [s]; steps of the test's own integration in one
+
+
+def record(size=2.5, seconds=20.0, seed=1, oscillation=0.0):
+    """Commands held for a period, answers integrated in fine steps, IMU samples that are means over a period, and the data sheet's noise."""
+    rng, n = np.random.default_rng(seed), round(seconds / PERIOD)
+    command_t = PERIOD * np.arange(n)
+    smooth = np.exp(-0.5 * (np.arange(-150, 151) / 30.0) ** 2)
+    u = np.stack([np.convolve(rng.standard_normal(n), smooth / np.sqrt(np.sum(smooth**2)), "same") for _ in range(4)], axis=1) * size
+    u[:, 3] = 9.81 + u[:, 3]
+    fine = PERIOD / FINE
+    held = u[np.clip((np.arange(n * FINE) - round(DELAY / fine)) // FINE, 0, None)]
+    y, speed, x, dx = np.zeros((n, 4)), np.zeros((n, 3)), np.array([0.0, 0.0, 0.0, 9.81 * THRUST_GAIN]), np.zeros(4)
+    lag, gain = np.array([*LAG, THRUST_LAG]), np.array([*GAIN, THRUST_GAIN])
+    for k in range(n):
+        total = np.zeros(4)
+        for i in range(FINE):
+            wanted = gain * held[k * FINE + i]
+            if oscillation:
+                dx += fine * (oscillation**2 * (wanted - x) - 0.1 * oscillation * dx)
+                x = x + fine * dx
+            else:
+                x = x + fine * (wanted - x) / lag
+            total += x
+        y[k] = total / FINE
+    for i, T in enumerate((1.7, 2.3, 2.9)):
+        speed[:, i] = 0.8 * np.sin(2 * np.pi * command_t / T)
+    gyro = y[:, :3] + 0.01 * rng.standard_normal((n, 3)) + 0.004
+    accel = -np.array(DRAG) / VEHICLE.mass * speed + 0.316 * rng.standard_normal((n, 3))
+    accel[:, 2] += y[:, 3]
+    # A sample that is the mean over the period from command k to command k + 1 has the stamp of its end.
+    return Record(command_t + PERIOD, gyro, accel, speed, command_t, u[:, :3], u[:, 3])
+
+
+@pytest.fixture(scope="module")
+def found():
+    return {one.key: one for one in identify(record(), VEHICLE)[0]}
+
+
+def test_what_a_record_was_made_with_is_found(found):
+    true = {f"actuation.rate_{name}[{i}]": values[i] for name, values in (("lag", LAG), ("gain", GAIN)) for i in range(3)}
+    true |= {"actuation.delay": DELAY, "actuation.thrust_lag": THRUST_LAG, "actuation.thrust_gain": THRUST_GAIN}
+    true |= {f"drag[{i}]": DRAG[i] for i in range(3)}
+    assert set(found) == set(true)
+    for key, value in true.items():
+        one = found[key]
+        assert abs(one.value - value) < max(4.0 * one.sigma, 0.01 * value), str(one)
+        if not key.startswith("drag"):
+            assert not one.refused and one.sigma < 0.1 * value, str(one)
+
+
+def test_a_hover_tells_nothing_and_says_so():
+    found, _ = identify(record(size=0.05, seconds=10.0), VEHICLE)
+    assert all(one.refused for one in found if one.key.startswith("actuation"))
+    assert "too small" in found[0].refused and "no axis" in next(one.refused for one in found if one.key == "actuation.delay")
+
+
+def test_a_loop_that_rings_is_none_of_first_order():
+    found, answers = identify(record(oscillation=15.0, seconds=10.0), VEHICLE)
+    assert "explains" in found[0].refused and answers[0].explained < 0.9
+
+
+def test_rotors_are_identified_from_their_speeds():
+    n, tau, hover = 9000, 0.04, 1200.0
+    t, scale = PERIOD * np.arange(n), 1.07
+    speeds = hover + np.stack([150 * np.sin(2 * np.pi * f * t) + 40 * np.sin(9 * t) for f in (0.7, 1.1, 1.6, 2.3)], axis=1)
+    omega, felt = speeds[0].copy(), np.zeros(n)
+    vehicle = load_vehicle("snapdragon")
+    for k in range(n):
+        for _ in range(FINE):
+            omega += PERIOD / FINE * (speeds[k] - omega) / tau
+            felt[k] += scale * vehicle.thrust_coefficient * np.sum(omega**2) / vehicle.mass / FINE
+    v = 0.5 * np.sin(3.0 * t)[:, None] * np.ones(3)
+    noise = 0.3 * np.random.default_rng(4).standard_normal((n, 3))
+    accel = np.stack([0 * felt, 0 * felt, felt], axis=1) + noise - 0.2 * v
+    found = {one.key: one for one in identify(Record(t + PERIOD, 0 * v, accel, v, t, rotor_speeds=speeds), vehicle)[0]}
+    assert found["motor_time_constant"].value == pytest.approx(tau, rel=0.03)
+    assert found["thrust_coefficient"].value == pytest.approx(scale * vehicle.thrust_coefficient, rel=0.01)
+
+
+def test_a_flight_without_commands_is_refused():
+    with pytest.raises(PerchError, match="no imu/data_raw"):
+        record_of(Flight({}))
+
+
+def test_the_program_flies_and_writes_a_vehicle_file(tmp_path, monkeypatch, capsys):
+    """On a vehicle whose loop is 1.3 times as slow as its file says, and 4 % heavier."""
+    (tmp_path / "slow.yaml").write_text("name: slow\nextends: surface_90\ndisturbance: {loop_lag_factor: 1.3, mass_factor: 1.04}\n")
+    monkeypatch.setattr(command.flight, "ROUNDS", 1)
+    monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", "--scenario", str(tmp_path / "slow.yaml"), "--out", str(tmp_path)])
+    assert command.main() in (0, 1), capsys.readouterr().err  # drag needs a longer flight
+    written, nominal = load_vehicle(tmp_path / "vehicle.yaml").actuation, VEHICLE.actuation
+    wanted = [1.3 * lag + nominal.delay for lag in (*nominal.rate_lag, nominal.thrust_lag)]  # the rotors' own time counts as delay
+    assert [lag + written.delay for lag in (*written.rate_lag, written.thrust_lag)] == pytest.approx(wanted, rel=0.08)
+    assert written.thrust_gain == pytest.approx(1 / 1.04, abs=0.015) and written.rate_gain == pytest.approx((1.0,) * 3, abs=0.02)
+    assert (tmp_path / "identify.png").stat().st_size > 20_000
+    assert "+-" in (tmp_path / "vehicle.yaml").read_text() and config.find("vehicles", tmp_path / "vehicle.yaml")
+    assert replace(load_vehicle(tmp_path / "vehicle.yaml"), name="x", drag=VEHICLE.drag, actuation=nominal) == replace(VEHICLE, name="x")
+
+
+@pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"), (["--vehicle", "snapdragon", "--recording", "/no/file"], "no such file")])
+def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["identify.py", *arguments])
+    assert command.main() == 2
+    line = capsys.readouterr().err
+    assert words in line and line.count("\n") == 1
