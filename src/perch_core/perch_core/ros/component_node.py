@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 import time
 import traceback
 from collections import deque
@@ -76,7 +77,7 @@ class ComponentNode(Node):
         self.component.log.receivers.append(self._log)
         self._diagnostics = self.create_publisher(topics.message_type("/diagnostics"), "/diagnostics", topics.topic("/diagnostics").qos.publish)
         self.component.diagnostics.receivers.append(self._publish_diagnostics)
-        self._reported, self._report = 0.0, Diagnostics(0)
+        self._reported, self._report, self._process = 0.0, Diagnostics(0), f"{socket.gethostname()}:{os.getpid()}"
         self.create_timer(HEARTBEAT, self._beat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._publish_outputs()
         self.component.warm_up()
@@ -259,7 +260,9 @@ class ComponentNode(Node):
         if self._failures:
             values["failures"], level = self._failures, 2
         shown = Diagnostics(diagnostics.stamp, values, level, diagnostics.message)
-        self._diagnostics.publish(diagnostics_message(shown, self.get_fully_qualified_name()))
+        message = diagnostics_message(shown, self.get_fully_qualified_name())
+        message.status[0].hardware_id = self._process
+        self._diagnostics.publish(message)
 
     def host_figures(self) -> dict[str, Any]:
         """What the host adds to the diagnostics."""

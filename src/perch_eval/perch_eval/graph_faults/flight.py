@@ -316,13 +316,11 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
 
 def _settled(pilot: Pilot, watcher: Watcher, director: _Director) -> str:
     """Wait until an end lasts, and the fault has had its time to be named."""
-    limit, since, last, named_silent = time.monotonic() + LIMIT, watcher.time, "", set()
+    limit, since, last = time.monotonic() + LIMIT, watcher.time, ""
     while time.monotonic() < limit:
         pilot.listen(0.05)
         director.look()
-        for name in sorted(pilot.silent() - named_silent):
-            named_silent.add(name)
-            director.said.append((time.time(), f"{name} is silent"))
+        director.said += [(time.time(), words) for words in pilot.news()]
         now = watcher.situation()
         if now is None:
             continue

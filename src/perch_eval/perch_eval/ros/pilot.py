@@ -90,6 +90,8 @@ class Pilot:
         self._vehicle = self._node.get_namespace().rstrip("/") + "/vehicle"
         self._time, self._waiting_for, self._looked = 0.0, "", 0.0
         self._heard: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
+        self._process: dict[str, str] = {}  # node -> where it runs, as its diagnostics say
+        self._silent, self._news = set(), []
         self._interrupted, self._handler = False, None
         if threading.current_thread() is threading.main_thread():
             self._handler = signal.signal(signal.SIGINT, self._interrupt)
@@ -129,12 +131,14 @@ class Pilot:
         """Run what has come, or comes in time [s]."""
         self._spin(timeout)
 
-    def silent(self) -> set[str]:
-        """Nodes of which nothing is heard any more, though others are: they hang, or have ended."""
-        now = time.monotonic()
-        if now - max(self._heard.values(), default=0.0) > 0.5 * SILENT:
-            return set()
-        return {name for name, heard in self._heard.items() if now - heard > SILENT}
+    def news(self) -> list[str]:
+        """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended."""
+        now, (news, self._news) = time.monotonic(), (self._news, [])
+        if now - max(self._heard.values(), default=0.0) < 0.5 * SILENT:
+            silent = {name for name, heard in self._heard.items() if now - heard > SILENT}
+            news += [f"{name} has been silent for {SILENT:g} s" for name in sorted(silent - self._silent)]
+            self._silent = silent
+        return news
 
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
@@ -147,8 +151,8 @@ class Pilot:
 
         Args:
             scenario: what to fly.
-            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, when a node falls silent, and
-                who is waited for when simulation time stands still.
+            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, when a node falls silent or
+                was restarted, and who is waited for when simulation time stands still.
             check: called often; may raise to end the wait (a node that died).
             stall: wall-clock time without progress of simulation time after which the flight has failed [s].
 
@@ -176,13 +180,12 @@ class Pilot:
         if not handle.accepted:
             raise PerchError("the mission refused the goal: it is flying another one")
         result = handle.get_result_async()
-        cancelled, servers, silent = False, self._servers(), set()
+        cancelled, servers = False, self._servers()
         while not result.done():
             self._spin(0.05)
             check()
-            silent, before = self.silent(), silent
-            for name in sorted(silent - before):
-                on_phase(self._time, seen[0], f"{name} has been silent for {SILENT:g} s")
+            for words in self.news():
+                on_phase(self._time, seen[0], words)
             self._check_server(servers)
             still = progress.look(self._time)
             if progress.explain():
@@ -269,5 +272,8 @@ class Pilot:
     def _receive_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
             self._heard[status.name] = time.monotonic()
+            if self._process.setdefault(status.name, status.hardware_id) != status.hardware_id:
+                self._process[status.name] = status.hardware_id
+                self._news.append(f"{status.name} was restarted")
             if status.name == self._vehicle:
                 self._waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")
