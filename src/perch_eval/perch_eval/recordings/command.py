@@ -185,7 +185,7 @@ def _figures(perception: Perception, truth: Trajectory | None) -> tuple[dict[str
             figures["vio"] |= compared.figures()
             rows += _evaluation_rows("VIO", compared)
             odometry = perception.odometry[::max(1, len(perception.odometry) // 5000)]
-            against = evaluate(_trajectory([(o.stamp, o.p_WB, o.q_WB) for o in odometry if o.stamp >= vio.stamps[0]]), truth)
+            against = evaluate(_trajectory([(o.stamp, o.p_WB, o.q_WB) for o in odometry]), truth)
             figures["estimator"] = against.figures()
             rows += _evaluation_rows("estimator", against)[:1]
         plots["The path"] = report.path_figure(vio, compared)
@@ -243,9 +243,8 @@ def _trajectory(rows: list[tuple[int, Any, Any]]) -> Trajectory:
 
 def _write_trajectories(folder: Path, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
     write_tum(folder / "vio.tum", vio)
-    first = vio.stamps[0] if len(vio) else 0
     write_tum(folder / "estimator.tum",
-              _trajectory([(o.stamp, o.p_WB, o.q_WB) for o in perception.odometry if o.stamp >= first and len(vio)]))
+              _trajectory([(o.stamp, o.p_WB, o.q_WB) for o in perception.odometry]))
     write_tum(folder / "target.tum", _trajectory([(t.stamp, t.p_WS, t.q_WS) for t in perception.targets]))
     if truth is not None:
         write_tum(folder / "truth.tum", truth)

@@ -39,10 +39,11 @@ class Report:
 def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> tuple[float, float]:
     """Rate [Hz] and jitter (1 sigma of an interval, in periods) of ascending stamps."""
     intervals = 1e-9 * np.diff(stamps)
-    period = float(np.median(intervals))
-    rate = 1.0 / period
-    usual = intervals[intervals < 1.5 * period]
-    jitter, gaps = float(usual.std() / period) if len(usual) else np.nan, intervals[intervals > 1.8 * period]
+    reach = min(9, len(intervals))  # stamps may come in batches
+    period = float(np.median(stamps[reach:] - stamps[:-reach])) * 1e-9 / reach
+    rate, beside = 1.0 / period, np.pad(intervals, 1, constant_values=period)
+    gap = (intervals > 1.8 * period) & (beside[:-2] + intervals + beside[2:] > 3.5 * period)
+    jitter, gaps = float(intervals[~gap].std() / period) if not gap.all() else np.nan, intervals[gap]
     report.figures[f"{about} rate_hz"] = rate
     wrong = told is not None and not 0.8 < rate / told < 1.25
     report.say(f"{about} rate",

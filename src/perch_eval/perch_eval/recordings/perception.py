@@ -27,6 +27,7 @@ from perch_perception.powerline_mapper import PowerlineMapper
 from perch_perception.target_localizer import TargetLocalizer
 from perch_perception.vio_component import VioComponent
 
+KNOWN = 100.0  # 1 sigma of a position that means something [m]
 TAIL = 8  # frames that a picture of tracks looks back
 
 
@@ -114,7 +115,7 @@ class _Target(TargetLocalizer):
         self.sighting.receivers.pop()
         seen = sightings[-1]
         gallery = self.missed if seen.pose_camera is None else self.found
-        if not gallery.due():
+        if not gallery.due() or image.pixels() is None:
             gallery.pass_by()
             return
         camera = self.mounted.mount.camera
@@ -134,7 +135,7 @@ class _Wires(PowerlineMapper):
     def look(self, image: CameraImage, exposed: float) -> None:
         """As it does."""
         super().look(image, exposed)
-        if not self.gallery.due():
+        if not self.gallery.due() or image.pixels() is None:
             self.gallery.pass_by()
             return
         camera = self.mounted.mount.camera
@@ -151,7 +152,7 @@ class Perception:
     Attributes:
         vio: the component of VIO.
         states: of VIO.
-        odometry: the estimator's, one for each IMU sample.
+        odometry: the estimator's, one for each IMU sample from when it knows where it is.
         health: the estimator's word on itself.
         sightings, targets: of the target localiser.
         lines: the last map; None: there is none.
@@ -181,7 +182,7 @@ class Perception:
         self.vio.state.receivers += [self.states.append, self.estimator.on_vio_state]
         self.vio.odometry.receivers.append(self.estimator.on_vio_odometry)
         self.estimator.status.receivers.append(self.health.append)
-        self.estimator.odometry.receivers.append(self.odometry.append)
+        self.estimator.odometry.receivers.append(self._keep)
         if self.target is not None:
             self.target.found, self.target.missed = Gallery(), Gallery(4)
             self.target.sighting.receivers.append(self.sightings.append)
@@ -213,6 +214,10 @@ class Perception:
         component = cls(config.from_mapping(cls.config_type, nested(parameters), node))
         component.log.receivers.append(lambda line: self._note(node, line))
         return component
+
+    def _keep(self, odometry: OdometryState) -> None:
+        if odometry.pose_covariance[0, 0] < KNOWN**2:
+            self.odometry.append(odometry)
 
     def _note(self, node: str, line: LogLine) -> None:
         key = (node, line.level, line.text)

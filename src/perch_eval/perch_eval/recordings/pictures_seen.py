@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount, PinholeCamera
-from perch_core.tag_board import TagBoard
+from perch_core.camera import Camera, CameraMount, PinholeCamera
+from perch_core.tag_board import FAMILIES, Tag, TagBoard
 from perch_core.values import CameraImage, TargetPose
 from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_tags, draw_wires
 from perch_eval.recordings.gallery import Shown
 from perch_perception.images import mono_image
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting, detect_lines
-from perch_perception.tags import BoardLocalizer, BoardPose
-from perch_perception.tags.detector import SEARCH_WINDOWS
+from perch_perception.tags import BoardLocalizer, BoardPose, TagDetector, refine_corners
 
 GUESSED_FOCAL = 0.8  # of a camera that nobody has calibrated, as a share of the image's width
 
@@ -85,7 +83,7 @@ def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDet
         ImageError: it is not of the camera's size or has no pixels.
     """
     grey = mono_image(image, mount.camera)
-    tags = find_tags(grey)
+    tags = find_tags(grey, mount.camera, board)
     if calibrated:
         found = BoardLocalizer(board, mount).process(grey, 0.0)
         pose, message = found.board, found.message
@@ -95,25 +93,13 @@ def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDet
                 mount)
 
 
-def find_tags(grey: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """Number and corners (TL, TR, BR, BL) [px], (4, 2), of every tag 36h11 in a grey image, several with one number included.
-
-    OpenCV's detector on the image enlarged twice, with each of the localiser's threshold windows: a tag that one loses, another finds.
-    """
-    large, found = cv2.resize(grey, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), []
-    for window in SEARCH_WINDOWS:
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window
-        parameters.minMarkerPerimeterRate = 0.01
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
-        corners, ids, _ = detector.detectMarkers(large)
-        for number, corner in zip(() if ids is None else np.ravel(ids).tolist(), corners):
-            corner = (np.reshape(corner, (4, 2)) - 0.5) / 2.0  # cv2.resize maps the centre u of a pixel to 2 u + 0.5
-            side = np.linalg.norm(corner[0] - corner[1])
-            if all(np.linalg.norm(corner.mean(axis=0) - other.mean(axis=0)) > 0.3 * side for _, other in found):
-                found.append((int(number), corner))
-    return found
+def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[int, np.ndarray]]:
+    """Number and corners (TL, TR, BR, BL) [px], (4, 2), of every tag of a board's family in a grey image, several with one number included."""
+    side = 0.1 * min(board.pad_size)
+    anything = replace(board, grid=None, tags=tuple(Tag(number, (0.0, 0.0), side) for number in range(FAMILIES[board.family][1])))
+    detection = TagDetector(anything, camera).search(grey)
+    pixels = camera.project(refine_corners(grey, camera, detection.corners, modules=board.modules).rays_C)[0]
+    return list(zip(detection.ids, pixels))
 
 
 def drawn(image: CameraImage, seen: Seen, board: TagBoard, name: str) -> Shown:

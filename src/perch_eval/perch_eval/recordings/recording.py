@@ -110,7 +110,8 @@ def picture(path: Path, stamp: int, name: str, camera: CameraSensor | None) -> C
         width, height = pixels.shape[1], pixels.shape[0]
     else:
         width, height = camera.width, camera.height
-    image = _Picture(stamp, optical_frame(name), width, height, encoding, cache(lambda region=None: decoded(path, flag)))
+    whole = cache(lambda: decoded(path, flag))
+    image = _Picture(stamp, optical_frame(name), width, height, encoding, lambda region=None: whole())
     image.path = path
     return image
 
