@@ -49,7 +49,7 @@ def test_a_node_is_no_witness_of_itself_and_routine_names_nobody():
              "[INFO] [1000000102.5] [controller]: descent without position: no odometry",
              "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator is gone", "Traceback: estimator"]
     assert named(CASE, 1000000100.0, lines, []) == (2.5, "controller: descent without position: no odometry")
-    assert named(CASE, 1000000100.0, lines[:2], []) is None
+    assert named(CASE, 1000000100.0, lines[:2], [(1000000101.0, "waits for the estimator")]) is None
     assert named(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has been silent for 3 s")])[0] == 1.5
 
 

@@ -128,7 +128,8 @@ def named(case: Case, struck: float, lines: Iterable[str], said: Iterable[tuple[
         said: (seconds since the epoch, words) of who sent the goal.
     """
     words = re.compile(WORDS[case.node], re.IGNORECASE)
-    found = [(time - struck, f"pilot: {text}") for time, text in said if time >= struck and words.search(text)]
+    found = [(time - struck, f"pilot: {text}") for time, text in said
+             if time >= struck and words.search(text) and _TROUBLE.search(text)]
     for line in filter(None, map(_LINE.match, lines)):
         after, text = float(line["time"]) - struck, line["text"]
         if line["node"] != case.node and after >= 0.0 and words.search(text) and (_TROUBLE.search(text) or line["level"] != "INFO"):

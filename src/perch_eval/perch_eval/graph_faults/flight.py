@@ -43,6 +43,7 @@ STALL = 30.0     # simulation time may stand still for so long [s]
 SETTLE = 4.0     # an end that lasts so long is one, in simulation time [s]
 LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
 STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
+GOING = 10.0     # for what processes had open to vanish after their end, on a busy machine [s]
 PORTS, DOMAIN_PORTS = 7400, 250  # first port of domain 0, and ports of each, by the standard of DDS
 _PORT = re.compile(r"(?:sem\.)?fast\w+_port(\d+)")
 NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
@@ -170,7 +171,7 @@ class Group:
 
     def left(self) -> tuple[str, ...]:
         """What is left when all have been stopped, the pilot included, in words; shared memory is cleaned first."""
-        end, seen = time.monotonic() + STOPPING[1], self._memory.seen
+        end, seen = time.monotonic() + GOING, self._memory.seen
         while True:  # threads of a process that has ended may hold what it had open for a moment
             self._memory.clean()
             found = (*(f"process {pid}" for leader in self._sessions for pid in session(leader)), *self._sockets(), *self._shared_memory(seen))
