@@ -68,7 +68,7 @@ def test_what_a_record_was_made_with_is_found(found):
 def test_a_hover_tells_nothing_and_says_so():
     found, _ = identify(record(size=0.05, seconds=10.0), VEHICLE)
     assert all(one.refused for one in found if one.key.startswith("actuation"))
-    assert "too small" in found[0].refused and "no axis" in next(one.refused for one in found if one.key == "actuation.delay")
+    assert "too small" in found[0].refused and "neither roll nor pitch" in next(one.refused for one in found if one.key == "actuation.delay")
 
 
 def test_a_loop_that_rings_is_none_of_first_order():

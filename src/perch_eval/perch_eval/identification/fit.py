@@ -95,23 +95,24 @@ def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: fl
     return Found(key, float(value), float(sigma), unit, why)
 
 
-def rates(record: Record, axis: int) -> tuple[list[Found], Answer]:
-    """Lag, gain and delay of one axis of the rate loop."""
-    h, w = record.period, record.gyro[:, axis]
+def rates(record: Record, axis: int, delay: float | None = None) -> tuple[list[Found], Answer]:
+    """Lag and gain of one axis of the rate loop with a delay, or with the delay that fits it best, which is then the third."""
+    h, w, free = record.period, record.gyro[:, axis], delay is None
 
     def model(x: np.ndarray, samples: slice) -> np.ndarray:
-        lag, gain, delay, offset = x
-        return lagged(gain * record.at(record.command_t, record.rates[:, axis], delay + h)[samples], lag, h) + offset
+        late = x[3] if free else delay
+        return lagged(x[1] * record.at(record.command_t, record.rates[:, axis], late + h)[samples], x[0], h) + x[2]
 
-    (lag, gain, delay, _), sigma = x, _ = _fitted(model, w, (0.04, 1.0, 0.005, 0.0), (1e-3, 0.2, -0.01, -0.5), (0.5, 5.0, 0.1, 0.5))
+    n = 4 if free else 3
+    x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
     answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, record.rates[:, axis], 0.0), w, model(x, slice(None)))
     size, why = float(np.std(answer.command)), ""
     if size < LEAST_RATE:
         why = f"commands of {size:.2g} rad/s (1 sigma) are too small; {LEAST_RATE:g} are needed"
     elif answer.explained < EXPLAINED:
         why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
-    return [_judged(f"actuation.rate_lag[{axis}]", lag, sigma[0], "s", why), _judged(f"actuation.rate_gain[{axis}]", gain, sigma[1], "", why),
-            _judged(f"delay about {'xyz'[axis]}", max(delay, 0.0), sigma[2], "s", why, DELAY_CERTAIN)], answer
+    found = [_judged(f"actuation.rate_lag[{axis}]", x[0], sigma[0], "s", why), _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
+    return found + ([_judged("actuation.delay", max(x[3], 0.0), sigma[3], "s", why, DELAY_CERTAIN)] if free else []), answer
 
 
 def thrust(record: Record, vehicle: Vehicle, delay: float) -> tuple[list[Found], Answer]:
@@ -160,16 +161,15 @@ def identify(record: Record, vehicle: Vehicle) -> tuple[list[Found], list[Answer
     answers: list[Answer] = []
     delay = vehicle.actuation.delay
     if record.rates is not None:
-        axes = [rates(record, axis) for axis in range(3)]
+        # One delay for all: that of roll and pitch, which turn the thrust; what yaw is later counts as its lag.
+        tilt = [part[2] for part, _ in (rates(record, axis) for axis in (0, 1)) if not part[2].refused]
+        if tilt:
+            delay = float(np.mean([one.value for one in tilt]))
+        axes = [rates(record, axis, delay) for axis in range(3)]
         answers += [answer for _, answer in axes]
-        told = [part[2] for part, _ in axes if not part[2].refused]
-        found += [one for part, _ in axes for one in part[:2]]
-        weight = np.array([1.0 / max(one.sigma, 2e-4) ** 2 for one in told])
-        if told:
-            delay = float(weight @ [one.value for one in told] / weight.sum())
-            scatter = float(np.sqrt(weight @ [(one.value - delay) ** 2 for one in told] / weight.sum()))
-        found.append(_judged("actuation.delay", delay, max(scatter, float(weight.sum() ** -0.5)), "s", "", DELAY_CERTAIN) if told
-                     else Found("actuation.delay", delay, inf, "s", "no axis tells it"))
+        found += [one for part, _ in axes for one in part]
+        sigma = float(np.hypot(np.std([one.value for one in tilt]), max(one.sigma for one in tilt))) if tilt else inf
+        found.append(_judged("actuation.delay", delay, sigma, "s", "" if tilt else "neither roll nor pitch tells it", DELAY_CERTAIN))
     if record.thrust is not None or record.rotor_speeds is not None:
         part, answer = thrust(record, vehicle, delay)
         found, answers = [*found, *part[:2], drag(record, vehicle, 0), drag(record, vehicle, 1), part[2]], [*answers, answer]
