@@ -13,6 +13,8 @@ from perch_eval import demo
 from perch_eval.campaign import command as campaign
 from perch_eval.campaign.specification import load_campaign
 from perch_eval.evaluation import command as evaluation
+from perch_eval.recordings import command as perceive
+from perch_eval.recordings import sensors_command
 from perch_eval.replay import command as replay
 from perch_sim.scenario import load_scenario
 
@@ -31,7 +33,7 @@ def start_stack_parser():
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
 PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
-           "start_stack.py": start_stack_parser}
+           "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser}
 
 
 def blocks(language):
