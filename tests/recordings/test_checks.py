@@ -1,0 +1,161 @@
+"""`scripts/sensors.py check`: what would make perception fail is named, and what is well is not."""
+
+import numpy as np
+import pytest
+
+from perch_core.sensors import load_sensors
+from perch_core.values import CameraImage
+from perch_eval.recordings import camera_check, sensors_command
+from perch_eval.recordings.check import check
+from perch_eval.recordings.evaluation import evaluate
+from perch_eval.recordings.imu_check import allan_deviation, longest_still
+from perch_eval.recordings.opening import open_recording
+from perch_eval.recordings.recording import IMU, Recording, RecordingError
+from perch_eval.recordings.trajectory import Trajectory, read_trajectory, write_tum
+
+
+@pytest.fixture(scope="module")
+def heard(files):
+    """The events of the bag with compressed images, and its sensors."""
+    sensors = load_sensors(files / "mine.yaml")
+    return list(open_recording(files / "sqlite3", sensors).events()), sensors
+
+
+class Told(Recording):
+    """Events that are at hand."""
+
+    def __init__(self, events, sensors):
+        super().__init__("told", sensors)
+        self._events = events
+        self.images = {"cam0": sum(e.source != IMU for e in events)}
+        self.samples = sum(e.source == IMU for e in events)
+
+    def events(self):
+        yield from self._events
+
+
+@pytest.fixture(autouse=True)
+def few_looks(monkeypatch):
+    """A dozen images are enough here."""
+    monkeypatch.setattr(camera_check, "LOOKED_AT", 12)
+
+
+def spoilt(heard, imu=lambda k, s: s, image=lambda k, i: i):
+    """The findings that are not `ok`, as {about: level}, of changed events; None: it is lost."""
+    events, sensors = heard
+    out, counts = [], {True: 0, False: 0}
+    for event in events:
+        felt = event.source == IMU
+        value = (imu if felt else image)(counts[felt], event.value)
+        counts[felt] += 1
+        if value is not None:
+            out.append(event._replace(value=value))
+    report = check(Told(out, sensors))
+    return {f.about: f.level for f in report.findings if f.level != "ok"}
+
+
+def pixels(change):
+    return lambda k, i: CameraImage(i.stamp, i.frame, i.width, i.height, i.encoding, change(i.pixels()))
+
+
+def times(factor):
+    return lambda k, s: s._replace(f_B=tuple(factor * x for x in s.f_B))
+
+
+def test_nothing_is_wrong_with_a_good_one(heard):
+    assert spoilt(heard) == {}
+
+
+@pytest.mark.parametrize("changes, about, level", [
+    (dict(imu=times(1 / 9.81)), "imu units", "fails"),
+    (dict(imu=times(0.0)), "imu units", "fails"),
+    (dict(imu=lambda k, s: s._replace(w_B=(3000.0, 0.0, 40.0))), "imu units", "fails"),
+    (dict(imu=lambda k, s: None if 500 < k < 530 else s), "imu gaps", "warning"),
+    (dict(imu=lambda k, s: s._replace(stamp=s.stamp - 4_500_000 * (k % 2))), "imu jitter", "warning"),
+    (dict(imu=lambda k, s: s if k % 5 == 0 else None), "imu rate", "fails"),
+    (dict(imu=lambda k, s: s._replace(stamp=s.stamp + 3600 * 10**9)), "camera cam0 clock", "fails"),
+    (dict(image=lambda k, i: CameraImage(i.stamp + 60_000_000, i.frame, i.width, i.height, i.encoding, i.pixels())), "camera cam0 clock", "fails"),
+    (dict(image=pixels(lambda p: p // 40)), "camera cam0 exposure", "fails"),
+    (dict(image=pixels(lambda p: np.full_like(p, 128))), "camera cam0 texture", "fails"),
+    (dict(image=pixels(lambda p: p[::2, ::2])), "camera cam0", "fails"),
+    (dict(image=lambda k, i: None if k % 8 else i), "camera cam0 rate", "fails"),
+])
+def test_what_is_wrong_is_named(heard, changes, about, level):
+    assert spoilt(heard, **changes).get(about) == level
+
+
+def test_blur_is_seen(heard):
+    cv2 = pytest.importorskip("cv2")
+    found = spoilt(heard, image=pixels(lambda p: cv2.GaussianBlur(p, (0, 0), 4.0)))
+    assert found.get("camera cam0 sharpness") == "warning"
+
+
+def test_the_command_says_it_by_its_exit_code(files, capsys):
+    assert sensors_command.main(["check", str(files / "mcap"), "--sensors", str(files / "mine.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert "rest" in told and "gyro noise" in told and "warning" not in told
+    assert sensors_command.main(["check", str(files / "none")]) == 2
+
+
+def test_allan_deviation_finds_the_density_and_the_walk():
+    rng, rate = np.random.default_rng(3), 200.0
+    white = 0.01 * np.sqrt(rate) * rng.standard_normal((40_000, 2))
+    tau, deviation = allan_deviation(white, rate)
+    np.testing.assert_allclose((deviation * np.sqrt(tau)[:, None])[:8], 0.01, rtol=0.05)  # sigma = N / sqrt(tau)
+    walk = np.cumsum(0.002 * np.sqrt(1 / rate) * rng.standard_normal((40_000, 2)), axis=0)
+    tau, deviation = allan_deviation(walk, rate)
+    np.testing.assert_allclose((deviation / np.sqrt(tau / 3.0)[:, None])[4:9], 0.002, rtol=0.25)  # sigma = K sqrt(tau / 3)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.2])
+def test_rest_is_seen_whatever_the_bias(bias):
+    rng, t = np.random.default_rng(4), np.arange(0.0, 6.0, 0.005)
+    imu = np.hstack([np.full((len(t), 3), bias), np.tile([1.0, 0.0, 9.8], (len(t), 1))]) + 0.02 * rng.standard_normal((len(t), 6))
+    imu[t > 3.0, 0] += 0.3 * np.sin(5.0 * t[t > 3.0])
+    first, last = longest_still((1e9 * t).astype(np.int64), imu)
+    assert first == 0 and 2.7 < t[last] < 3.3
+
+
+# -- against the truth -----------------------------------------------------------------------------------------------
+
+
+def circle(n=400):
+    t = np.linspace(0.0, 8.0, n)
+    p = np.stack([np.cos(t), np.sin(t), 0.1 * t], axis=1)
+    q = np.stack([np.zeros(n), np.zeros(n), np.sin(0.5 * t), np.cos(0.5 * t)], axis=1)
+    return Trajectory((1.7e18 + 1e9 * t).astype(np.int64), p, q)
+
+
+def test_place_and_heading_of_the_start_do_not_count_and_the_scale_does():
+    truth = circle()
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = truth.p @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T + [3.0, -2.0, 1.0]
+    yaw = np.array([0.0, 0.0, np.sin(0.35), np.cos(0.35)])
+    q = np.stack([yaw[3] * truth.q[:, 2] + yaw[2] * truth.q[:, 3], yaw[3] * truth.q[:, 3] - yaw[2] * truth.q[:, 2]], axis=1)
+    same = Trajectory(truth.stamps, turned, np.hstack([np.zeros((len(q), 2)), q]))
+    e = evaluate(same, truth)
+    assert e.ate < 1e-9 and e.final < 1e-6 and np.degrees(np.abs(e.turn).max()) < 1e-5 and abs(e.scale - 1.0) < 1e-9
+    larger = Trajectory(truth.stamps, turned[0] + 1.05 * (turned - turned[0]), same.q)
+    assert evaluate(larger, truth).scale == pytest.approx(1.05, abs=1e-6)
+    assert evaluate(larger, truth).final == pytest.approx(0.05 * np.linalg.norm(truth.p[-1] - truth.p[0]), rel=1e-6)
+
+
+def test_nees_is_three_for_errors_as_large_as_they_are_said_to_be():
+    truth, rng, sigma = circle(), np.random.default_rng(5), np.array([0.01, 0.02, 0.005])
+    noise = sigma * rng.standard_normal((len(truth), 3))
+    noise[0] = 0.0
+    e = evaluate(Trajectory(truth.stamps, truth.p + noise, truth.q), truth, np.tile(np.diag(sigma**2), (len(truth), 1, 1)))
+    assert 2.6 < np.nanmean(e.nees) < 3.4  # 1197 degrees of freedom: 3 +- 0.12 (1 sigma)
+
+
+def test_trajectories_are_read_to_the_nanosecond(tmp_path):
+    truth = circle(20)
+    write_tum(tmp_path / "a.tum", truth)
+    again = read_trajectory(tmp_path / "a.tum")
+    assert (again.stamps == truth.stamps).all()
+    np.testing.assert_allclose(again.p, truth.p, atol=1e-9)
+    rows = [f"{s},{','.join(map(str, p))},{q[3]},{q[0]},{q[1]},{q[2]},0,0,0" for s, p, q in zip(truth.stamps, truth.p, truth.q)]
+    (tmp_path / "data.csv").write_text("#timestamp, p, q\n" + "\n".join(rows))
+    np.testing.assert_allclose(read_trajectory(tmp_path / "data.csv").q, truth.q, atol=1e-9)
+    with pytest.raises(RecordingError, match="in common"):
+        evaluate(circle(), Trajectory(truth.stamps + 10**12, truth.p, truth.q))

@@ -1,0 +1,122 @@
+"""`scripts/perceive.py` on a photographed floor: what it finds is where it is, in every format; what it cannot read is refused in a line."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perch_eval.recordings import command
+from perch_eval.recordings.asl import AslRecording
+from perch_eval.recordings.trajectory import read_trajectory
+from recordings import photo_flight
+
+
+def perceive(*arguments) -> int:
+    return command.main([str(a) for a in arguments])
+
+
+def report(folder) -> dict:
+    return json.loads((folder / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def euroc(files, tmp_path_factory):
+    """What comes of a folder in which three images cannot be read."""
+    folder = tmp_path_factory.mktemp("euroc")
+    shutil.copytree(files / "asl", folder / "asl")
+    for path in sorted((folder / "asl" / "mav0" / "cam0" / "data").iterdir())[70:73]:
+        path.write_bytes(path.read_bytes()[:100])
+    assert perceive(folder / "asl", "--out", folder) == 0
+    return folder
+
+
+def test_the_motion_is_found(euroc):
+    found = report(euroc)
+    assert found["restarts"] == 0 and found["frames"]["TRACKING"] > 60
+    assert found["frames"]["BAD_IMAGE"] == 3  # a frame that cannot be read costs a frame
+    for who in ("vio", "estimator"):  # 2 m of path; the truth is of the file beside the images
+        assert found[who]["ate_rmse_m"] < 0.015 and 1.2 < found[who]["path_m"] < 4.0
+        assert found[who]["attitude_rms_deg"] < 1.5
+    assert found["vio"]["nees_position_mean"] < 9.0 and abs(found["vio"]["scale"] - 1.0) < 0.02
+
+
+def test_the_board_is_where_it_lies_and_there_is_no_wire(euroc, flight):
+    found = report(euroc)
+    assert found["target"]["found"] > 60 and found["target"]["spread_m"] < 0.02 and found["powerlines"] == 0
+    start = np.loadtxt(euroc / "vio.tum")[0]
+    heading = (Rotation.from_quat(start[4:]) * Rotation.from_quat(flight.q_WB[0]).inv()).as_euler("zyx")[0]  # VIO's against the truth's
+    pad = Rotation.from_euler("z", heading).apply(np.array([*photo_flight.PAD, 0.0]) - flight.p_WB[0])
+    seen = np.loadtxt(euroc / "target.tum")[:, 1:4] - start[1:4]
+    assert np.linalg.norm(np.median(seen, axis=0) - pad) < 0.02
+
+
+def test_the_page_shows_it(euroc):
+    page = (euroc / "report.html").read_text()
+    names = ("The path", "Error and covariance", "Biases", "Tracks", "The board", "Wires", "The sensors")
+    assert all(f"<h2>{name}</h2>" in page for name in names) and page.count("data:image/") > 12
+
+
+def test_a_bag_with_its_truth_on_a_topic(files, tmp_path):
+    assert perceive(files / "mcap", "--sensors", files / "mine.yaml", "--truth", "/truth", "--out", tmp_path,
+                    "--without", "target_localizer", "powerline_mapper") == 0
+    assert report(tmp_path)["vio"]["ate_rmse_m"] < 0.015
+    vio, true = read_trajectory(tmp_path / "vio.tum"), read_trajectory(tmp_path / "truth.tum")
+    assert true.stamps[0] == photo_flight.START and len(vio) > 80  # to the nanosecond
+
+
+def test_a_folder_of_images(flight, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "a.png"), flight.images[5])
+    (folder / "b.jpg").write_bytes(b"not an image")
+    (folder / "notes.txt").write_text("neither")
+    assert perceive(folder, "--out", tmp_path / "out") == 0
+    seen = json.loads((tmp_path / "out" / "detections.json").read_text())
+    assert list(seen) == ["a.png"] and "b.jpg" in str(report(tmp_path / "out")["problems"])
+    tags = {tag["id"]: np.array(tag["corners"]) for tag in seen["a.png"]["tags"]}
+    assert set(tags) == {0, 1, 2, 3}
+    for number, centre in enumerate(((0.2, 0.2), (0.2, -0.2), (-0.2, -0.2), (-0.2, 0.2))):  # by OpenCV's projection
+        corners = photo_flight.PAD + centre + 0.08 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+        p_WB, R_WB = photo_flight.Motion(6.0).pose(0.02 + 5 / photo_flight.IMAGE_RATE)
+        R_CW = (R_WB * photo_flight.R_BC).inv()
+        turn, place = R_CW.as_rotvec(), -R_CW.apply(p_WB + R_WB.apply(photo_flight.P_BC))
+        pixels = cv2.projectPoints(np.column_stack([corners, np.zeros(4)]), turn, place, photo_flight.K, photo_flight.DISTORTION)[0][:, 0]
+        assert np.abs(tags[number] - pixels).max() < 1.0
+
+
+def test_what_cannot_be_done_is_said_in_a_line(files, tmp_path, capsys):
+    broken, empty, elsewhere = tmp_path / "broken.mcap", tmp_path / "empty", tmp_path / "truth.tum"
+    whole = next((files / "mcap").glob("*.mcap")).read_bytes()
+    broken.write_bytes(whole[:1000])
+    empty.mkdir()
+    elsewhere.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    mine, asl = files / "mine.yaml", files / "asl"
+    for arguments, words in (
+        ((tmp_path / "none",), "no such recording"),
+        ((empty,), "is no recording"),
+        ((broken, "--sensors", mine), "cannot be read"),
+        ((files / "mcap",), "--sensors"),
+        ((asl, "--camera", "left"), "is not one of cam0"),
+        ((asl, "--truth", tmp_path / "none.tum"), "is no file"),
+        ((asl, "--truth", mine), "is no trajectory"),
+        ((asl, "--board", "none"), "unknown"),
+        ((asl, "-p", "vio.nonsense:=1"), "nonsense"),
+        ((asl, "-p", "controller.x:=1"), "is not one of"),
+    ):
+        assert perceive(*arguments, "--out", tmp_path / "out") == 2, arguments
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 1 and said[0].startswith("error: ") and words in said[0], said
+    assert perceive(asl, "--out", mine / "below") == 2
+
+
+def test_an_interrupt_leaves_no_report(files, tmp_path, monkeypatch, capsys):
+    def events(self):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(AslRecording, "events", events)
+    assert perceive(files / "asl", "--out", tmp_path) == 130
+    assert not (tmp_path / "report.html").exists() and "Traceback" not in capsys.readouterr().err

@@ -1,0 +1,139 @@
+"""Sensor files: imported from Kalibr and EuRoC without loss, strict, read by the nodes' components and by nothing of the simulator."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perch_core.errors import ConfigError
+from perch_core.sensors import CameraSensor, load_sensors
+from perch_core.values import ImuSample
+from perch_eval.recordings import sensors_command
+from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
+from perch_perception.estimator_component import StateEstimator
+from perch_perception.estimators import EstimatorConfig
+from perch_perception.imu_intake import ImuIntake
+from perch_perception.powerline_mapper import PowerlineMapper, PowerlineMapperConfig
+from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
+from perch_perception.vio_component import VioComponent, VioComponentConfig
+from recordings import photo_flight
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "config" / "sensors").glob("*.yaml")), ids=lambda p: p.stem)
+def test_what_is_shipped_can_be_read(file):
+    sensors = load_sensors(file.stem)
+    assert sensors.name == file.stem and sensors.imu is not None and sensors.mounts
+
+
+def test_kalibr_says_the_same(tmp_path):
+    sensors = from_kalibr(*photo_flight.kalibr(tmp_path), "mine")
+    mount = sensors.mounts["cam0"]
+    np.testing.assert_allclose(mount.p_BC, photo_flight.P_BC, atol=1e-9)
+    np.testing.assert_allclose(mount.R_BC, photo_flight.R_BC.as_matrix(), atol=1e-7)
+    assert mount.stamp_offset == pytest.approx(photo_flight.STAMP_OFFSET) and sensors.cameras["cam0"].topic == "/cam0/image_raw"
+    assert sensors.imu.gyro_noise == pytest.approx(photo_flight.GYRO_DENSITY * np.sqrt(200.0))
+    points = np.random.default_rng(1).uniform([-0.6, -0.4, 1.0], [0.6, 0.4, 2.0], (50, 3))
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), photo_flight.K, photo_flight.DISTORTION)[0][:, 0]
+    np.testing.assert_allclose(mount.camera.project(points)[0], expected, atol=1e-6)
+
+
+def test_an_imu_that_is_mounted_turned(tmp_path):
+    R_BI = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
+    plain, turned = (from_kalibr(*photo_flight.kalibr(tmp_path), "mine", R) for R in (np.eye(3), R_BI.as_matrix()))
+    np.testing.assert_allclose(turned.mounts["cam0"].R_BC, R_BI.as_matrix() @ plain.mounts["cam0"].R_BC, atol=1e-7)
+    np.testing.assert_allclose(turned.mounts["cam0"].p_BC, R_BI.apply(plain.mounts["cam0"].p_BC), atol=1e-9)
+    file = tmp_path / "turned.yaml"
+    file.write_text(to_yaml(turned))
+    taken = []
+    for component in (VioComponent(VioComponentConfig(sensors=str(file), camera="cam0")), StateEstimator(EstimatorConfig(sensors=str(file)))):
+        taken.append(component._intake.take(ImuSample(1, (0.1, 0.2, 0.3), (1.0, 2.0, 9.0))))
+    for sample in taken:
+        np.testing.assert_allclose(sample.f_B, R_BI.apply([1.0, 2.0, 9.0]), atol=1e-6)
+        np.testing.assert_allclose(sample.w_B, R_BI.apply([0.1, 0.2, 0.3]), atol=1e-6)
+    assert ImuIntake(print).take(ImuSample(1, (0.1, 0.2, 0.3), (1.0, 2.0, 9.0))).w_B == (0.1, 0.2, 0.3)
+
+
+def test_fisheye_of_kalibr(tmp_path):
+    chain, _ = photo_flight.kalibr(tmp_path)
+    k = [-0.01, 0.02, -0.015, 0.004]
+    chain.write_text(chain.read_text().replace("radtan", "equidistant").replace(str(photo_flight.DISTORTION.tolist()), str(k)))
+    camera = from_kalibr(chain, None, "fisheye").mounts["cam0"].camera
+    points = np.random.default_rng(2).uniform([-1.5, -1.5, 0.8], [1.5, 1.5, 1.5], (50, 3))
+    expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), photo_flight.K, np.array(k))[0][:, 0]
+    np.testing.assert_allclose(camera.project(points)[0], expected, atol=1e-6)
+
+
+def test_euroc_says_the_same(files):
+    sensors = from_asl(files / "asl" / "mav0")
+    np.testing.assert_allclose(sensors.mounts["cam0"].R_BC, photo_flight.R_BC.as_matrix(), atol=1e-7)
+    assert sensors.cameras["cam0"].rate == photo_flight.IMAGE_RATE and sensors.imu.rate == photo_flight.IMU_RATE
+    assert sensors.imu.accel_noise_density == photo_flight.ACCEL_DENSITY
+
+
+def test_what_is_written_can_be_read_again(files, tmp_path):
+    for sensors in (load_sensors(files / "mine.yaml"), load_sensors("snapdragon"), load_sensors("euroc")):
+        file = tmp_path / "again.yaml"
+        file.write_text(to_yaml(sensors, "a comment"))
+        assert load_sensors(file) == sensors
+
+
+def test_the_command(files, tmp_path, capsys):
+    out = tmp_path / "named.yaml"
+    assert sensors_command.main(["import", "euroc", str(files / "asl"), "--rename", "cam0=down", "--name", "mine", "--out", str(out)]) == 0
+    assert list(load_sensors(out).cameras) == ["down"] and load_sensors(out).name == "mine"
+    capsys.readouterr()
+    for arguments, words in ((["euroc", str(files)], "mav0"), (["kalibr", str(files / "mine.yaml")], "no cam0"),
+                             (["kalibr", str(tmp_path / "none.yaml")], "cannot be read"),
+                             (["euroc", str(files / "asl"), "--rename", "left=down"], "--rename"),
+                             (["euroc", str(files / "asl"), "--imu-orientation", "0", "0", "0", "0"], "--imu-orientation")):
+        assert sensors_command.main(["import", *arguments]) == 2
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 1 and words in said[0], said
+
+
+@pytest.mark.parametrize("old, new, words", [
+    ("camera_model: pinhole", "camera_model: omni", "camera_model"), ("distortion_model: radtan", "distortion_model: fov", "distortion_model"),
+    ("resolution: [512, 384]", "resolution: [512]", "resolution"), ("T_cam_imu", "T_other", "T_cam_imu"),
+    ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: late", "timeshift_cam_imu"), ("[300.0,", "[-300.0,", "focal"),
+    ("0.000000000000000, 1.000000000000000]", "0.000000000000000, 2.000000000000000]", "rigid")])
+def test_calibrations_that_are_none_are_refused(tmp_path, old, new, words):
+    chain, _ = photo_flight.kalibr(tmp_path)
+    assert old in chain.read_text()
+    chain.write_text(chain.read_text().replace(old, new))
+    with pytest.raises(ConfigError, match=words):
+        from_kalibr(chain, None, "mine")
+
+
+def test_components_take_everything_from_the_file(files):
+    name, sensors = str(files / "mine.yaml"), load_sensors(files / "mine.yaml")
+    vio = VioComponent(VioComponentConfig(sensors=name, camera="cam0"))
+    assert vio.config.imu.accel_noise == sensors.imu.accel_noise and vio.config.imu.integration == "instant"
+    assert vio.config.calibration.time_offset == sensors.cameras["cam0"].sigma.time_offset
+    target = TargetLocalizer(TargetLocalizerConfig(sensors=name, camera="cam0"))
+    assert target.mounted.nominal.camera == sensors.mounts["cam0"].camera
+    assert np.radians(target.config.calibration.rotation) == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
+    config = PowerlineMapperConfig(sensors=name, camera="cam0")
+    wires = PowerlineMapper(replace(config, detection=replace(config.detection, appearance="dark")))
+    assert np.radians(wires.config.mapper.triangulation.mount_rotation) == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
+    with pytest.raises(ConfigError, match="'down' of .* is not there; usable: cam0"):
+        VioComponent(VioComponentConfig(sensors=name))
+    with pytest.raises(ConfigError, match="no such file"):
+        StateEstimator(EstimatorConfig(sensors=str(files / "none.yaml")))
+
+
+def test_a_lens_without_distortion_has_none():
+    common = dict(width=640, height=480, focal=(500.0, 500.0), centre=(320.0, 240.0))
+    with pytest.raises(ConfigError, match="radtan"):
+        CameraSensor(model="pinhole", distortion=(0.1, 0.0, 0.0, 0.0), **common)
+    with pytest.raises(ConfigError, match="distortion"):
+        CameraSensor(model="equidistant", distortion=(0.1, 0.0), **common)
+
+
+def test_the_simulator_does_not_read_them():
+    sources = list((ROOT / "src" / "perch_sim").rglob("*.py"))
+    assert len(sources) > 20 and not [p for p in sources if "perch_core.sensors" in p.read_text() or "load_sensors" in p.read_text()]
