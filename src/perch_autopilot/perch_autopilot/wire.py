@@ -56,7 +56,7 @@ class Wire:
             attributes[4] = attributes[5] = speed
             termios.tcsetattr(self.file, termios.TCSANOW, attributes)
         except termios.error as error:
-            raise WireError(f"{address}: is no serial line: {error}") from None
+            raise WireError(f"{address}: is no serial line: {error.args[-1]}") from None
 
     def write(self, data: bytes) -> None:
         """Send; what the line cannot take now is lost, as a stale command would be worse.
