@@ -10,7 +10,7 @@ def test_only_own_unused_segments_are_removed(tmp_path, monkeypatch):
     shm, proc = tmp_path / "shm", tmp_path / "proc"
     monkeypatch.setattr(shared_memory, "_SEGMENT", shared_memory.re.compile(rf"({shm}/(?:sem\.)?fast(?:rtps|dds)_\S+)"))
     shm.mkdir()
-    for name in ("fastrtps_mine", "fastrtps_mine_el", "fastrtps_port1", "fastrtps_foreign", "other_mine"):
+    for name in ("fastrtps_mine", "fastrtps_mine_el", "sem.fastrtps_mine_mutex", "sem.fastrtps_port1_mutex", "fastrtps_port1", "fastrtps_foreign", "other_mine"):
         (shm / name).touch()
 
     def uses(pid: int, *names: str) -> None:
@@ -24,9 +24,9 @@ def test_only_own_unused_segments_are_removed(tmp_path, monkeypatch):
     (proc / "1" / "maps").unlink()  # process 1 is killed
 
     removed = memory.clean()
-    assert sorted(removed) == [str(shm / "fastrtps_mine"), str(shm / "fastrtps_mine_el")]
-    assert sorted(path.name for path in shm.iterdir()) == ["fastrtps_foreign", "fastrtps_port1", "other_mine"]
+    assert sorted(removed) == [str(shm / name) for name in ("fastrtps_mine", "fastrtps_mine_el", "sem.fastrtps_mine_mutex")]
+    assert sorted(path.name for path in shm.iterdir()) == ["fastrtps_foreign", "fastrtps_port1", "other_mine", "sem.fastrtps_port1_mutex"]
 
     uses(2)
-    assert memory.clean() == [str(shm / "fastrtps_port1")]
+    assert memory.clean() == [str(shm / "fastrtps_port1"), str(shm / "sem.fastrtps_port1_mutex")]
     assert memory.clean() == []

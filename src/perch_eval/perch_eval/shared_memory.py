@@ -47,7 +47,8 @@ class SharedMemory:
         used = self.used()
         removed = []
         for segment in sorted(self._seen - used):
-            for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl")):
+            mutex = Path(segment).with_name(f"sem.{Path(segment).name}_mutex")  # stays after a process that ended by itself, too
+            for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl"), mutex):
                 try:
                     file.unlink()
                     removed.append(str(file))

@@ -167,6 +167,7 @@ class Group:
                         pass
             end = time.monotonic() + patience
             while time.monotonic() < end and (running := [pid for pid in running if alive(pid)]):
+                self._memory.observe(running)
                 time.sleep(0.02)
 
     def left(self) -> tuple[str, ...]:
