@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import socket
 import struct
 import time
 
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, msp
 from perch_autopilot.configuration import differences, load_configuration
+from perch_autopilot.keeper import KeeperLink
 from perch_autopilot.rates import RateCurve, Sticks, rate_curves
 from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
 from perch_autopilot.wire import Wire, WireError
@@ -219,6 +221,22 @@ def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
             wire.read(1.0)
     finally:
         wire.close()
+
+
+def test_the_keeper_speaks_without_a_node_opens_the_wire_again_and_ends_with_the_motors_off():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20.0)
+        link = KeeperLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", WatchdogSettings(), 1450, 1420)
+        frame = msp.channels((1500, 1500, 1000, 1500, OFF, OFF))
+        for _ in range(2):  # the first wire ends; the keeper opens another
+            with server.accept()[0] as wire:
+                wire.settimeout(20.0)
+                got = b""
+                while len(got) < 5 * len(frame):
+                    got += wire.recv(4096)
+                assert got[:4 * len(frame)] == 4 * frame
+        link.close()
+        assert link.process.wait(20.0) == 0
 
 
 # -- configuration ---------------------------------------------------------------------------------------------------

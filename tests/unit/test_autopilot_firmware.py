@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from perch_autopilot import firmware, msp
+from perch_autopilot import firmware, msp, sitl
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, Configuration, load_configuration
 from perch_autopilot.loop import FirmwareLoop
-from perch_autopilot.namespace import NamespaceError
+from perch_autopilot.namespace import IsolatedProgram, NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
 from perch_autopilot.watchdog import OFF, ON
 from perch_core.component import Output, ports
@@ -84,9 +85,9 @@ def test_a_wall_is_perched_on_through_the_firmware():
 
 def test_the_configuration_is_read_back_and_what_differs_is_named():
     loaded = load_configuration("betaflight")
-    sitl = started(lambda: Sitl(loaded))
+    running = started(lambda: Sitl(loaded))
     try:
-        cli = Cli(sitl.send, sitl.receive)
+        cli = Cli(running.send, running.receive)
         cli.check(loaded)
         wrong = Configuration("mine.txt", (*loaded.lines, "set p_roll = 1"))
         with pytest.raises(CliError, match="p_roll is 180, not 1"):
@@ -94,7 +95,30 @@ def test_the_configuration_is_read_back_and_what_differs_is_named():
         with pytest.raises(CliError, match="mine.txt: set no_such = 1: the firmware refuses it"):
             cli.apply(Configuration("mine.txt", ("set no_such = 1",)))
     finally:
-        sitl.close()
+        running.close()
+
+
+def test_a_firmware_that_freezes_is_named_in_flight_and_started_again_before_it(tmp_path, monkeypatch):
+    loaded = load_configuration("betaflight")
+    running = started(lambda: Sitl(loaded))
+    try:
+        running._running.received.settimeout(0.05)
+        running._running.process.send_signal(signal.SIGSTOP)
+        with pytest.raises(sitl.Frozen, match="has not answered 5 packets"):
+            for _ in range(100):  # what it had begun it may answer
+                running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
+    finally:
+        running.close()
+    program, launched = tmp_path / "asleep", []
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
+    program.chmod(0o700)
+    (tmp_path / f"{loaded.identity}.eeprom").touch()
+    monkeypatch.setattr(firmware, "found", lambda: program)
+    monkeypatch.setattr(sitl, "_START", 0.1)
+    monkeypatch.setattr(sitl, "IsolatedProgram", lambda *words: launched.append(IsolatedProgram(*words)) or launched[-1])
+    with pytest.raises(sitl.Frozen, match="does not open its port"):
+        Sitl(loaded)
+    assert len(launched) == 4 and all(one.process.poll() is not None for one in launched)
 
 
 # -- the node's component, over the firmware's MSP ---------------------------------------------------------------------
