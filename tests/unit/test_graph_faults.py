@@ -75,6 +75,8 @@ def row(**changes) -> dict:
 @pytest.mark.parametrize("changes, problem", [
     ({}, []), ({"end": "in flight"}, ["ended in flight"]), ({"named": None}, ["not named"]), ({"named": 7.0}, ["named after 7.0 s"]),
     ({"left": ["process 7"]}, ["left: process 7"]), ({"ended": ["mission"]}, ["mission ended, too"]),
+    ({"fault": "drop", "goal": "perched: perched", "end": "perched", "named": None}, []),
+    ({"fault": "drop", "goal": "missed", "end": "hovering", "named": None}, ["not named"]),
     ({"struck": None}, ["the flight ended before the fault: g"])])
 def test_what_is_not_as_it_should_be_is_said(changes, problem):
     assert campaign.problems(row(**changes)) == problem
