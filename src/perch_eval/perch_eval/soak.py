@@ -166,7 +166,9 @@ def verdicts(flights: Sequence[Flight]) -> list[str]:
     for name, of in growth(flights).items():
         if of["slope_MB_per_100"] is not None and of["slope_MB_per_100"] > BAR:
             found.append(f"{name}: memory grows by {of['slope_MB_per_100']:.2f} MB per 100 flights")
-        found += [f"{name}: {what} between {low} and {high}" for what in ("descriptors", "threads") for low, high in (of[what],) if low != high]
+        for what in ("descriptors", "threads"):
+            low, high = of[what]
+            found += [f"{name}: {what} between {low} and {high}"] if low != high else []
     return found
 
 
@@ -204,14 +206,16 @@ def page(folder: Path) -> str:
         sight = "with cameras" if run["cameras"] else "without cameras (error models in their place)"
         minutes = run["flights"][-1]["time"] / 60.0
         text += ["", f"## {file.stem}", "", f"`{run['scenario']}`, seed {run['seed']}, {sight}; {run['commit']}, {run['machine']}.",
-                 f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in {run['wall_s'] / 60.0:.1f} min.",
+                 f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in "
+                 f"{run['wall_s'] / 60.0:.1f} min.",
                  "", "| process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads |", "| --- " * 6 + "|"]
         for name, of in run["growth"].items():
             rate = "too few flights" if of["slope_MB_per_100"] is None else f"{of['slope_MB_per_100']:+.2f}"
             text.append(f"| {name} | {of['rss_first_MB']:.1f} | {of['rss_last_MB']:.1f} | {rate} | " + " | ".join(
                 f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])) + " |")
         shared = [flight["shared"] for flight in run["flights"]]
-        verdict = ["Not as it should be:", "", *(f"* {problem}" for problem in run["problems"])] if run["problems"] else ["All as it should be."]
+        bad = [f"* {problem}" for problem in run["problems"]]
+        verdict = ["Not as it should be:", "", *bad] if bad else ["All as it should be."]
         text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)"]
     return "\n".join(text) + "\n"
 

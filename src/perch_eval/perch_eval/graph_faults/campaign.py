@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import subprocess
 import sys
@@ -95,7 +94,6 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
             folder = logs / case.name.replace(", ", "_").replace(" ", "_")
             for old in folder.glob("*.log"):
                 old.unlink()
-            gc.collect()  # goals of the flight before are cycles that hold its DDS participant
             try:
                 row = fly(case, nursery, folder, commit()).as_json()
             except PerchError as error:
@@ -155,21 +153,22 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
             + f" on {machine()}.", "",
             f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
-            f"* **{len(told)} of {len(struck) - len(through)} are named within {NAMED:g} s** of the wall clock: a node, or who sent the goal, says who or",
-            "  whose messages are missing. The node that was struck is no witness, and what starts the processes is none.",
+            f"* **{len(told)} of {len(struck) - len(through)} are named within {NAMED:g} s** of the wall clock: a node, or who sent the",
+            "  goal, says who or whose messages are missing. The node that was struck is no witness, and what starts the processes is none.",
             f"  Not counted: {len(through)} flights whose messages were disturbed and that perched as if they had not been.",
-            f"* **{len(clean)} of {len(rows)} leave nothing**: no process, no socket of the lockstep, no shared memory when all were stopped.",
+            f"* **{len(clean)} of {len(rows)} leave nothing**: no process, no socket of the lockstep, no shared memory in the end.",
             f"* {lost} of those that end safely hit the floor with more than {FALL:g} m/s.",
             f"* In {sum(bool(row['ended']) for row in rows)} flights a node that was not struck ended.",
-            "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those that do",
-            "not look at images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
-            "(`perch_eval.modelled_sight_node`). Processes are forked from one that has loaded the code: a restart takes less than a second.",
-            "In lockstep a node that hangs is waited for 8 s instead of 60; a plan begins 1.5 s after its request instead of 0.1. The end is",
-            "judged by the truth, for a hover by the controller's state, too, when it has lasted for 4 s. *motors off*: on the ground after a",
-            "fall, or lying tilted; without a controller nobody else can hold the vehicle.", "",
+            "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
+            "that do not look at images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
+            "(`perch_eval.modelled_sight_node`). Processes are forked from one that has loaded the code: a restart is quick.",
+            "In lockstep a node that hangs is waited for 8 s instead of 60; a plan begins 1.5 s after its request instead of 0.1. The end",
+            "is judged by the truth, for a hover by the controller's state, too, when it has lasted for 4 s. *motors off*: on the ground",
+            "after a fall, or lying tilted; without a controller nobody else can hold the vehicle.", "",
             "| fault | what happens |", "| --- | --- |", *(f"| {name} | {about} |" for name, about in FAULTS.items()), "",
-            "Messages are disturbed by a relay between publisher and subscribers, which lockstep does not have (its batches go over sockets",
-            f"of their own): in real time only. Phases: {', '.join(PHASES)}; messages are disturbed in search and approach, from then on.", ""]
+            "Messages are disturbed by a relay between publisher and subscribers, which lockstep does not have (its batches go over",
+            f"sockets of their own): in real time only. Phases: {', '.join(PHASES)}; messages are disturbed in search and approach, from",
+            "then on.", ""]
     for mode in MODES:
         nodes = list(dict.fromkeys(case.node for case in cases() if case.mode == mode))
         text += [f"## Ends, {mode}", "", "| fault | " + " | ".join(nodes) + " |", "| --- " * (len(nodes) + 1) + "|"]

@@ -47,8 +47,8 @@ WORDS = {
     "mission": r"mission|trajectory|order",
 }
 """What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
-_TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|restarted|back)\b",
-                      re.IGNORECASE)
+_TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|"
+                      r"restarted|back)\b", re.IGNORECASE)
 _LINE = re.compile(r"\[(?P<level>[A-Z]+)\] \[(?P<time>\d{9,}\.\d+)\] \[(?P<node>[\w.]+)\]: (?P<text>.*)")
 
 

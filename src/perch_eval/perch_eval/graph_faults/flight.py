@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -175,7 +176,8 @@ class Group:
         end, seen = time.monotonic() + GOING, self._memory.seen
         while True:  # threads of a process that has ended may hold what it had open for a moment
             self._memory.clean()
-            found = (*(f"process {pid}" for leader in self._sessions for pid in session(leader)), *self._sockets(), *self._shared_memory(seen))
+            processes = [f"process {pid}" for leader in self._sessions for pid in session(leader)]
+            found = (*processes, *self._sockets(), *self._shared_memory(seen))
             if not found or time.monotonic() > end:
                 return found
             time.sleep(0.1)
@@ -307,6 +309,7 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
         finally:
             group.stop()
             pilot.close()
+            gc.collect()  # a goal is a cycle that holds the pilot's DDS participant
             left = group.left()
     found = named(case, director.struck, group.lines(), director.said) if director.struck is not None else None
     touched = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
