@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import hypot
 
 from perch_core.component import Component, Input, Output, Wake
 from perch_core.config import quantity, text
@@ -41,7 +43,7 @@ class Description(Component[DescriptionParameters]):
         super().__init__(config)
         self._vehicle = load_vehicle(config.vehicle)
         self._period = round(NANOSECONDS / config.rate)
-        self._next = -1
+        self._next = self._ahead = -1
         self._target: tuple[tuple[float, ...], tuple[float, ...]] | None = None
         self._told = False
 
@@ -62,13 +64,26 @@ class Description(Component[DescriptionParameters]):
         if state.frame not in (MAP, ODOM):
             self.warn(f"odometry in frame {state.frame!r} is not used: neither {MAP} nor {ODOM}", every=1.0)
             return
+        if self._next >= 0 and state.stamp > self._next + NANOSECONDS and not 0 < state.stamp - self._ahead < NANOSECONDS:
+            self._ahead = state.stamp  # a reader of /tf that has seen the future believes nothing else; where two agree, time has jumped
+            self.warn(f"odometry: stamp {state.stamp} ns is ahead of the others: ignored", every=1.0)
+            return
         late = self._next >= 0 and state.stamp < self._next + self._period
         self._next = (self._next if late else state.stamp) + self._period
-        self.frames(StampedTransform(state.stamp, ODOM, BASE, tuple(state.p_WB), tuple(state.q_WB)))
+        self.frames(StampedTransform(state.stamp, ODOM, BASE, tuple(state.p_WB), _unit(state.q_WB)))
 
     def on_target(self, pose: TargetPose) -> None:
         """The target, whenever it is believed to be elsewhere."""
-        p, q = tuple(map(float, pose.p_WS)), tuple(map(float, pose.q_WS))
+        if self._next >= 0 and pose.stamp > self._next + NANOSECONDS:
+            self.warn(f"target/pose: stamp {pose.stamp} ns is ahead of the odometry: ignored", every=1.0)
+            return
+        p, q = tuple(map(float, pose.p_WS)), _unit(pose.q_WS)
         if (p, q) != self._target:
             self._target = p, q
             self.frames(StampedTransform(pose.stamp, MAP, TARGET, p, q))
+
+
+def _unit(q: Sequence[float]) -> tuple[float, ...]:
+    """A quaternion whose norm is 1 but for rounding, normalised."""
+    norm = hypot(*q)
+    return tuple(float(x) / norm for x in q) if abs(norm - 1.0) > 1e-9 else tuple(map(float, q))

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from perch_core.ros.late_service import WAITING
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 
 class GoalServer(ActionServer):
@@ -27,8 +29,9 @@ class GoalServer(ActionServer):
             accept: says whether a goal is accepted.
         """
         self._begin = begin
-        super().__init__(node, action, name, self._refuse_to_wait, goal_callback=accept,
-                         cancel_callback=lambda _: CancelResponse.ACCEPT)
+        kept = QoSProfile(depth=WAITING)
+        super().__init__(node, action, name, self._refuse_to_wait, goal_callback=accept, cancel_callback=lambda _: CancelResponse.ACCEPT,
+                         goal_service_qos_profile=kept, result_service_qos_profile=kept, cancel_service_qos_profile=kept)
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
         """Start the goal; rclpy calls this when it is accepted."""

@@ -6,6 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+WAITING = 1000
+"""Requests, and answers that were not yet taken by who asked; ROS keeps ten, and drops the others without a word."""
 
 
 class LateService:
@@ -26,7 +30,7 @@ class LateService:
         """
         self._take = take
         self._requests: dict[int, Any] = {}  # by the identity of the empty response that stands for the answer
-        self._service = node.create_service(srv_type, name, self._receive)
+        self._service = node.create_service(srv_type, name, self._receive, qos_profile=QoSProfile(depth=WAITING))
         self._send = self._service.send_response
         self._service.send_response = self._keep_header
 

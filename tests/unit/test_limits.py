@@ -1,0 +1,79 @@
+"""What may enter: each kind of limit, the door before every component, and the page that says so."""
+
+from __future__ import annotations
+
+from math import inf, nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perch_core.component import Component, Input
+from perch_core.errors import ConfigError
+from perch_core.ros import topics
+from perch_core.values import ImuSample, MappedPowerline, OdometryState, PerchGoal, PowerlineMap, limits
+from perch_eval.limits_page import page
+
+ROOT = Path(__file__).resolve().parents[2]
+IMU = ImuSample(0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.81))
+ODOMETRY = OdometryState(0, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, np.eye(6), np.eye(6))
+LINE = MappedPowerline(1, (0.0, 0.0, 3.0), (1.0, 0.0, 3.0), 0.01, np.eye(3), 0.1, 5)
+UNEVEN = np.eye(3) + np.triu(np.ones((3, 3)), 1)
+
+
+@pytest.mark.parametrize("value, said", [
+    (IMU, ""), (ODOMETRY, ""), (PowerlineMap(0, (LINE,) * 500, False, ""), ""), (PerchGoal(), ""),
+    (IMU._replace(f_B=(0.0, nan, 0.0)), "f_B: nan is not finite"), (IMU._replace(w_B=(101.0, 0.0, 0.0)), "w_B: 101 is outside [-100, 100] rad/s"),
+    (IMU._replace(w_B=(0.0, 0.0)), "w_B: shape (2,) is not 3"), (IMU._replace(frame="x" * 300), "frame: 'xxx"),
+    (ODOMETRY._replace(q_WB=(0.0, 0.0, 0.0, 1.01)), "q_WB: norm 1.0100 is not 1"), (ODOMETRY._replace(p_WB=(0.0, inf, 0.0)), "p_WB: inf is not finite"),
+    (ODOMETRY._replace(pose_covariance=-np.eye(6)), "pose_covariance: a variance of -1 is negative"), (ODOMETRY._replace(twist_covariance=-np.eye(6)), ""),
+    (ODOMETRY._replace(twist_covariance=np.full((6, 6), nan)), "twist_covariance: an entry of nan is not finite"),
+    (PowerlineMap(0, (LINE,) * 501, False, ""), "lines: 501 entries are more than 500"),
+    (PowerlineMap(0, (LINE, LINE._replace(covariance=UNEVEN)), False, ""), "lines[1].covariance: is not symmetric"),
+    (PerchGoal(takeoff_height=0.1), "takeoff_height: 0.1 is outside [0.3, 10] m"), (PerchGoal(attempts=10**6), "attempts: 1e+06 is outside"),
+    ("a value without limits", "")])
+def test_a_value_is_refused_with_field_value_and_range(value, said):
+    assert limits.problem(value).startswith(said) and bool(limits.problem(value)) == bool(said)
+
+
+def test_a_request_is_refused_with_its_source():
+    with pytest.raises(ConfigError, match=r"request: lines\[0\].radius: 3 is outside \[0.0001, 1\] m"):
+        limits.check("request", PowerlineMap(0, (LINE._replace(radius=3.0),), False, ""))
+
+
+class Taker(Component[None]):
+    """Keeps what it gets."""
+
+    imu = Input(ImuSample, "imu/data_raw")
+    answered = Input(OdometryState, "odometry", answered=True)
+
+    def __init__(self):
+        super().__init__(None)
+        self.got, self.said = [], []
+        self.log.receivers.append(self.said.append)
+
+    def on_imu(self, value):
+        self.got.append(value)
+
+    def on_answered(self, value):
+        self.got.append(value)
+
+
+def test_nonsense_does_not_pass_the_door_unless_it_is_answered():
+    taker = Taker()
+    bad = IMU._replace(f_B=(nan, 0.0, 0.0)), ODOMETRY._replace(p_WB=(nan, 0.0, 0.0))
+    for port in (Taker.imu, Taker.answered):
+        handle = port.handler(taker)
+        for value in (IMU, *bad):
+            if isinstance(value, port.value):
+                handle(value)
+    assert taker.got == [IMU, bad[1]]
+    assert [(line.level, line.text) for line in taker.said] == [("warning", "imu/data_raw: f_B: nan is not finite: refused")]
+
+
+def test_a_message_is_measured_before_it_is_read():
+    with pytest.raises(Exception, match="bytes are more than 1048576"):
+        topics.topic("trajectory").read(bytes(1 << 20) + b"\0")
+
+
+def test_the_page_is_what_the_declarations_say():
+    assert (ROOT / "docs" / "limits.md").read_text() == page(), "python3 scripts/limits.py writes it"
