@@ -31,8 +31,13 @@ class Report:
         self.problems: list[str] = []
         self._folder, self._out, self._period = cases / kind, out or sys.stderr, period
         self._counts: Counter[str] = Counter()
+        self._minutes = minutes
+        self.begin()
+
+    def begin(self) -> None:
+        """Time counts from now on: what a hunt needs has been prepared."""
         self._began = self._shown = time.monotonic()
-        self._end = self._began + 60.0 * minutes
+        self._end = self._began + 60.0 * self._minutes
 
     def going(self) -> bool:
         """Whether there is time for another input."""

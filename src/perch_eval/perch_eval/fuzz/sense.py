@@ -19,20 +19,21 @@ MAY_BE_ABSENT = {PerchFeedback: {"time_to_contact"}, PerchResult: {"contact_time
 """Fields that are NaN or infinite where there is nothing to tell."""
 
 
-def nonsense(value: Any, speed_max: float, place: str = "") -> Iterator[str]:
+def nonsense(value: Any, speed_max: float, place: str = "", turned: float = 1e-6) -> Iterator[str]:
     """What is wrong with a value that a component has emitted.
 
     Args:
         value: as emitted.
         speed_max: greatest rotor speed of the vehicle [rad/s].
         place: of it, for words.
+        turned: how far the norm of a quaternion may be from 1.
     """
     if isinstance(value, np.ndarray):
         if value.dtype == object or not np.isfinite(value).all():
             yield f"{place}: not finite"
         elif "covariance" in place.rpartition(".")[2]:
             yield from _covariance(value, place)
-        elif _is_attitude(place) and value.shape[-1:] == (4,) and np.abs(np.linalg.norm(value, axis=-1) - 1.0).max() > 1e-6:
+        elif _is_attitude(place) and value.shape[-1:] == (4,) and np.abs(np.linalg.norm(value, axis=-1) - 1.0).max() > turned:
             yield f"{place}: norm {np.linalg.norm(value, axis=-1)} is not 1"
     elif isinstance(value, (bool, enum.Enum)) or value is None:
         return
@@ -46,15 +47,15 @@ def nonsense(value: Any, speed_max: float, place: str = "") -> Iterator[str]:
         names = value._fields if hasattr(value, "_fields") else [item.name for item in dataclasses.fields(value) if item.init]
         for name in names:
             if name not in MAY_BE_ABSENT.get(type(value), ()):
-                yield from nonsense(getattr(value, name), speed_max, f"{place}.{name}")
+                yield from nonsense(getattr(value, name), speed_max, f"{place}.{name}", turned)
         if isinstance(value, MotorCommand) and not all(0.0 <= speed <= 1.001 * speed_max for speed in value.rotor_speed):
             yield f"{place}: rotor speeds {value.rotor_speed} are outside [0, {speed_max:.0f}]"
     elif isinstance(value, (tuple, list)):
         if _is_attitude(place) and len(value) == 4 and all(isinstance(x, float) for x in value):
-            yield from nonsense(np.array(value), speed_max, place)
+            yield from nonsense(np.array(value), speed_max, place, turned)
         else:
             for entry in value:
-                yield from nonsense(entry, speed_max, place)
+                yield from nonsense(entry, speed_max, place, turned)
 
 
 def _is_attitude(place: str) -> bool:
