@@ -22,6 +22,7 @@ setup(
     entry_points={
         "console_scripts": [
             "betaflight = perch_autopilot.betaflight_node:main",
+            "mavlink = perch_autopilot.mavlink_node:main",
         ],
     },
 )

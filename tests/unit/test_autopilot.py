@@ -130,9 +130,10 @@ def test_changes_of_axes_agree_with_scipy_and_are_their_own_inverse(v, R):
     q = frames.attitude(R.as_quat())
     assert (NED * R * FRD.inv() * Rotation.from_quat(q).inv()).magnitude() < 1e-6 and q[3] >= 0.0
     assert (Rotation.from_quat(frames.attitude(q)) * R.inv()).magnitude() < 1e-6
-    for turn, axes in ((frames.world_covariance, NED.as_matrix()), (frames.body_covariance, FRD.as_matrix())):
-        P = np.outer(v, v) + np.diag([1.0, 2.0, 3.0])
-        assert turn(P) == pytest.approx(axes @ P @ axes.T)
+    for axes, name in ((NED.as_matrix(), frames.WORLD), (FRD.as_matrix(), frames.BODY)):
+        x = np.r_[v, 2 * v + 1.0]
+        turned = np.r_[axes @ x[:3], axes @ x[3:]]
+        assert frames.covariance(np.outer(x, x), name) == pytest.approx(np.outer(turned, turned))
 
 
 # -- watchdog --------------------------------------------------------------------------------------------------------

@@ -15,14 +15,24 @@ import numpy as np
 _H = sqrt(0.5)
 
 
+WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+BODY = np.diag([1.0, -1.0, -1.0])
+
+
 def world(v: np.ndarray) -> np.ndarray:
     """A vector of the world, ENU <-> NED; any unit."""
-    return np.array([v[1], v[0], -v[2]])
+    return WORLD @ v
 
 
 def body(v: np.ndarray) -> np.ndarray:
     """A vector of the body, FLU <-> FRD; any unit."""
-    return np.array([v[0], -v[1], -v[2]])
+    return BODY @ v
+
+
+def covariance(P: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Covariance of two vectors, shape (6, 6), both in the axes that are changed by `WORLD` or `BODY`."""
+    both = np.kron(np.eye(2), axes)
+    return both @ P @ both.T
 
 
 def attitude(q: np.ndarray) -> np.ndarray:
@@ -33,16 +43,3 @@ def attitude(q: np.ndarray) -> np.ndarray:
     x, y, z, w = q
     turned = _H * np.array([x + y, x - y, w - z, w + z])
     return turned if turned[3] >= 0.0 else -turned
-
-
-def world_covariance(covariance: np.ndarray) -> np.ndarray:
-    """Covariance of a vector of the world, shape (3, 3), ENU <-> NED."""
-    order = [1, 0, 2]
-    sign = np.array([1.0, 1.0, -1.0])
-    return covariance[np.ix_(order, order)] * np.outer(sign, sign)
-
-
-def body_covariance(covariance: np.ndarray) -> np.ndarray:
-    """Covariance of a vector of the body, shape (3, 3), FLU <-> FRD."""
-    sign = np.array([1.0, -1.0, -1.0])
-    return covariance * np.outer(sign, sign)

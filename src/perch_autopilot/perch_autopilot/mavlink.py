@@ -1,0 +1,200 @@
+"""Component of the node `mavlink`: an autopilot that speaks MAVLink 2 (PX4, ArduPilot) follows body rates and thrust.
+
+| to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm) |
+| --- | --- |
+| from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT |
+
+Where commands cease, so do set points: the autopilot's own failsafe for their loss then counts. The messages are those of `pymavlink`, an
+optional extra (requirements/autopilot.lock).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
+from perch_core.config import quantity, text
+from perch_core.errors import PerchError
+from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
+from perch_core.vehicle import load_vehicle
+from perch_autopilot import frames
+from perch_autopilot.offboard import Ask, Offboard
+from perch_autopilot.wire import Wire, WireError
+
+_STALE = 100_000_000                 # a command that is older is not sent any more [ns]
+_RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
+_COMMANDS = {176: "the mode", 400: "arming"}
+_IGNORE_ATTITUDE = 128               # of SET_ATTITUDE_TARGET's type_mask: rates and thrust count
+
+
+@dataclass(frozen=True, kw_only=True)
+class MavlinkParameters:
+    """Parameters of the node `mavlink`; all are read once, at the start."""
+
+    vehicle: str = text("snapdragon_rates", doc="config/vehicles/<name>.yaml, or a file")
+    wire: str = text("/dev/ttyACM0@921600", doc="/dev/ttyACM0@921600, tcp:HOST:PORT")
+    system: int = quantity(1, low=1, high=255, doc="the autopilot's system id; ours is the same, with the component of a companion computer")
+
+
+class ClockOffset:
+    """The autopilot's clock against the host's, by TIMESYNC: of several exchanges the one with the shortest way counts.
+
+    Attributes:
+        offset: host's time - autopilot's [ns]; None: unknown.
+    """
+
+    def __init__(self) -> None:
+        self.offset: int | None = None
+        self._way = float("inf")
+
+    def answered(self, sent: int, theirs: int, now: int) -> None:
+        """An answer to a request that was sent at a host's time, stamped by the autopilot, came now [ns]."""
+        way = now - sent
+        if not 0 <= way < NANOSECONDS:
+            return
+        self._way *= 1.02  # clocks drift: an old exchange counts less and less
+        if way <= self._way or (self.offset is not None and abs((sent + now) // 2 - theirs - self.offset) > way + NANOSECONDS // 10):
+            self._way, self.offset = way, (sent + now) // 2 - theirs
+
+
+class Mavlink(Component[MavlinkParameters]):
+    """Commands an autopilot over MAVLink.
+
+    Attributes:
+        offboard: on the way to flying.
+    """
+
+    config_type = MavlinkParameters
+
+    rates_thrust = Input(RatesThrust, "rates_thrust_command")
+    odometry = Input(OdometryState, "odometry")
+    poll = Wake(0.005)
+    imu = Output(ImuSample, "imu/data_raw")
+
+    def __init__(self, config: MavlinkParameters) -> None:
+        """
+        Raises:
+            ConfigError: there is no such vehicle.
+            WireError: the wire cannot be opened.
+            PerchError: pymavlink is not installed.
+        """
+        super().__init__(config)
+        try:
+            from pymavlink.dialects.v20 import common
+        except ImportError:
+            raise PerchError("the node mavlink needs pymavlink (an optional extra): pip install pymavlink==2.4.50") from None
+        vehicle = load_vehicle(config.vehicle)
+        self._thrust_max = 4.0 * vehicle.thrust_max / vehicle.mass
+        self._wire = Wire(config.wire)
+        self._mavlink = common.MAVLink(None, srcSystem=config.system, srcComponent=191)  # MAV_COMP_ID_ONBOARD_COMPUTER
+        self._mavlink.robust_parsing = True
+        self.offboard, self._clock = Offboard(), ClockOffset()
+        self._command: RatesThrust | None = None
+        self._now = self._came = self._second = 0
+        self._torn = 0
+
+    # -- to the autopilot --------------------------------------------------------------------------------------------
+
+    def on_rates_thrust(self, command: RatesThrust) -> None:
+        """Sent with the next poll, until it is stale."""
+        if not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
+            self.warn("rates_thrust_command: not finite, or beyond any vehicle: ignored", every=1.0)
+            return
+        self._command, self._came = command, self._now
+
+    def on_odometry(self, state: OdometryState) -> None:
+        """On to the autopilot's own estimator, in its axes."""
+        mavlink = self._mavlink
+        x, y, z = frames.world(state.p_WB)
+        vx, vy, vz = frames.body(state.v_B)
+        p, q, r = frames.body(state.w_B)
+        i, j, k, w = frames.attitude(np.array(state.q_WB))
+        self._send(mavlink.odometry_encode(
+            (state.stamp - (self._clock.offset or 0)) // 1000, 1, 12, x, y, z, (w, i, j, k), vx, vy, vz, p, q, r,  # LOCAL_NED, BODY_FRD
+            _upper(state.pose_covariance, frames.WORLD), _upper(state.twist_covariance, frames.BODY)))
+
+    def _send(self, message: Any) -> None:
+        try:
+            self._wire.write(message.pack(self._mavlink))
+            self._mavlink.seq = (self._mavlink.seq + 1) % 256
+        except WireError as error:
+            self.log(LogLine("error", str(error), 1.0))
+
+    def _target(self, command: RatesThrust) -> None:
+        rates = frames.body(np.array(command.w_B)) if command.armed else np.zeros(3)
+        thrust = min(max(command.thrust / self._thrust_max, 0.0), 1.0) if command.armed else 0.0
+        self._send(self._mavlink.set_attitude_target_encode(0, self.config.system, 1, _IGNORE_ATTITUDE, (1.0, 0.0, 0.0, 0.0), *rates, thrust))
+
+    # -- from it -----------------------------------------------------------------------------------------------------
+
+    def on_poll(self, now: int) -> None:
+        """Take what has come; send the command while it is fresh; once a second what keeps the connection."""
+        self._now = now
+        try:
+            for message in self._mavlink.parse_buffer(self._wire.read()) or ():
+                self._take(message, now)
+        except WireError as error:
+            self.log(LogLine("error", str(error), 1.0))
+        command = self._command
+        fresh = command is not None and 0 <= now - self._came <= _STALE
+        if fresh:
+            self._target(command)
+        ask = self.offboard.ask(now * 1e-9, fresh and command.armed, fresh)
+        if ask is Ask.MODE:
+            self._order(176, 1.0, *_mode_words(self.offboard.mode))                    # MAV_CMD_DO_SET_MODE
+        elif ask is not Ask.NOTHING:
+            self._order(400, 1.0 if ask is Ask.ARM else 0.0)                           # MAV_CMD_COMPONENT_ARM_DISARM
+        if now - self._second >= NANOSECONDS:
+            self._second = now
+            self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
+            self._send(self._mavlink.timesync_encode(0, now))
+            self._diagnose(now)
+
+    def _order(self, command: int, *words: float) -> None:
+        self._send(self._mavlink.command_long_encode(self.config.system, 1, command, 0, *words, *(0.0,) * (7 - len(words))))
+
+    def _take(self, message: Any, now: int) -> None:
+        kind = message.get_type()
+        if kind == "BAD_DATA":
+            self._torn += 1
+        elif message.get_srcSystem() != self.config.system:
+            return
+        elif kind == "HEARTBEAT" and message.get_srcComponent() == 1:
+            self.offboard.heartbeat(now * 1e-9, message.autopilot, message.base_mode, message.custom_mode)
+        elif kind == "HIGHRES_IMU" and self._clock.offset is not None:
+            f, w = (message.xacc, message.yacc, message.zacc), (message.xgyro, message.ygyro, message.zgyro)
+            self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(frames.body(w).tolist()), tuple(frames.body(f).tolist())))
+        elif kind == "TIMESYNC":
+            if message.tc1 == 0:
+                self._send(self._mavlink.timesync_encode(now, message.ts1))
+            else:
+                self._clock.answered(message.ts1, message.tc1, now)
+        elif kind == "COMMAND_ACK" and message.command in _COMMANDS and message.result not in (0, 5):
+            word = _RESULTS[message.result] if message.result < len(_RESULTS) else str(message.result)
+            self.log(LogLine("error", f"the autopilot refuses {_COMMANDS[message.command]}: {word}", 1.0))
+        elif kind == "STATUSTEXT":
+            said = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
+            self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {said}", 1.0))
+
+    def _diagnose(self, now: int) -> None:
+        alive = self.offboard.alive(now * 1e-9)
+        self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following, "torn_frames": self._torn,
+                                           "clock_offset_s": (self._clock.offset or 0) * 1e-9},
+                                     0 if alive else 2, "ok" if alive else "no heartbeat of the autopilot"))
+
+    def close(self) -> None:
+        """Close the wire; the autopilot's failsafe for the loss of set points counts from now on."""
+        self._wire.close()
+
+
+def _mode_words(mode: int) -> tuple[float, ...]:
+    """Custom mode of MAV_CMD_DO_SET_MODE: PX4 takes main and sub mode apart, ArduPilot one number."""
+    return (float(mode >> 16 & 255), float(mode >> 24 & 255)) if mode >> 16 else (float(mode),)
+
+
+def _upper(covariance: np.ndarray, axes: np.ndarray) -> list[float]:
+    """Upper triangle, row by row, of a covariance in other axes."""
+    return frames.covariance(covariance, axes)[np.triu_indices(6)].tolist()

@@ -1,0 +1,7 @@
+"""Node `mavlink`: `ros2 run perch_autopilot mavlink`."""
+
+from perch_autopilot.mavlink import Mavlink
+from perch_core.ros.node import node
+
+NODE = node("mavlink", Mavlink)
+create, main = NODE.create, NODE.main

@@ -1,0 +1,87 @@
+"""How an autopilot that speaks MAVLink is brought to follow: set points first, then its mode, then its motors. Pure: time is given to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+PX4, ARDUPILOT = 12, 3              # MAV_AUTOPILOT
+ARMED = 128                         # MAV_MODE_FLAG_SAFETY_ARMED
+OFFBOARD, GUIDED_NOGPS = 6 << 16, 20  # custom modes: PX4's main mode, ArduPilot's copter mode
+SETTLED = 0.5                       # set points are sent for so long before the mode is asked for; PX4 wants more than 2 Hz [s]
+AGAIN = 1.0                         # between two requests for the same [s]
+SILENT = 2.0                        # without a heartbeat for so long the autopilot is gone [s]
+
+
+class Ask(Enum):
+    """What to ask of the autopilot."""
+
+    NOTHING = 0
+    MODE = 1
+    ARM = 2
+    DISARM = 3
+
+
+@dataclass
+class Offboard:
+    """State of the way into offboard (PX4) or guided (ArduPilot) flight.
+
+    Attributes:
+        autopilot: PX4, ARDUPILOT or another number, by its heartbeat; 0: none has come.
+        armed: its motors may turn.
+        following: its mode is the one in which it follows.
+    """
+
+    autopilot: int = 0
+    armed: bool = False
+    following: bool = False
+    _heard: float = -1e9
+    _streaming: float | None = None
+    _asked: float = -1e9
+    _was_following: bool = False
+
+    @property
+    def mode(self) -> int:
+        """Custom mode in which it follows."""
+        return GUIDED_NOGPS if self.autopilot == ARDUPILOT else OFFBOARD
+
+    def heartbeat(self, now: float, autopilot: int, base_mode: int, custom_mode: int) -> None:
+        """Take a heartbeat of the autopilot at a time [s]."""
+        self._heard, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
+        self.following = custom_mode == self.mode
+        self._was_following |= self.following
+
+    def alive(self, now: float) -> bool:
+        """Whether its heartbeat is of the present."""
+        return now - self._heard < SILENT
+
+    def ask(self, now: float, wanted: bool, streaming: bool) -> Ask:
+        """What to ask for now.
+
+        A pilot who leaves the mode in flight has taken over: it is not asked for again until the motors were off.
+
+        Args:
+            now: [s].
+            wanted: the motors shall turn.
+            streaming: set points are being sent.
+        """
+        if not streaming:
+            self._streaming = None
+        elif self._streaming is None:
+            self._streaming = now
+        if not self.armed and not wanted:
+            self._was_following = False
+        step = Ask.NOTHING
+        if not self.alive(now):
+            return step
+        if not wanted:
+            step = Ask.DISARM if self.armed and self.following else step
+        elif self._streaming is not None and now - self._streaming >= SETTLED:
+            if not self.following:
+                step = step if self.armed and self._was_following else Ask.MODE
+            elif not self.armed:
+                step = Ask.ARM
+        if step is Ask.NOTHING or now - self._asked < AGAIN:
+            return Ask.NOTHING
+        self._asked = now
+        return step

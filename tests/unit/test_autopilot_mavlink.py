@@ -1,0 +1,166 @@
+"""MAVLink: the way into offboard flight, clocks, and byte streams as an autopilot would send them. No autopilot is tried here."""
+
+from __future__ import annotations
+
+import socket
+
+import numpy as np
+import pytest
+from perch_autopilot.mavlink import ClockOffset, Mavlink, MavlinkParameters
+from perch_autopilot.offboard import ARDUPILOT, ARMED, GUIDED_NOGPS, OFFBOARD, PX4, Ask, Offboard
+from perch_core.component import Output, ports
+from perch_core.values import NANOSECONDS, OdometryState, RatesThrust
+from perch_core.vehicle import load_vehicle
+
+SECOND = NANOSECONDS
+
+
+def asked(machine: Offboard, seconds: float, start: float = 0.0, wanted: bool = True, streaming: bool = True) -> list[Ask]:
+    """What a machine asks for in some time, at 100 Hz, but for nothing; the autopilot's heartbeats go on."""
+    out = []
+    for k in range(round(100 * seconds)):
+        now = start + 0.01 * k
+        machine.heartbeat(now, machine.autopilot, ARMED * machine.armed, machine.mode if machine.following else 0)
+        out.append(machine.ask(now, wanted, streaming))
+    return [ask for ask in out if ask is not Ask.NOTHING]
+
+
+@pytest.mark.parametrize("autopilot, mode", [(PX4, OFFBOARD), (ARDUPILOT, GUIDED_NOGPS)])
+def test_set_points_come_first_then_the_mode_then_the_motors(autopilot, mode):
+    machine = Offboard(autopilot=autopilot)
+    assert machine.mode == mode
+    assert asked(machine, 0.4) == []                           # set points have to flow first
+    assert asked(machine, 1.0, start=0.4) == [Ask.MODE]
+    machine.following = True
+    assert asked(machine, 1.0, start=1.5) == [Ask.ARM]
+    machine.armed = True
+    assert asked(machine, 1.0, start=2.5) == []
+    assert asked(machine, 1.0, start=3.5, wanted=False) == [Ask.DISARM]
+
+
+def test_a_pilot_who_takes_the_mode_back_keeps_it():
+    machine = Offboard(autopilot=PX4, armed=True, following=True)
+    assert asked(machine, 2.0) == []
+    machine.following = False
+    assert asked(machine, 5.0, start=2.0) == []
+    machine.armed = False
+    assert asked(machine, 1.0, start=7.0, wanted=False) == []
+    assert Ask.MODE in asked(machine, 2.0, start=8.0)
+
+
+def test_nothing_is_asked_of_an_autopilot_that_is_gone_or_without_set_points():
+    machine = Offboard()
+    assert [machine.ask(0.01 * k, True, True) for k in range(300)] == [Ask.NOTHING] * 300
+    assert asked(Offboard(autopilot=PX4), 3.0, streaming=False) == []
+
+
+def test_the_clock_of_the_shortest_way_counts_and_a_jump_is_followed():
+    clock, rng = ClockOffset(), np.random.default_rng(1)
+    for k in range(50):
+        sent, there, back = k * SECOND, *rng.uniform(1e5, 2e7, 2).astype(int).tolist()
+        clock.answered(sent, sent + there - 7 * SECOND, sent + there + back)
+    assert clock.offset == pytest.approx(7 * SECOND, abs=4e6)
+    clock.answered(100 * SECOND, 900 * SECOND, 100 * SECOND + 1_000_000)
+    assert clock.offset == pytest.approx(-800 * SECOND, abs=1e6)
+    clock.answered(100 * SECOND, 0, 90 * SECOND)               # an answer before its request
+    assert clock.offset == pytest.approx(-800 * SECOND, abs=1e6)
+
+
+# -- byte streams ----------------------------------------------------------------------------------------------------
+
+class Autopilot:
+    """The other end of the wire."""
+
+    def __init__(self) -> None:
+        common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (requirements/autopilot.lock)")
+        ours, self.wire = socket.socketpair()
+        self.mavlink = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        self.mavlink.robust_parsing = True
+        self.node = Mavlink(MavlinkParameters(wire=f"fd:{ours.detach()}"))
+        self.got: dict = {}
+        for port in ports(Mavlink, Output):
+            getattr(self.node, port.name).receivers.append(self.got.setdefault(port.name, []).append)
+        self.now = SECOND
+
+    def say(self, message) -> None:
+        self.wire.sendall(message.pack(self.mavlink))
+
+    def heard(self, seconds: float = 0.005) -> dict:
+        """What the node says while it is polled for a time, the last of each kind."""
+        for _ in range(max(round(seconds / 0.005), 1)):
+            self.now += 5_000_000
+            self.node.on_poll(self.now)
+        self.wire.setblocking(False)
+        try:
+            data = self.wire.recv(1 << 20)
+        except BlockingIOError:
+            return {}
+        finally:
+            self.wire.setblocking(True)
+        return {message.get_type(): message for message in self.mavlink.parse_buffer(data) or ()}
+
+
+@pytest.fixture
+def autopilot():
+    one = Autopilot()
+    yield one
+    one.node.close()
+    one.wire.close()
+
+
+def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
+    vehicle = load_vehicle("snapdragon_rates")
+    autopilot.heard()
+    autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.1, 0.2, 0.3), 9.81))
+    target = autopilot.heard()["SET_ATTITUDE_TARGET"]
+    assert (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate) == pytest.approx((0.1, -0.2, -0.3))
+    assert target.thrust == pytest.approx(vehicle.hover_thrust / (4 * vehicle.thrust_max)) and target.type_mask == 128
+    assert "SET_ATTITUDE_TARGET" in autopilot.heard(0.05)
+    autopilot.heard(0.1)
+    assert "SET_ATTITUDE_TARGET" not in autopilot.heard(1.0)
+    autopilot.node.on_rates_thrust(RatesThrust(0, True, (float("nan"), 0.0, 0.0), 9.81))
+    assert "SET_ATTITUDE_TARGET" not in autopilot.heard() and "not finite" in autopilot.got["log"][-1].text
+
+
+def test_odometry_leaves_as_ned_with_its_covariance(autopilot):
+    P = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    autopilot.node.on_odometry(OdometryState(SECOND, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (4.0, 5.0, 6.0), (0.1, 0.2, 0.3), P, P))
+    said = autopilot.heard()["ODOMETRY"]
+    assert (said.x, said.y, said.z, said.vx, said.vy, said.vz) == (2.0, 1.0, -3.0, 4.0, -5.0, -6.0)
+    assert said.q == pytest.approx([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # forward is east: a heading of 90 deg, w x y z
+    assert [said.pose_covariance[k] for k in (0, 6, 11, 15, 18, 20)] == [2.0, 1.0, 3.0, 5.0, 4.0, 6.0]
+
+
+def test_imu_comes_in_by_the_hosts_clock_and_torn_frames_are_counted(autopilot):
+    m = autopilot.mavlink
+    imu = m.highres_imu_encode(5_000_000, 1.0, 2.0, -9.81, 0.1, 0.2, 0.3, 0, 0, 0, 0, 0, 0, 0, 63)
+    autopilot.say(imu)
+    autopilot.heard()
+    assert autopilot.got["imu"] == []                          # its clock is unknown
+    autopilot.say(m.timesync_encode(5 * SECOND, autopilot.now))
+    torn = bytearray(imu.pack(m))
+    torn[20] ^= 0xFF
+    autopilot.wire.sendall(bytes(torn))
+    autopilot.say(imu)
+    autopilot.heard()
+    sample, = autopilot.got["imu"]
+    assert sample.f_B == pytest.approx((1.0, -2.0, 9.81)) and sample.w_B == pytest.approx((0.1, -0.2, -0.3))
+    assert sample.stamp == pytest.approx(autopilot.now, abs=10_000_000)
+    autopilot.heard(1.1)
+    assert autopilot.got["diagnostics"][-1].values["torn_frames"] >= 1
+
+
+def test_it_arms_by_its_own_way_and_says_why_not(autopilot):
+    m, orders = autopilot.mavlink, []
+    for _ in range(400):
+        autopilot.say(m.heartbeat_encode(2, PX4, 0, OFFBOARD if orders else 0, 4))
+        autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+        order = autopilot.heard().get("COMMAND_LONG")
+        if order is not None:
+            orders.append((order.command, order.param1, order.param2))
+    assert orders[0] == (176, 1.0, 6.0) and orders[1] == (400, 1.0, 0.0)
+    autopilot.say(m.command_ack_encode(400, 1))
+    autopilot.say(m.statustext_encode(2, b"Preflight Fail: Accel #0 uncalibrated"))
+    autopilot.heard()
+    said = " | ".join(line.text for line in autopilot.got["log"])
+    assert "refuses arming: TEMPORARILY_REJECTED" in said and "Preflight Fail: Accel #0 uncalibrated" in said
