@@ -1,0 +1,110 @@
+"""The program `preflight`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+import numpy as np
+
+from perch_core.errors import PerchError
+from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.preflight import checks
+from perch_eval.preflight.checks import Check, Verdict
+
+EXAMPLES = """examples:
+  python3 scripts/preflight.py --vehicle mine.yaml                     listen for 5 s to a vehicle that stands still on its feet
+  python3 scripts/preflight.py --vehicle mine.yaml --shake down        then shake it by hand: rotation between camera and IMU
+  python3 scripts/preflight.py --vehicle mine.yaml --props-off         then arm, disarm and kill: NO PROPELLERS MAY BE MOUNTED
+  python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and see the motors stop
+
+exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
+DISARM, ARM, KILL = 0, 1, 5           # perch_msgs/ControllerCommand
+DISARMED, ARMED, FAILED = 0, 1, 6     # perch_msgs/ControllerStatus
+
+
+def command_line() -> argparse.ArgumentParser:
+    """The options."""
+    parser = argparse.ArgumentParser(prog="preflight.py", description="Check a running vehicle before it flies.", epilog=EXAMPLES,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--vehicle", required=True, help="its file, a name in config/vehicles or a file")
+    parser.add_argument("--namespace", default="", help="of its nodes")
+    parser.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
+    parser.add_argument("--shake", choices=("down", "front"), help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
+    parser.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
+    parser.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
+    return parser
+
+
+def listened(visitor: Any, vehicle: Vehicle) -> list[Check]:
+    """What is judged of a vehicle at rest."""
+    values = {channel: [value for _, value in entries] for channel, entries in visitor.values.items()}
+    channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
+    found = [check for channel in channels for check in checks.stream(channel, [value.stamp for value in values[channel]])]
+    found += checks.clocks(visitor.stamped("imu/data_raw"), {name: visitor.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts})
+    found += checks.frames(visitor.newest("odometry"), visitor.newest("imu/data_raw"))
+    found += checks.rest(values["imu/data_raw"])
+    found += [checks.camera_model(name, visitor.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
+    return found + checks.extrinsics(values["/tf_static"], vehicle)
+
+
+def shaken(visitor: Any, vehicle: Vehicle, camera: str) -> Check:
+    """The rotation between camera and IMU, told while the vehicle is shaken."""
+    if camera:
+        visitor.watch(camera, vehicle.mounts[camera].camera)
+        print("shake the vehicle about all axes for 10 s ...", flush=True)
+        visitor.listen(10.0)
+        imu = [value for _, value in visitor.values["imu/data_raw"]]
+        pairs = visitor.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3), vehicle.mounts[camera].stamp_offset)
+    else:
+        camera, pairs = next(iter(vehicle.mounts), ""), (np.zeros((0, 3)), np.zeros((0, 3)))
+    return checks.shaken(camera, *pairs, vehicle)
+
+
+def exercised(visitor: Any, allowed: bool, watchdog: bool) -> list[Check]:
+    """Arming, disarming, killing, and the watchdog, where the propellers are off."""
+    takeover = Check("pilot's takeover", Verdict.OPEN, "this program has no switch", "props off, armed: flip the pilot's switch, and see the autopilot's `mode` in /diagnostics")
+    if not allowed:
+        return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
+                for name in ("armed state", "disarming", "kill", "watchdog")] + [takeover]
+    found = [checks.obeyed("armed state", visitor.order(ARM, ARMED), ARMED, True), checks.obeyed("disarming", visitor.order(DISARM, DISARMED), DISARMED, False)]
+    if found[0].verdict is Verdict.PASSED:
+        visitor.order(ARM, ARMED)
+        found.append(checks.obeyed("kill", visitor.order(KILL, FAILED), FAILED, False))
+        visitor.order(DISARM, DISARMED)
+    last = None, None
+    if watchdog and visitor.order(ARM, ARMED).armed:
+        print("armed: stop the controller's process now (within 60 s) ...", flush=True)
+        last = visitor.await_end_of_commands(60.0)
+        visitor.order(KILL, FAILED)
+    return [*found, checks.stopped(*last), takeover]
+
+
+def main() -> int:
+    """Listen, judge, tell."""
+    arguments = command_line().parse_args()
+    if not 1.0 <= arguments.listen <= 300.0:
+        print(f"error: --listen: {arguments.listen:g} is outside [1, 300] s", file=sys.stderr)
+        return 2
+    try:
+        vehicle = load_vehicle(arguments.vehicle)
+        if arguments.shake and arguments.shake not in vehicle.mounts:
+            raise PerchError(f"--shake: {vehicle.name} has no camera {arguments.shake!r}")
+        from perch_eval.preflight.ros.visitor import Visitor
+
+        visitor = Visitor(vehicle, arguments.namespace)
+    except PerchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
+        visitor.await_first("imu/data_raw", arguments.listen)
+        visitor.listen(arguments.listen)
+        found = [*listened(visitor, vehicle), shaken(visitor, vehicle, arguments.shake or ""), *exercised(visitor, arguments.props_off, arguments.watchdog)]
+    finally:
+        visitor.close()
+    print("\n".join(map(str, found)))
+    counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}
+    print(", ".join(f"{count} {verdict.value}" for verdict, count in counts.items()))
+    return 1 if counts[Verdict.FAILED] else 0

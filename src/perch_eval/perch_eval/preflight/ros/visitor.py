@@ -1,0 +1,131 @@
+"""A node that listens to a vehicle's graph for preflight, and gives the controller orders where it is allowed to."""
+
+from __future__ import annotations
+
+import time
+from copy import copy
+from functools import partial
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+from perch_core.camera import Camera
+from perch_core.errors import PerchError
+from perch_core.ros import topics
+from perch_core.values import ControllerCommand, RotorState
+from perch_core.vehicle import Vehicle
+from perch_eval.preflight.camera_turns import CameraTurns
+from perch_eval.preflight.checks import ANSWER, Order
+
+COMMANDS = ("motor_command", "rates_thrust_command", "attitude_thrust_command")
+CHANNELS = ("imu/data_raw", "odometry", "camera_down/camera_info", "camera_front/camera_info", "controller/status", "rotor_state", "/tf_static",
+            "/diagnostics", *COMMANDS)
+KEPT = 20_000       # values of a channel
+DEEP = 2000         # messages that wait while this program does not run
+TURNING = 0.02      # of its highest speed: a rotor that is faster turns
+SETTLING = 0.3      # after an effect, until the commands are looked at [s]
+
+
+class Visitor:
+    """Subscribes to everything that is judged.
+
+    Attributes:
+        values: channel -> (arrival by the wall clock [s], value), the newest `KEPT`.
+        turns: of the camera that is watched.
+    """
+
+    def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
+        self._context = Context()
+        rclpy.init(context=self._context)
+        self._node = Node("preflight", namespace=namespace or None, context=self._context, start_parameter_services=False)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
+        self.turns: CameraTurns | None = None
+        self._fastest = vehicle.speed_max
+        for channel in CHANNELS:
+            row = topics.topic(channel)
+            profile = copy(row.qos.subscribe)
+            profile.depth = max(profile.depth, DEEP)
+            self._node.create_subscription(row.message, channel, partial(self._take, channel, row), profile, raw=True)
+        order = topics.topic("controller/command")
+        self._orders = self._node.create_publisher(order.message, "controller/command", order.qos.publish)
+
+    def _take(self, channel: str, row: topics.Topic, data: bytes) -> None:
+        try:
+            read = row.read(data)
+        except PerchError:
+            return
+        kept = self.values[channel]
+        kept += [(time.monotonic(), value) for value in (read if isinstance(read, list) else [read])]
+        del kept[:-KEPT]
+
+    def _look(self, row: topics.Topic, data: bytes) -> None:
+        image = row.read(data)
+        self.turns.add(image.stamp, image.pixels())
+
+    def await_first(self, channel: str, patience: float) -> None:
+        """Until a channel's first value has come, or for so long [s]: nodes find each other in their own time."""
+        end = time.monotonic() + patience
+        while not self.values[channel] and time.monotonic() < end:
+            self.listen(0.05)
+
+    def watch(self, camera: str, model: Camera) -> None:
+        """Look through a camera from now on."""
+        self.turns, row = CameraTurns(model), topics.topic(f"camera_{camera}/image_raw")
+        self._node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._look, row), row.qos.subscribe, raw=True)
+
+    def listen(self, duration: float) -> None:
+        """For so long [s]."""
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def stamped(self, channel: str) -> list[tuple[float, int]]:
+        """Arrival [s] and stamp [ns] of everything on a channel."""
+        return [(arrival, value.stamp) for arrival, value in self.values[channel]]
+
+    def newest(self, channel: str) -> Any:
+        """The newest value of a channel; None: there is none."""
+        return self.values[channel][-1][1] if self.values[channel] else None
+
+    def order(self, command: int, state: int) -> Order:
+        """Give the controller an order, and wait for a state."""
+        stamp = getattr(self.newest("odometry"), "stamp", 0)
+        row, begun = topics.topic("controller/command"), time.monotonic()
+        self._orders.publish(row.to_message(ControllerCommand(stamp, command, "preflight, props off")))
+        while time.monotonic() - begun < 2.0 * ANSWER:
+            self.listen(0.02)
+            status = self.values["controller/status"]
+            if status and status[-1][0] > begun and status[-1][1].state == state:
+                break
+        delay = time.monotonic() - begun
+        self.listen(SETTLING)
+        sent = [value for channel in COMMANDS for arrival, value in self.values[channel][-1:] if arrival > begun]
+        return Order(self.newest("controller/status"), delay, sent[-1].armed if sent else None)
+
+    def await_end_of_commands(self, patience: float) -> tuple[float | None, float | None]:
+        """When the last command came, and when a motor last turned after that [s]; see `checks.stopped`."""
+        end = time.monotonic() + patience
+        while time.monotonic() < end:
+            self.listen(0.1)
+            last = max((self.values[channel][-1][0] for channel in COMMANDS if self.values[channel]), default=None)
+            if last is not None and time.monotonic() - last > 3.0 * ANSWER:
+                return last, self._last_motion(last)
+        return None, None
+
+    def _last_motion(self, since: float) -> float | None:
+        rotors: list[tuple[float, RotorState]] = [entry for entry in self.values["rotor_state"] if entry[0] > since]
+        told = [(arrival, max(state.speed) > TURNING * self._fastest) for arrival, state in rotors]
+        told += [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
+                 if arrival > since and "armed" in said.values]
+        return max((arrival for arrival, turns in told if turns), default=since) if told else None
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()

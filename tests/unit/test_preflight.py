@@ -1,0 +1,157 @@
+"""Preflight: what is sound passes, every wrong axis, rate, stamp, clock and unit is named, and nothing is exercised that was not allowed."""
+
+from dataclasses import replace
+from itertools import permutations, product
+
+import cv2
+import numpy as np
+import pytest
+from perch_core.urdf import fixed_frames
+from perch_core.values import CameraModel, ControllerStatus, ImuSample
+from perch_core.vehicle import load_vehicle
+from perch_eval.preflight import checks, command
+from perch_eval.preflight.camera_turns import CameraTurns, rotation_between
+from perch_eval.preflight.checks import Order, Verdict
+from scipy.spatial.transform import Rotation
+
+VEHICLE = load_vehicle("snapdragon")
+PASSED, FAILED, OPEN = Verdict.PASSED, Verdict.FAILED, Verdict.OPEN
+MS = 1_000_000
+AXES = [R for order in permutations(range(3)) for signs in product((1, -1), repeat=3) if np.linalg.det(R := np.diag(signs)[:, order].astype(float)) > 0]
+
+
+def verdicts(found):
+    return {check.name: check.verdict for check in found}
+
+
+def still(R=np.eye(3), scale=1.0, spin=0.0, seed=1):
+    """A second of an IMU at rest whose axes are turned by R."""
+    rng = np.random.default_rng(seed)
+    f = scale * (R @ np.array([0.0, 0.0, 9.81]) + 0.3 * rng.standard_normal((500, 3)))
+    w = spin + 0.01 * rng.standard_normal((500, 3))
+    return [ImuSample(k * 2 * MS, tuple(w[k]), tuple(f[k])) for k in range(500)]
+
+
+@pytest.mark.parametrize("k", range(24))
+def test_every_wrong_axis_is_found_by_gravity_or_by_shaking(k):
+    R = AXES[k]
+    seen = verdicts(checks.rest(still(R)))
+    assert seen["gravity's size"] is PASSED and seen["gyroscope at rest"] is PASSED
+    assert (seen["gravity up"] is PASSED) == (R[2, 2] == 1.0)
+    rng = np.random.default_rng(k)
+    rates = rng.standard_normal((60, 3))  # of the body; its IMU says R of it, the camera what its mount makes of it
+    check = checks.shaken("down", rates @ R.T + 0.02 * rng.standard_normal((60, 3)), rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
+    assert (check.verdict is PASSED) == bool((R == np.eye(3)).all())
+
+
+def test_units_and_motion_are_seen():
+    assert verdicts(checks.rest(still(scale=1 / 9.81)))["gravity's size"] is FAILED
+    assert verdicts(checks.rest(still(spin=0.2)))["gyroscope at rest"] is FAILED
+    assert verdicts(checks.rest([]))["gravity up"] is FAILED
+
+
+@pytest.mark.parametrize("stamps, rate, even", [
+    ([k * 2 * MS for k in range(500)], PASSED, PASSED), ([k * 20 * MS for k in range(50)], FAILED, PASSED),
+    ([k * 2 * MS + 30 * MS * (k > 200) for k in range(500)], PASSED, FAILED), ([k * 2 * MS - 4 * MS * (k == 200) for k in range(500)], PASSED, FAILED)])
+def test_rates_and_stamps(stamps, rate, even):
+    assert list(verdicts(checks.stream("imu/data_raw", stamps)).values()) == [rate, even]
+
+
+def test_silence_fails():
+    assert [check.verdict for check in checks.stream("odometry", [])] == [FAILED]
+    assert [check.verdict for check in checks.frames(None, still()[0])] == [FAILED, PASSED]
+
+
+@pytest.mark.parametrize("shift, verdict", [(0.03, PASSED), (0.6, FAILED), (-0.4, FAILED), (1.7e9, FAILED)])
+def test_clocks_are_compared_though_this_program_is_late(shift, verdict):
+    rng = np.random.default_rng(5)
+    imu = [(100.0 + 0.002 * k + rng.exponential(0.05), k * 2 * MS) for k in range(1000)]
+    frames = [(100.0 + 0.033 * k + shift + rng.exponential(0.05), k * 33 * MS) for k in range(60)]
+    assert [check.verdict for check in checks.clocks(imu, {"down": frames})] == [verdict]
+
+
+def test_cameras_and_extrinsics_are_compared_with_the_file():
+    camera = VEHICLE.mounts["down"].camera
+    model = CameraModel(0, "camera_down_optical_frame", camera)
+    assert checks.camera_model("down", model, VEHICLE).verdict is PASSED
+    for wrong in (model._replace(camera=replace(camera, fx=1.1 * camera.fx)), model._replace(frame="down"), None):
+        assert checks.camera_model("down", wrong, VEHICLE).verdict is FAILED
+    frames = list(fixed_frames(VEHICLE))
+    assert {check.verdict for check in checks.extrinsics(frames, VEHICLE)} == {PASSED}
+    assert {check.verdict for check in checks.extrinsics([], VEHICLE)} == {OPEN}
+    moved = [f._replace(p=(f.p[0] + 0.05, *f.p[1:])) if f.child.startswith("camera_front") else f for f in frames]
+    assert [check.name for check in checks.extrinsics(moved, VEHICLE) if check.verdict is FAILED] == ["extrinsics camera_front_optical_frame"]
+
+
+def test_shaking_too_little_is_no_verdict():
+    rates = np.outer(np.sin(np.arange(60)), (1.0, 0.0, 0.0))  # about one axis alone
+    assert checks.shaken("down", rates, rates, VEHICLE).verdict is OPEN and checks.shaken("down", rates[:5], rates[:5], VEHICLE).verdict is OPEN
+
+
+def test_rotations_are_found_among_false_rays():
+    rng = np.random.default_rng(2)
+    after = rng.standard_normal((80, 3))
+    after /= np.linalg.norm(after, axis=1)[:, None]
+    R = Rotation.from_rotvec([0.05, -0.08, 0.03])
+    before = R.apply(after)
+    before[:8] = -before[:8]
+    assert np.abs(rotation_between(before, after) - R.as_matrix()).max() < 1e-3
+
+
+def test_a_camera_is_seen_to_turn():
+    """A textured plane at infinity through a pinhole camera: a turn by R is the homography K R^T K^-1."""
+    rng, camera = np.random.default_rng(3), load_vehicle("rpg").mounts["front"].camera
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (camera.height, camera.width)).astype(np.uint8), (0, 0), 4.0)
+    picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX)
+    turns, rate = CameraTurns(camera), np.array([0.4, -0.6, 0.8])
+    for k in range(4):
+        R = Rotation.from_rotvec(rate * 0.033 * k).as_matrix()
+        turns.add(k * 33 * MS, cv2.warpPerspective(picture, camera.K @ R.T @ np.linalg.inv(camera.K), (camera.width, camera.height), borderMode=cv2.BORDER_REFLECT))
+    assert len(turns.spans) == 3
+    for _, _, seen in turns.spans:
+        np.testing.assert_allclose(seen, rate, atol=0.06)
+    stamps = np.arange(0, 110) * MS
+    gyro, seen = turns.paired(stamps, np.tile(rate, (110, 1)), -0.005)
+    assert len(gyro) == 3 and np.abs(gyro - seen).max() < 0.06
+
+
+class Graph:
+    """A vehicle that obeys, or does not."""
+
+    def __init__(self, obeys=True):
+        self.orders, self.obeys = [], obeys
+
+    def order(self, order, state):
+        self.orders.append(order)
+        status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, "said")
+        return Order(status, 0.1, state == command.ARMED and self.obeys)
+
+    def await_end_of_commands(self, patience):
+        return 10.0, 10.4
+
+
+def test_motors_start_only_where_the_propellers_are_off():
+    graph = Graph()
+    assert {check.verdict for check in command.exercised(graph, False, True)} == {OPEN} and not graph.orders
+    seen = verdicts(command.exercised(graph, True, True))
+    assert [seen[name] for name in ("armed state", "disarming", "kill", "watchdog", "pilot's takeover")] == [PASSED] * 4 + [OPEN]
+    assert graph.orders[-1] == command.KILL, "it is left with the motors off"
+
+
+def test_who_does_not_arm_fails_and_is_not_tried_further():
+    graph = Graph(obeys=False)
+    seen = verdicts(command.exercised(graph, True, True))
+    assert seen["armed state"] is FAILED and seen["watchdog"] is OPEN and graph.orders == [command.ARM, command.DISARM, command.ARM]
+
+
+@pytest.mark.parametrize("motion, verdict", [(10.3, PASSED), (11.5, FAILED), (None, OPEN)])
+def test_motors_that_go_on_without_commands_fail(motion, verdict):
+    assert checks.stopped(10.0, motion).verdict is verdict
+
+
+@pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"), (["--vehicle", "rpg_published", "--listen", "0"], "[1, 300] s")])
+def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["preflight.py", *arguments])
+    assert command.main() == 2
+    line = capsys.readouterr().err
+    assert words in line and line.count("\n") == 1
