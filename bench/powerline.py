@@ -91,6 +91,8 @@ def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> dict:
         plan = planner.plan(request)
     except PlanningRefusal as refusal:
         return {"refusal": str(refusal)}
+    if plan.recovery is None:
+        return {"refusal": plan.without_recovery}
     return {"refusal": "", "perch_ms": 1e3 * plan.perch.cpu_time, "recovery_ms": 1e3 * plan.recovery.cpu_time,
             "wall_ms": 1e3 * plan.perch.solve_time, "iterations": plan.perch.iterations,
             "violated": sum(not bound.holds for bound in plan.bounds),

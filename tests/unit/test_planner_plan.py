@@ -68,7 +68,7 @@ def test_a_ceiling_takes_more_than_the_rotors_have():
     assert not {c.quantity: c for c in checked(problem).certificates}["rotor_thrust"].holds
     with pytest.raises(PerchRefusal, match="single rotors") as refusal:
         plan(problem, PerchSettings(rotors="required", duration_max=6.0), VEHICLE)
-    assert "rotor_thrust" in refusal.value.limits
+    assert refusal.value.relaxed == {"rotors": "preferred"}
 
 
 @pytest.mark.parametrize("inclination", [60, 75, 90, 105, 120])
@@ -153,7 +153,7 @@ def test_certificates_enclose_what_dense_sampling_finds():
     (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 30.0}, refusals.UNREACHABLE_TILT),
     (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 1.0}, refusals.UNREACHABLE_TILT),
     (PerchProblem(HOVER, surface(90.0)), {"thrust_max": 2.3}, refusals.THRUST_FLOOR),
-    (PerchProblem(HOVER, surface(90.0)), {"thrust_max": 2.7, "duration_max": 8.0}, refusals.THRUST_FLOOR),
+    (PerchProblem(HOVER, surface(90.0), segment_times=(0.5,)), {"thrust_max": 2.6, "duration_max": 8.0}, refusals.THRUST_FLOOR),
     (PerchProblem(HOVER, surface(90.0)), {"body_rate_max": 1.0, "duration_max": 6.0}, refusals.BODY_RATE),
     (PerchProblem(HOVER, surface(90.0, p=(-1.0, 0.0, 1.5))), {}, refusals.BOX),
     (PerchProblem(StartState((0.0, 0.0, 0.05)), surface(90.0)), {}, refusals.BOX),
@@ -177,6 +177,10 @@ def test_a_waypoint_too_near_to_the_surface_is_told_where_it_is_and_what_it_lack
     assert words in str(caught.value) and caught.value.margin == pytest.approx(margin)
 
 
+def test_other_divisions_of_the_time_are_tried_where_more_of_it_does_not_help():
+    checked(PerchProblem(HOVER, surface(90.0)), PerchSettings(thrust_max=2.7, duration_max=8.0))
+
+
 def test_no_plan_is_longer_than_duration_max():
     waypoints = tuple(Waypoint((-8.0 * (k % 2), 3.0 * (k % 3), 1.4)) for k in range(60))
     with pytest.raises(PerchRefusal, match="longer than duration_max 20 s") as caught:
@@ -184,20 +188,26 @@ def test_no_plan_is_longer_than_duration_max():
     assert caught.value.code == refusals.BOX and caught.value.margin < 0.0
 
 
-def test_a_refusal_names_one_limit_where_one_is_enough():
-    problem, settings = PerchProblem(HOVER, surface(90.0)), PerchSettings(body_rate_max=1.0, duration_max=6.0)
-    with pytest.raises(PerchRefusal) as caught:
-        plan(problem, settings, VEHICLE)
-    assert caught.value.limits == ("body_rate",)  # the thrust range fails in most attempts, too
+@pytest.mark.parametrize("settings, names, words", [
+    ({"body_rate_max": 1.0, "duration_max": 6.0}, {"body_rate_max"}, "body-rate limit"),  # the thrust leaves its range as often
+    ({"thrust_max": 2.6, "duration_max": 8.0}, {"thrust_max"}, "thrust range"),
+    ({"thrust_max": 2.6, "body_rate_max": 1.0, "duration_max": 6.0}, {"thrust_max", "body_rate_max"}, "thrust range .* and body-rate limit"),
+    ({"duration_max": 0.6}, {"duration_max"}, "duration_max")])
+def test_a_refusal_names_the_fewest_limits_and_values_that_do(settings, names, words):
+    problem = PerchProblem(HOVER, surface(90.0), segment_times=(0.5,))
+    with pytest.raises(PerchRefusal, match=words) as caught:
+        plan(problem, PerchSettings(**settings), VEHICLE)
+    assert set(caught.value.relaxed) == names and caught.value.margin < 0.0
+    checked(problem, PerchSettings(**settings | caught.value.relaxed))
 
 
-def test_a_refusal_is_confirmed_by_relaxing_what_it_names():
-    problem = PerchProblem(HOVER, surface(90.0))
-    with pytest.raises(PerchRefusal) as caught:
-        plan(problem, PerchSettings(thrust_max=2.6, duration_max=8.0), VEHICLE)
-    assert caught.value.code == refusals.THRUST_FLOOR
-    relaxed = PerchSettings(thrust_max=2.6 - caught.value.margin + 1e-3, duration_max=8.0)
-    checked(problem, relaxed)
+def test_a_ceiling_near_the_floor_is_refused_for_the_floor():
+    """Not for the thrust, of which it would take more than the vehicle has."""
+    problem = PerchProblem(HOVER, surface(179.0, p=(1.7, 0.0, 1.6)))
+    with pytest.raises(PerchRefusal, match="height limits") as caught:
+        plan(problem, PerchSettings(height_min=1.2), VEHICLE)
+    assert set(caught.value.relaxed) == {"height_min"}
+    checked(problem, PerchSettings(**caught.value.relaxed))
 
 
 @pytest.mark.parametrize("make, key", [

@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from perch_control.mission.requests import plan_answer
 from perch_core import config, so3
 from perch_core.errors import ConfigError, PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, V
+from perch_core.values import AtEnd
 from perch_core.vehicle import load_vehicle
-from perch_planner.powerline import problem
+from perch_planner.powerline import problem, service
 from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.report import write_report
@@ -55,6 +57,16 @@ def test_a_recovery_begins_even_where_the_flight_has_eaten_the_margin(planner: P
     state[P] -= 0.028 * REQUEST.perch.s3_W  # 2 mm of air are left
     plan = planner.plan(replace(REQUEST, start=state, perch=None, recovery_only=True))
     assert all(bound.holds for bound in plan.bounds)
+
+
+def test_a_perch_after_which_no_recovery_is_found_is_given_without_one() -> None:
+    """With the reason; the mission, which asks for recoveries, takes it for a refusal."""
+    planner = PowerlinePlanner(VEHICLE, config.replace(SETUP.settings, recovery_duration=(0.01, 0.02)))
+    plan = planner.plan(REQUEST)
+    assert plan.recovery is None and "no recovery" in plan.without_recovery and all(bound.holds for bound in plan.bounds)
+    answer = service.answer(plan, planner.solver.model, 0.01, 0.25, 0)
+    assert answer.success and answer.at_end == AtEnd.CONTACT and answer.recovery_start < 0.0 and "without recovery: no recovery" in answer.message
+    assert not plan_answer(answer).success and plan_answer(answer).message == answer.message
 
 
 def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlanner, planned: PlannedProblem) -> None:

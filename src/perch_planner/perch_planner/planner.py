@@ -1,8 +1,8 @@
 """The perching planner: quadratic programs until every limit is proved, or a typed refusal. [M:IV-C]
 
 For given durations a QP is solved and its plan checked; where a limit is violated, linear bounds are added and the QP is
-solved again; where that does not help, the durations grow [M:IV-C.3]. Each of the three loops is bounded, so that a plan
-ends after at most `iterations_max` programs. The procedure as the paper has it: `paper.paper_m`.
+solved again; where that does not help, the durations grow [M:IV-C.3]. Where no longer time helps, others are drawn.
+Each loop is bounded: a search ends after `iterations_max` programs, and the drawing as well. The procedure as the paper has it: `paper.paper_m`.
 """
 
 from __future__ import annotations
@@ -15,26 +15,12 @@ import numpy as np
 from perch_core.trajectory import FlatTrajectory
 from perch_core.values import Certificate
 from perch_core.vehicle import Vehicle
-from perch_planner import plan_checks, refusals
+from perch_planner import refusals, relaxation
 from perch_planner.certificates import certificates
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
-from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Attempt, Outcome, Search
 
 _PREFERRED = 60  # programs in which a plan that keeps the rotors' limits must be found where they are preferred
-_CODES = {"": refusals.INFEASIBLE_WINDOW, "thrust": refusals.THRUST_FLOOR, "speed": refusals.BOX, "height": refusals.BOX,
-          "clearance": refusals.BOX, "body_rate": refusals.BODY_RATE, "rotor_thrust": refusals.THRUST_FLOOR,
-          "solver": refusals.SOLVER}
-_WORDS = {"": "impact window and tube [M:eq14, M:eq15]", "thrust": "thrust range [M:eq16]", "speed": "speed limit",
-          "height": "height limits", "clearance": "clearance from the surface until contact", "body_rate": "body-rate limit",
-          "rotor_thrust": "thrust range of the single rotors",
-          "solver": "numerics of the quadratic program"}
-_ADVICE = {"": "widen the impact speeds, tangential_speed_max or the tube",
-           "thrust": "raise thrust_max, tangential_speed_max or duration_max, or lower impact_acceleration",
-           "speed": "raise speed_max", "height": "move the target or the start, or widen the height limits",
-           "clearance": "start farther in front of the surface", "body_rate": "raise body_rate_max or impact_acceleration",
-           "rotor_thrust": "raise impact_acceleration or tube_tolerance, or shorten tube_time",
-           "solver": "choose another solver"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +67,13 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     refusals.refuse_hopeless(problem, settings, limits, vehicle)
     search, durations, outcome = _search(problem, settings, vehicle, limits)
     if not outcome.proved:
-        raise _refusal(search, outcome)
-    if settings.minimum_time:
+        again = Search(problem, search.settings, vehicle, search.limits)
+        restarted = again.restarted()
+        search.attempts += again.attempts
+        if restarted is None:
+            raise relaxation.refusal(search, outcome)
+        outcome = restarted
+    elif settings.minimum_time:
         outcome = search.shortest(durations, outcome)
     duration = float(outcome.durations.sum())
     if duration > settings.duration_max:
@@ -105,51 +96,3 @@ def _search(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle,
     search = Search(problem, settings, vehicle, limits.without("rotor_thrust"))
     search.attempts += first.attempts
     return search, *search.run()
-
-
-def _refusal(search: Search, best: Outcome) -> PerchRefusal:
-    """Find out what stands in the way: each limit that failed is taken away, then several, until there is a plan."""
-    asked = Limits.of(search.settings, search.vehicle)
-    proofs = () if best.results is None else certificates(best.results, asked, search.vehicle.mass)
-    longest = search.attempts[-1].duration if search.attempts else float(search.first.sum())
-    tried = f"{search.iterations} programs up to {longest:.2f} s"
-    alone = {(name,): Search(search.problem, search.settings, search.vehicle, search.limits.without(name))
-             for name in _failed(search)}
-    for taken, relaxed in alone.items():
-        _, outcome = relaxed.run()
-        if outcome.proved:
-            return _named(search, taken, outcome, asked, proofs, tried)
-    taken, relaxed = next(iter(alone.items()), ((), search))
-    while name := next((n for n in _failed(relaxed) if n not in taken), None):
-        taken += (name,)
-        relaxed = Search(search.problem, search.settings, search.vehicle, relaxed.limits.without(name))
-        _, outcome = relaxed.run()
-        if outcome.proved:
-            return _named(search, taken, outcome, asked, proofs, tried)
-    name = "solver" if search.failures["solver"] else ""
-    return PerchRefusal(_CODES[name], _WORDS[name], float("-inf"),
-                        f"{_WORDS[name]}: no plan, even without the other limits ({tried}); {_ADVICE[name]}", proofs,
-                        search.iterations)
-
-
-def _failed(search: Search) -> list[str]:
-    """Names of the limits that failed in a search, the most frequent first."""
-    return [name for name, _ in search.failures.most_common() if name in plan_checks.NAMES]
-
-
-def _named(search: Search, taken: tuple[str, ...], outcome: Outcome, asked: Limits, proofs: tuple[Certificate, ...],
-           tried: str) -> PerchRefusal:
-    """The refusal that names the limits without which there is a plan, and what that plan takes."""
-    margin, words = _needed(certificates(outcome.results, asked, search.vehicle.mass), taken)
-    constraint = " and ".join(_WORDS[n] for n in taken)
-    return PerchRefusal(_CODES[taken[0]], constraint, margin,
-                        f"no plan keeps the {constraint} ({tried}); without it there is one that takes {words}; "
-                        f"{_ADVICE[taken[0]]}", proofs, search.iterations, taken)
-
-
-def _needed(proofs: tuple[Certificate, ...], names: tuple[str, ...]) -> tuple[float, str]:
-    """By how much the first named limit is exceeded by a plan without it, and its figures in words."""
-    by_name = {proof.quantity: proof for proof in proofs}
-    first = by_name[names[0]]
-    words = ", ".join(f"{n} in [{by_name[n].minimum:.3g}, {by_name[n].maximum:.3g}] {by_name[n].unit}" for n in names)
-    return first.margin, words

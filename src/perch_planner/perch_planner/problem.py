@@ -162,7 +162,7 @@ class PerchSettings:
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
     last_segment_min: float = quantity(0.25, unit="s", low=0.05, high=5.0, doc="shortest last segment")
-    iterations_max: int = quantity(200, low=1, high=1000, doc="QPs per plan")
+    iterations_max: int = quantity(200, low=1, high=1000, doc="QPs per search")
 
     def __post_init__(self) -> None:
         if self.impact_speed_max < self.impact_speed_min:

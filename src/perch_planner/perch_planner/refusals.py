@@ -23,17 +23,17 @@ TIME_LIMIT = "time_limit"
 
 
 class PerchRefusal(PlanningRefusal):
-    """A refusal with the certificates of the best plan that was found on the way.
+    """A refusal with the certificates of the last plan that was checked on the way.
 
     Attributes:
         certificates: empty where no plan was found at all.
         iterations: QPs solved.
-        limits: names of the limits without which there is a plan (`Limits.without`); empty where that is not known.
+        relaxed: values of settings with which there is a plan, or another obstacle; empty where none are known.
     """
 
     def __init__(self, code: str, constraint: str, margin: float, message: str, certificates: tuple[Certificate, ...] = (),
-                 iterations: int = 0, limits: tuple[str, ...] = ()) -> None:
-        self.certificates, self.iterations, self.limits = certificates, iterations, limits
+                 iterations: int = 0, relaxed: dict[str, float | str] | None = None) -> None:
+        self.certificates, self.iterations, self.relaxed = certificates, iterations, relaxed or {}
         super().__init__(code, constraint, margin, message)
 
 
@@ -90,12 +90,11 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(
             UNREACHABLE_TILT, "thrust at contact m alpha within [tau_min, tau_max] [M:eq9, M:eq11]", margin,
             f"holding the surface's attitude takes m alpha = {contact:.3f} N, outside [{low:.3f}, {high:.3f}] N; "
-            f"choose impact_acceleration between {low / vehicle.mass:.2f} and {high / vehicle.mass:.2f} m/s^2",
-            limits=("thrust",))
+            f"choose impact_acceleration between {low / vehicle.mass:.2f} and {high / vehicle.mass:.2f} m/s^2")
     hover = vehicle.mass * GRAVITY
     if high <= 1.02 * hover:
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
-                           f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N", limits=("thrust",))
+                           f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N")
     start, surface = problem.start, problem.surface
     specific, rim, distance, wrong, height, near, at_waypoint = _figures(
         problem.points, start.a, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
@@ -104,27 +103,22 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
-                           f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N",
-                           limits=("thrust",))
+                           f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
     if wrong >= 0:
         margin = min(height - limits.height[0], limits.height[1] - height)
         name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[wrong]
         raise PerchRefusal(BOX, f"height of the {name}", margin,
-                           f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m",
-                           limits=("height",))
+                           f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m")
     speed = hypot(*start.v.tolist())
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
-                           f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s",
-                           limits=("speed",))
+                           f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
-                           f"the start is {_place(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it",
-                           limits=("clearance",))
+                           f"the start is {_place(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it")
     if near >= 0 and not any(problem.target_velocity.tolist()):
         raise PerchRefusal(BOX, f"clearance of waypoint {near - 1} from the surface's plane", at_waypoint - limits.clearance,
-                           f"waypoint {near - 1} is {_place(at_waypoint)}; it needs more than {limits.clearance:.3f} m in front of it",
-                           limits=("clearance",))
+                           f"waypoint {near - 1} is {_place(at_waypoint)}; it needs more than {limits.clearance:.3f} m in front of it")
 
 
 def _place(distance: float) -> str:
@@ -133,7 +127,8 @@ def _place(distance: float) -> str:
 
 
 def too_long(settings: PerchSettings, duration: float, certificates: tuple[Certificate, ...] = (), iterations: int = 0) -> PerchRefusal:
-    """The refusal of a plan that would take `duration` [s]."""
+    """The refusal of a plan that would take `duration` [s]; with certificates: of one that there is."""
     return PerchRefusal(BOX, "duration_max", settings.duration_max - duration,
                         f"a plan would take {duration:.2f} s, longer than duration_max {settings.duration_max:g} s; "
-                        "start nearer, ask for fewer waypoints, or raise duration_max", certificates, iterations, ("duration_max",))
+                        "start nearer, ask for fewer waypoints, or raise duration_max", certificates, iterations,
+                        {"duration_max": duration} if certificates else None)

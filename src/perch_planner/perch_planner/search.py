@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
 
 from perch_core.vehicle import Vehicle
-from perch_planner import plan_checks, refusals
+from perch_planner import refusals
 from perch_planner.contact_constraints import Contact
 from perch_planner.cutting import turning_side
 from perch_planner.judgement import Judgement, Question
@@ -16,7 +15,7 @@ from perch_planner.linear_bounds import Bounds
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.rotor_thrusts import linear_bounds, rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
-from perch_planner.time_allocation import allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
+from perch_planner.time_allocation import SEGMENT_MIN, allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
 from perch_planner.yaw_profile import yaw_coefficients
 
 _CUT_ROUNDS = 24
@@ -24,6 +23,7 @@ _PATIENCE = 5         # so often, peaks are stretched where a longer time helps 
 _NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
 _PLAIN_STRETCH = 1.15
 _BISECTIONS = 12
+_RESTARTS = 40        # draws of durations where lengthening the first ones has led to no plan
 
 
 class Attempt(NamedTuple):
@@ -42,21 +42,15 @@ class Attempt(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a set of durations [s] gave: a plan (`failure` empty) or why not, and how much longer to try."""
+    """What a set of durations [s] gave: a plan whose limits are proved, or one whose are not, and how much longer to try."""
 
     durations: np.ndarray
     coefficients: np.ndarray | None
     yaw: np.ndarray | None
     results: np.ndarray | None
-    failure: str = ""
-    margin: float = 0.0
+    proved: bool = False
     stretch: float = _PLAIN_STRETCH
     extrema: np.ndarray | None = None
-
-    @property
-    def proved(self) -> bool:
-        """All limits hold."""
-        return not self.failure and self.results is not None
 
 
 class Search:
@@ -74,7 +68,6 @@ class Search:
             len(problem.waypoints))
         self.rotors = rotor_model(vehicle)
         self.attempts: list[Attempt] = []
-        self.failures: Counter[str] = Counter()
 
     @property
     def iterations(self) -> int:
@@ -92,7 +85,7 @@ class Search:
         try:
             program = SegmentProgram(self.contact, durations, settings, self.question)
         except np.linalg.LinAlgError:
-            return nothing._replace(failure="solver")
+            return nothing
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
         best, count, turning, duration = None, 0, False, float(durations.sum())
@@ -114,12 +107,12 @@ class Search:
                 kept = low <= row[0] and row[2] <= high
                 results, turning = np.vstack([found.results, [*row, kept]]), turning or not kept
                 if found.holds and kept:
-                    return Outcome(durations, found.coefficients, yaw, results)
+                    return Outcome(durations, found.coefficients, yaw, results, True)
                 if turning:
                     bounds = Bounds(*linear_bounds(thrusts, row, found.coefficients, yaw, durations, low, high, *self.rotors))
                     program.replace(bounds)
                     count += len(bounds.lower)
-                outcome = outcome or self._limit(durations, found.coefficients, yaw, results)
+                outcome = outcome or Outcome(durations, found.coefficients, yaw, results)
             best = outcome
             if not (found.cuts or turning):
                 break
@@ -127,28 +120,10 @@ class Search:
         return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or nothing
 
     def _thrust(self, durations: np.ndarray, found: Judgement) -> Outcome | None:
-        """The failure of the thrust range, or None."""
+        """The outcome where the thrust leaves its range, or None."""
         if found.most <= self.high and found.least >= self.low:
             return None
-        margin = min(self.high - found.most, found.least - self.low) * self.vehicle.mass
-        return Outcome(durations, found.coefficients, None, None, "thrust", margin, stretch_factor(found.most, self.high),
-                       found.extrema)
-
-    def _limit(self, durations: np.ndarray, coefficients: np.ndarray, yaw: np.ndarray, results: np.ndarray) -> Outcome:
-        """The failure of another limit than the thrust range."""
-        name = [n for n, row in zip(plan_checks.NAMES, results) if not row[plan_checks.HOLDS]][-1]
-        return Outcome(durations, coefficients, yaw, results, name, self._margin(results, name))
-
-    def _margin(self, results: np.ndarray, name: str) -> float:
-        row, limits = results[plan_checks.NAMES.index(name)], self.limits
-        if name == "speed":
-            return limits.speed - row[plan_checks.MAXIMUM]
-        if name == "rotor_thrust":
-            low, high = limits.rotor_thrust
-            return min(row[plan_checks.MINIMUM] - low, high - row[plan_checks.MAXIMUM])
-        if name == "height":
-            return min(row[plan_checks.MINIMUM] - limits.height[0], limits.height[1] - row[plan_checks.MAXIMUM])
-        return -float("inf")
+        return Outcome(durations, found.coefficients, None, None, stretch=stretch_factor(found.most, self.high), extrema=found.extrema)
 
     def _note(self, duration: float, least: float, most: float, cuts: int) -> None:
         mass = self.vehicle.mass
@@ -168,13 +143,32 @@ class Search:
             if outcome.proved:
                 return durations, outcome
             stretched += 1
-            self.failures[outcome.failure] += 1
-            if best is None or best.coefficients is None or (outcome.coefficients is not None and outcome.margin > best.margin):
+            if best is None or outcome.results is not None:
                 best = outcome
             grown = self.longer(durations, outcome)
             if grown.sum() > self.settings.duration_max or self.iterations >= self.settings.iterations_max:
                 return durations, best
             durations = grown
+
+    def restarted(self) -> Outcome | None:
+        """Other divisions of the way and of the time, drawn around the first durations: a plan, or None.
+
+        The drawing is seeded: the same problem has the same answer.
+        """
+        rng = np.random.default_rng(0)
+        for _ in range(_RESTARTS):
+            if self.iterations >= self.settings.iterations_max:
+                break
+            durations = self.first * np.exp(rng.uniform(-0.5, 1.2)) * np.exp(rng.normal(0.0, 0.25, len(self.first)))
+            pieces = np.exp(rng.normal(0.0, 0.5, rng.integers(1, 6)))
+            pieces *= durations[-1] / pieces.sum()
+            pieces[-1] = max(pieces[-1], self.settings.tube_time, self.settings.last_segment_min)
+            durations = np.append(durations[:-1], pieces)
+            if durations.min() >= SEGMENT_MIN and durations.sum() <= self.settings.duration_max:
+                outcome = self.try_durations(durations, patient=True)
+                if outcome.proved:
+                    return outcome
+        return None
 
     def longer(self, durations: np.ndarray, outcome: Outcome) -> np.ndarray:
         """The next durations: all are longer where the thrust fails before the last waypoint, else the approach. [M:IV-C.3]

@@ -36,6 +36,8 @@ def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> PlanAnswer:
     trajectory = plan.trajectory
     if isinstance(plan, PerchPlan):
         return PlanAnswer(True, plan.message, trajectory, trajectory.start_time, trajectory.duration)
+    if plan.recovery_start < 0.0:  # a perch alone, which the planner offers where it finds no recovery
+        return PlanAnswer(False, plan.message)
     at_end = AtEnd.RECOVER if plan.perch_time else AtEnd.HOLD  # a recovery alone ends in a hover
     return PlanAnswer(True, plan.message, trajectory, trajectory.start_time, plan.perch_time or plan.recovery_time, normalised(trajectory),
                       at_end, plan.recovery_start)

@@ -54,6 +54,9 @@ def _table(effort: Effort) -> Section:
             except PlanningRefusal as refusal:
                 refused.append(f"seed {seed}: {refusal}")
                 continue
+            if plan.recovery is None:
+                refused.append(f"seed {seed}: {plan.without_recovery}")
+                continue
             perch.append(plan.perch.solve_time)
             recovery.append(plan.recovery.solve_time)
             violated += sum(not bound.holds for bound in plan.bounds)

@@ -47,14 +47,20 @@ class Manoeuvre:
 
 @dataclass(frozen=True)
 class PowerlinePlan:
-    """A perch, a recovery, or one after the other."""
+    """A perch, a recovery, or one after the other.
+
+    Attributes:
+        perch, recovery: None where they were not asked for.
+        without_recovery: why there is no recovery although one was asked for; empty: there is, or none was.
+    """
 
     perch: Manoeuvre | None
     recovery: Manoeuvre | None
+    without_recovery: str = ""
 
     @property
     def parts(self) -> tuple[Manoeuvre, ...]:
-        """Perch and recovery, in order, without those that were not asked for."""
+        """Perch and recovery, in order, without those that there are not."""
         return tuple(part for part in (self.perch, self.recovery) if part is not None)
 
     @property

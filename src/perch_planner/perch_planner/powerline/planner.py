@@ -91,7 +91,7 @@ class PowerlinePlanner:
                 self.solver.problem(Structure(self.settings.intervals, lines, perception, self.settings.solver), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
-        """Plan a perch with its recovery, or a recovery alone.
+        """Plan a perch with its recovery, or a recovery alone; a perch after which no recovery is found says so.
 
         Raises:
             PlanningRefusal: bad request, or no trajectory within the limits was found.
@@ -101,8 +101,12 @@ class PowerlinePlanner:
         if request.recovery_only:
             return PowerlinePlan(None, self._fly(self._recovery(request, request.start, hover)))
         perch = self._fly(self._perch(request))
-        recovery = self._fly(self._recovery(request, perch.states[-1], hover)) if request.with_recovery else None
-        return PowerlinePlan(perch, recovery)
+        if not request.with_recovery:
+            return PowerlinePlan(perch, None)
+        try:
+            return PowerlinePlan(perch, self._fly(self._recovery(request, perch.states[-1], hover)))
+        except PlanningRefusal as refusal:
+            return PowerlinePlan(perch, None, str(refusal))
 
     def _perch(self, request: PowerlineRequest) -> _Task:
         s, pose, target = self.settings, request.perch, request.target()

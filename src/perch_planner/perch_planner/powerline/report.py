@@ -43,7 +43,7 @@ def summary(planned: PlannedProblem) -> dict[str, Any]:
                      "lower_limit": _finite(b.lower_limit), "upper_limit": _finite(b.upper_limit), "margin": b.margin,
                      "holds": b.holds} for b in planned.plan.bounds]
     out = {"problem": planned.problem.name, "vehicle": planned.vehicle.name, "compiled": planned.planner.solver.compiled,
-           **parts, "certificates": certificates}
+           **parts, "without_recovery": planned.plan.without_recovery, "certificates": certificates}
     if planned.plan.perch is not None:
         mount = planned.vehicle.mounts[planned.problem.settings.camera]
         out["visibility"] = visibility(planned.plan.perch.states, planned.request.target(), mount).summary()

@@ -104,8 +104,9 @@ def answer(found: plan.PowerlinePlan, model: RotorModel, sample_step: float, con
         at_end, recovery_start = (AtEnd.HOLD, 0.0) if perch is None else (AtEnd.RECOVER, float(perch.duration))
     words = ([] if perch is None else [f"perch after {perch.duration:.3f} s"]) + (
         [] if recovery is None else [f"recovery of {recovery.duration:.3f} s"])
+    without = f", without recovery: {found.without_recovery}" if found.without_recovery else ""
     return PowerlinePlan(
-        success=True, message=", then ".join(words), trajectory=trajectory, at_end=at_end,
+        success=True, message=", then ".join(words) + without, trajectory=trajectory, at_end=at_end,
         contact_time=0.0 if perch is None else float(contact_time), recovery_start=recovery_start,
         certificates=found.bounds,
         perch_time=0.0 if perch is None else float(perch.duration), recovery_time=0.0 if recovery is None else float(recovery.duration),
