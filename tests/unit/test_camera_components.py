@@ -250,7 +250,7 @@ def test_the_mapper_says_why_an_image_was_not_used(odometries, encoding, why):
 
 
 def test_the_mapper_works_in_grey_where_wires_are_dark():
-    component, out, _ = mapper(detection={"appearance": "dark"})
+    component, out, _ = mapper(detection={"appearance": "plain"})
     for ms in range(0, 200, 2):
         component.on_odometry(odometry(ms * MS))
     component.on_image(picture(100 * MS, load_vehicle("rpg").mounts["front"].camera, "mono8"))

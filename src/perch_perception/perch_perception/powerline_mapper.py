@@ -13,7 +13,7 @@ from perch_core.covariance import largest_sigma
 from perch_core.values import CameraImage, MappedPowerline, PowerlineMap, nanoseconds
 from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, mono_image, rgb_image
-from perch_perception.line_mapping import LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
+from perch_perception.line_mapping import Backdrop, LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.sensor_file import mount_rotation, sensors_parameter
 
@@ -52,14 +52,17 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
         self._forget()
 
     def _forget(self) -> None:
-        self._mapper, self._used = LineMapper(self.config.mapper), -np.inf
+        self._mapper, self._used, self._backdrop = LineMapper(self.config.mapper), -np.inf, None
+        if self.mounted.mount is not None:
+            self.use_camera(self.mounted.mount)
 
     def unusable(self, mount: CameraMount) -> str:
         """Red wires need colour."""
         return "no colour camera" if self.config.detection.appearance == "red" and not mount.colour else ""
 
     def use_camera(self, mount: CameraMount) -> None:
-        """Nothing is kept that depends on the camera."""
+        """What was seen through another lens is not compared."""
+        self._backdrop = Backdrop(mount.camera) if self.config.detection.appearance == "plain" else None
 
     def restart(self) -> None:
         """Forget the map, too."""
@@ -74,8 +77,12 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
         mount, problem = self.mounted.mount, ""
         try:
             body = mapping_pose(self.bodies, exposed, self.config.max_pose_sigma)
-            sightings = detect_lines(self._pixels(image, mount.camera), mount.camera, self.config.detection)
-            lines = self._mapper.update(exposed, body, [place(one, body, mount) for one in sightings])
+            pixels = self._pixels(image, mount.camera)
+            sightings = detect_lines(pixels, mount.camera, self.config.detection)
+            if self._backdrop is not None:
+                self._backdrop.look(pixels, exposed, *mount.pose(body.p_WB - body.corrected, body.R_WB))
+            lines = self._mapper.update(exposed, body, [place(one, body, mount) for one in sightings],
+                                        self._backdrop.attached if self._backdrop is not None else None)
             self._images += 1
         except (ImageError, StampError) as error:
             lines, problem = self._mapper.map(exposed), str(error)

@@ -1,5 +1,6 @@
 """Powerlines from colour images: wires detected, associated and triangulated with the poses of their exposures."""
 
+from perch_perception.line_mapping.backdrop import Backdrop
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.detection import LineDetectionConfig, LineSighting, detect_lines
 from perch_perception.line_mapping.mapper import LineMap, LineMapper, MappedLine, MapperConfig
@@ -7,6 +8,6 @@ from perch_perception.line_mapping.observation import LineObservation, place
 from perch_perception.line_mapping.triangulation import (
     DegenerateBaseline, TriangulationConfig, WireEstimate, triangulate)
 
-__all__ = ["DegenerateBaseline", "LineDetectionConfig", "LineMap", "LineMapper", "LineObservation", "LineSighting",
+__all__ = ["Backdrop", "DegenerateBaseline", "LineDetectionConfig", "LineMap", "LineMapper", "LineObservation", "LineSighting",
            "MappedLine", "MapperConfig", "TriangulationConfig", "WireCurve", "WireEstimate", "detect_lines", "place",
            "triangulate"]

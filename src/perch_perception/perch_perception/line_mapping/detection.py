@@ -3,19 +3,21 @@
 A straight wire is seen as a plane through the optical centre, under any lens; one that sags, as an arc near a plane. So
 pixels of redness R - max(G, B) become ridge points across each blob, these become rays, and parabolas about the blob's
 plane are fitted to them. The threshold on redness gives no false segments on a textured background, where a line
-detector on the red channel gave thousands. Wires without a colour are found as dark ridges instead (see `ridge`).
+detector on the red channel gave thousands. Wires without a colour are ridges that run straight through the image (see `straight`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from perch_core import config
 from perch_core.camera import Camera
-from perch_perception.line_mapping.ridge import dark_ridges
+from perch_perception.line_mapping.centring import centred
+from perch_perception.line_mapping.ridges import ridges
+from perch_perception.line_mapping.straight import wires
 
 SAMPLES = 7          # rays that stand for a sighting
 HYPOTHESES = 64      # arcs tried per blob and round
@@ -31,24 +33,17 @@ MEETING, MEETING_AT, MEETING_OVER = 0.4, 3.25, 1.1
 class LineDetectionConfig:
     """What counts as a wire in the image."""
 
-    appearance: str = config.choice("red", options=("red", "dark"),
-                                    doc="red: redder than everything else; dark: darker than what is behind it")
+    appearance: str = config.choice("red", options=("red", "plain"),
+                                    doc="red: redder than everything else; plain: brighter or darker than what is behind it")
     redness: float = config.quantity(20.0, low=1.0, high=255.0, doc="least R - max(G, B) of a red wire [grey values]")
-    darkness: float = config.quantity(7.0, low=1.0, high=255.0, doc="least ridge answer of a dark wire [grey values]")
     min_length: float = config.quantity(30.0, unit="px", above=0.0, high=640.0, doc="shorter red arcs are not used")
-    dark_min_length: float = config.quantity(120.0, unit="px", above=0.0, high=640.0,
-                                             doc="shorter dark arcs are not used: texture and corners make short ones")
+    plain_min_length: float = config.quantity(80.0, unit="px", above=0.0, high=640.0, doc="shorter arcs of plain wires are not used")
     tolerance: float = config.quantity(1.5, unit="px", above=0.0, high=20.0, doc="of ridge points from their arc")
     max_gap: float = config.quantity(25.0, unit="px", above=0.0, high=200.0, doc="hole after which an arc is another one")
     sigma: float = config.quantity(0.2, unit="px", above=0.0, high=5.0, doc="error of an arc that averaging does not remove")
     width_loss: float = config.quantity(0.5, unit="px", low=0.0, high=5.0,
                                         doc="a wire wider than 6 px looks narrower by this: blurred, and darker at its rims")
     min_width: float = config.quantity(4.0, unit="px", above=0.0, high=100.0, doc="the thickness of a thinner wire is not measured")
-
-    @property
-    def least(self) -> float:
-        """Least length of an arc [px]."""
-        return self.min_length if self.appearance == "red" else self.dark_min_length
 
 
 @dataclass(frozen=True)
@@ -80,30 +75,38 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
     """Wires in an image, the longest first.
 
     Args:
-        image: rgb8, shape (height, width, 3); for dark wires mono8, shape (height, width), too.
+        image: rgb8, shape (height, width, 3); for plain wires mono8, shape (height, width), too.
         camera: its lens.
         settings: what counts as a wire.
     """
-    if settings.appearance == "red":
-        strength, threshold = redness(image), settings.redness
-    else:
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        strength, threshold = dark_ridges(grey), settings.darkness
-    mask = (strength > threshold).astype(np.uint8)
+    if settings.appearance == "plain":
+        return _plain(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), camera, settings)
+    strength = redness(image)
+    mask = (strength > settings.redness).astype(np.uint8)
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     padded = np.pad(strength.astype(float), EDGE_REACH, constant_values=np.nan)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     sightings = []
     for label in range(1, count):
         x, y, w, h = stats[label, :4]
-        if max(w, h) < settings.least:
+        if max(w, h) < settings.min_length:
             continue
         window = slice(y, y + h), slice(x, x + w)
         around = padded[y:y + h + 2 * EDGE_REACH, x:x + w + 2 * EDGE_REACH]
         pixels, edges = ridge_points(np.where(labels[window] == label, strength[window], 0).astype(float), around)
-        if settings.appearance == "dark":
-            edges[:] = np.nan  # the filter's edges, not the wire's
         sightings += _arcs(pixels + (x, y), edges + (x, y), camera, settings)
+    return sorted(sightings, key=lambda sighting: -sighting.length)
+
+
+def _plain(grey: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> list[LineSighting]:
+    """Wires that have no colour of their own; their widths are not measured."""
+    found = ridges(grey)
+    rays, edges = camera.unproject(found.pixels), np.full((len(found.pixels), 2, 2), np.nan)
+    arcs = wires(found, camera, settings.tolerance, settings.plain_min_length)
+    sightings = []
+    for arc in arcs:
+        one = _sighting(arc.points, found.pixels, edges, rays, arc.scatter / camera.fx, camera, settings)
+        sightings.append(replace(one, rays_C=centred(grey, camera, one.rays_C, arc.bright, arc.level)))
     return sorted(sightings, key=lambda sighting: -sighting.length)
 
 
@@ -152,7 +155,7 @@ def _arcs(pixels, edges, camera, settings) -> list[LineSighting]:
     rays = camera.unproject(pixels)
     seen = np.all(np.isfinite(rays), axis=1)
     pixels, edges, rays = pixels[seen], edges[seen], rays[seen]
-    if len(rays) < settings.least:
+    if len(rays) < settings.min_length:
         return []
     along, across = _arc_coordinates(rays)
     rng = np.random.default_rng(len(pixels))  # the same image gives the same arcs
@@ -160,10 +163,10 @@ def _arcs(pixels, edges, camera, settings) -> list[LineSighting]:
     left = np.arange(len(pixels))
     sightings: list[LineSighting] = []
     for _ in range(MAX_LINES):
-        if len(left) < settings.least:
+        if len(left) < settings.min_length:
             break
         inlier, spread = _best_arc(along[left], across[left], rng, tolerance)
-        if inlier.sum() < settings.least:
+        if inlier.sum() < settings.min_length:
             break
         chosen = left[inlier]
         chosen = chosen[np.argsort(along[chosen], kind="stable")]
@@ -218,7 +221,7 @@ def _pieces(ordered: np.ndarray, pixels: np.ndarray, settings: LineDetectionConf
     steps = np.linalg.norm(np.diff(pixels[ordered], axis=0), axis=1)
     pieces = np.split(ordered, np.nonzero(steps > settings.max_gap)[0] + 1)
     return [p for p in pieces if len(p) >= 2 * SAMPLES
-            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.least]
+            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.min_length]
 
 
 def _sighting(piece, pixels, edges, rays, spread, camera, settings) -> LineSighting:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Sequence
 
@@ -18,6 +19,7 @@ from perch_perception.line_mapping.triangulation import (
 from perch_perception.pose_buffer import BodyState
 
 PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
+CERTAIN = 3           # so many more images that show a line to be attached to what is beside it than apart: no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 
 
@@ -83,6 +85,7 @@ class _Track:
     estimate: WireEstimate | None = None
     extent: tuple[float, float] | None = None
     refusal: str = ""
+    attached: int = 0  # images that show it to be attached to what is beside it, less those that show it apart
 
 
 class LineMapper:
@@ -99,19 +102,22 @@ class LineMapper:
         self._body: BodyState | None = None
         self._corrected = np.zeros(3)
 
-    def update(self, time: float, body: BodyState, seen: Sequence[LineObservation]) -> LineMap:
+    def update(self, time: float, body: BodyState, seen: Sequence[LineObservation],
+               attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> LineMap:
         """Take the sightings of one image.
 
         Args:
             time: of the exposure [s].
             body: state of the body then; the covariance of its attitude is the odometry's share of the map's.
             seen: the sightings, placed with this state.
+            attached: says of a sighting and its wire (both without what the odometry corrected) whether it lies on what is beside it.
         """
         self._corrected = body.corrected
         self._body = replace(body, p_WB=body.p_WB - body.corrected)
         seen = [replace(one, p_WC=one.p_WC - body.corrected) for one in seen]
         changed = set()
-        for one, owner in zip(seen, associate(self._tracks, seen, self.settings.association)):
+        owners = associate(self._tracks, seen, self.settings.association)
+        for one, owner in zip(seen, owners):
             if owner is None:
                 continue
             if owner < 0:
@@ -121,6 +127,10 @@ class LineMapper:
                 changed.add(owner)
         for index in sorted(changed):
             self._triangulate(self._tracks[index])
+        for one, owner in zip(seen, owners) if attached is not None else ():
+            if owner is not None and owner >= 0 and (track := self._tracks[owner]).estimate is not None:
+                verdict = attached(one, track.estimate.curve)
+                track.attached += 0 if verdict is None else 1 if verdict else -1
         self._merge()
         self._supersede(time)
         self._tracks = [t for t in self._tracks
@@ -131,7 +141,7 @@ class LineMapper:
         """The present map."""
         lines, missing = [], []
         for track in self._tracks:
-            if track.count < MIN_OBSERVATIONS:
+            if track.count < MIN_OBSERVATIONS or track.attached >= CERTAIN:
                 continue
             if track.estimate is None:
                 missing.append(f"line {track.id}: {track.refusal}")
@@ -190,7 +200,7 @@ class LineMapper:
             merged = sorted(twin.observations + track.observations, key=lambda one: one.time)
             while len(merged) > self.settings.max_observations:
                 merged = _thinned(merged)
-            twin.observations, twin.count = merged, twin.count + track.count
+            twin.observations, twin.count, twin.attached = merged, twin.count + track.count, twin.attached + track.attached
             self._triangulate(twin)
         self._tracks = kept
 
