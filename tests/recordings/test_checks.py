@@ -5,7 +5,7 @@ import pytest
 
 from perch_core.sensors import load_sensors
 from perch_core.values import CameraImage
-from perch_eval.recordings import camera_check, sensors_command
+from perch_eval.recordings import camera_check, clocks, sensors_command
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import evaluate
 from perch_eval.recordings.imu_check import allan_deviation, longest_still
@@ -36,8 +36,9 @@ class Told(Recording):
 
 @pytest.fixture(autouse=True)
 def few_looks(monkeypatch):
-    """A dozen images are enough here."""
+    """A dozen images and four seconds of turns are enough here."""
     monkeypatch.setattr(camera_check, "LOOKED_AT", 12)
+    monkeypatch.setattr(clocks, "SPAN", 4.0)
 
 
 def spoilt(heard, imu=lambda k, s: s, image=lambda k, i: i):
@@ -74,7 +75,8 @@ def test_nothing_is_wrong_with_a_good_one(heard):
     (dict(imu=lambda k, s: s._replace(stamp=s.stamp - 4_500_000 * (k % 2))), "imu jitter", "warning"),
     (dict(imu=lambda k, s: s if k % 5 == 0 else None), "imu rate", "fails"),
     (dict(imu=lambda k, s: s._replace(stamp=s.stamp + 3600 * 10**9)), "camera cam0 clock", "fails"),
-    (dict(image=lambda k, i: CameraImage(i.stamp + 60_000_000, i.frame, i.width, i.height, i.encoding, i.pixels())), "camera cam0 clock", "fails"),
+    (dict(image=lambda k, i: CameraImage(i.stamp + 60_000_000, i.frame, i.width, i.height, i.encoding, i.pixels())),
+     "camera cam0 clock", "fails"),
     (dict(image=pixels(lambda p: p // 40)), "camera cam0 exposure", "fails"),
     (dict(image=pixels(lambda p: np.full_like(p, 128))), "camera cam0 texture", "fails"),
     (dict(image=pixels(lambda p: p[::2, ::2])), "camera cam0", "fails"),

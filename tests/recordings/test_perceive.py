@@ -1,4 +1,4 @@
-"""`scripts/perceive.py` on a photographed floor: what it finds is where it is, in every format; what it cannot read is refused in a line."""
+"""`scripts/perceive.py` on a photographed floor: what it finds is where it is, and what it cannot read is refused in a line."""
 
 import json
 import shutil

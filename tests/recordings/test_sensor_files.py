@@ -50,7 +50,8 @@ def test_an_imu_that_is_mounted_turned(tmp_path):
     file = tmp_path / "turned.yaml"
     file.write_text(to_yaml(turned))
     taken = []
-    for component in (VioComponent(VioComponentConfig(sensors=str(file), camera="cam0")), StateEstimator(EstimatorConfig(sensors=str(file)))):
+    vio, estimator = VioComponent(VioComponentConfig(sensors=str(file), camera="cam0")), StateEstimator(EstimatorConfig(sensors=str(file)))
+    for component in (vio, estimator):
         taken.append(component._intake.take(ImuSample(1, (0.1, 0.2, 0.3), (1.0, 2.0, 9.0))))
     for sample in taken:
         np.testing.assert_allclose(sample.f_B, R_BI.apply([1.0, 2.0, 9.0]), atol=1e-6)
@@ -97,7 +98,8 @@ def test_the_command(files, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("old, new, words", [
-    ("camera_model: pinhole", "camera_model: omni", "camera_model"), ("distortion_model: radtan", "distortion_model: fov", "distortion_model"),
+    ("camera_model: pinhole", "camera_model: omni", "camera_model"),
+    ("distortion_model: radtan", "distortion_model: fov", "distortion_model"),
     ("resolution: [512, 384]", "resolution: [512]", "resolution"), ("T_cam_imu", "T_other", "T_cam_imu"),
     ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: late", "timeshift_cam_imu"), ("[300.0,", "[-300.0,", "focal"),
     ("0.000000000000000, 1.000000000000000]", "0.000000000000000, 2.000000000000000]", "rigid")])
@@ -118,7 +120,7 @@ def test_components_take_everything_from_the_file(files):
     assert target.mounted.nominal.camera == sensors.mounts["cam0"].camera
     assert np.radians(target.config.calibration.rotation) == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
     config = PowerlineMapperConfig(sensors=name, camera="cam0")
-    wires = PowerlineMapper(replace(config, detection=replace(config.detection, appearance="dark")))
+    wires = PowerlineMapper(replace(config, detection=replace(config.detection, appearance="plain")))
     assert np.radians(wires.config.mapper.triangulation.mount_rotation) == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
     with pytest.raises(ConfigError, match="'down' of .* is not there; usable: cam0"):
         VioComponent(VioComponentConfig(sensors=name))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 from perch_core.errors import PerchError
 from perch_core.ros.messages.sensing import compressed_value, image_value, imu_value
 from perch_core.sensors import Sensors
-from perch_core.values import CameraImage
+from perch_core.values import CameraImage, ImuSample
 from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError
 
 IMAGES = {"sensor_msgs/msg/Image": image_value, "sensor_msgs/msg/CompressedImage": compressed_value}
@@ -55,46 +53,71 @@ class BagRecording(Recording):
         self.samples = counts[self._imu] if self._imu else 0
 
     def events(self) -> Iterator[Event]:
-        """In the order in which they were recorded. An image of an encoding that is not known here ends the reading."""
+        """In the order in which they were recorded. Images that cannot be used are left out and said in `damage`."""
         sources = {topic: name for name, topic in self._cameras.items()}
         if self._imu:
             sources[self._imu] = IMU
+        unusable: list[str] = []
         with _open(self.path) as reader:
-            try:
-                for connection, arrived, data in reader.messages([c for c in reader.connections if c.topic in sources]):
-                    message = reader.deserialize(data, connection.msgtype)
-                    source = sources[connection.topic]
-                    yield Event(source, arrived,
-                                imu_value(message)._replace(frame="imu_link") if source == IMU else self._image(message, connection))
-            except _damage() as error:
-                self.damage = f"{type(error).__name__}: {error}"
+            messages = reader.messages([c for c in reader.connections if c.topic in sources])
+            while True:
+                try:
+                    connection, arrived, data = next(messages)
+                    value = self._value(sources[connection.topic], connection, reader.deserialize(data, connection.msgtype))
+                except StopIteration:
+                    break
+                except PerchError as error:
+                    unusable.append(f"{connection.topic}: {error}")
+                    continue
+                except Exception as error:  # whatever the libraries make of a damaged file
+                    self.damage = f"{type(error).__name__}: {error}"
+                    break
+                yield Event(sources[connection.topic], arrived, value)
+        if unusable:
+            self.damage = f"{len(unusable)} messages cannot be used, the first: {unusable[0]}" + (f"; {self.damage}" if self.damage else "")
 
-    def poses(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """(stamp [ns], geometry_msgs pose or transform) of each message of a topic.
+    def poses(self, topic: str) -> list[tuple[Any, ...]]:
+        """(stamp [ns], x, y, z [m], qx, qy, qz, qw) of each message of a topic.
 
         Raises:
             RecordingError: there is no such topic, or its messages are no poses.
         """
+        rows: list[tuple[Any, ...]] = []
         with _open(self.path) as reader:
             connections = [c for c in reader.connections if c.topic == topic]
             if not connections:
                 raise RecordingError(f"{self.path}: no topic {topic}")
-            for connection, _, data in reader.messages(connections):
-                message = reader.deserialize(data, connection.msgtype)
-                inner = getattr(message, "pose", getattr(message, "transform", None))
-                inner = getattr(inner, "pose", inner)
-                if inner is None or not hasattr(message, "header"):
-                    raise RecordingError(f"{self.path}: {topic}: {connection.msgtype} is no stamped pose, transform or odometry")
-                yield message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec, inner
+            kind = connections[0].msgtype
+            try:
+                for connection, _, data in reader.messages(connections):
+                    message = reader.deserialize(data, connection.msgtype)
+                    inner = getattr(message, "pose", getattr(message, "transform", None))
+                    inner, stamp = getattr(inner, "pose", inner), message.header.stamp
+                    rows.append((stamp.sec * 1_000_000_000 + stamp.nanosec, *_numbers(inner)))
+            except AttributeError:
+                raise RecordingError(f"{self.path}: {topic}: {kind} is no stamped pose, transform or odometry") from None
+            except Exception as error:  # whatever the libraries make of a damaged file
+                raise RecordingError(f"{self.path}: {topic}: {error}") from None
+        return rows
 
-    def _image(self, message: Any, connection: Any) -> CameraImage:
-        try:
-            if getattr(message, "encoding", "") in WIDE:
-                message.data = message.data.reshape(-1, 2)[:, 0 if message.is_bigendian else 1].copy()
-                message.step, message.encoding = message.step // 2, WIDE[message.encoding]
-            return IMAGES[connection.msgtype](message)
-        except PerchError as error:
-            raise RecordingError(f"{self.path}: {connection.topic}: {error}") from None
+    def _value(self, source: str, connection: Any, message: Any) -> ImuSample | CameraImage:
+        """A message as a value.
+
+        Raises:
+            PerchError: an image of an encoding that is not known here, or that cannot be decoded.
+        """
+        if source == IMU:
+            return imu_value(message)._replace(frame="imu_link")
+        if getattr(message, "encoding", "") in WIDE:  # the upper 8 of 16 bits
+            message.data = message.data.reshape(-1, 2)[:, 0 if message.is_bigendian else 1].copy()
+            message.step, message.encoding = message.step // 2, WIDE[message.encoding]
+        return IMAGES[connection.msgtype](message)
+
+
+def _numbers(pose: Any) -> tuple[float, ...]:
+    """x y z qx qy qz qw of a geometry_msgs Pose or Transform."""
+    p, q = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def _topic(wanted: str, there: set[str]) -> str:
@@ -111,17 +134,6 @@ def _camera_of(topic: str, others: list[str]) -> str:
     return first.rpartition("camera_")[2].replace("/", "_") or "camera"
 
 
-def _damage() -> tuple[type[BaseException], ...]:
-    """What a damaged bag raises."""
-    from rosbags.highlevel import AnyReaderError
-    from rosbags.rosbag1 import ReaderError as Reader1Error
-    from rosbags.rosbag2 import ReaderError as Reader2Error
-    from rosbags.serde import SerdeError
-
-    return (AnyReaderError, Reader1Error, Reader2Error, SerdeError, struct.error, EOFError, OSError, sqlite3.Error, AssertionError,
-            KeyError, ValueError, IndexError)
-
-
 def _open(path: Path) -> Any:
     """A reader of a bag.
 
@@ -134,8 +146,8 @@ def _open(path: Path) -> Any:
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         reader.open()
-    except _damage() as error:
-        raise RecordingError(f"{path}: cannot be read: {error or type(error).__name__}") from None
+    except Exception as error:  # whatever the libraries make of a damaged file
+        raise RecordingError(f"{path}: cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from None
     return _Opened(reader)
 
 

@@ -12,6 +12,8 @@ from perch_eval.recordings.findings import Report
 from perch_eval.recordings.imu_check import check_imu
 from perch_eval.recordings.recording import IMU, Event, Recording
 
+DAY = 86_400_000_000_000  # [ns]
+
 
 def check(recording: Recording, watched: Callable[[Iterator[Event]], Iterator[Event]] = lambda events: events) -> Report:
     """Read a recording once and judge it.
@@ -35,6 +37,11 @@ def check(recording: Recording, watched: Callable[[Iterator[Event]], Iterator[Ev
         report.say("imu", "there is no IMU: only single images can be looked at", warning=True)
     imu = np.array(samples).reshape(-1, 6)
     times = np.array(stamps, np.int64)
+    if len(times):
+        near = np.abs(times - np.median(times)) < DAY
+        if not near.all():
+            report.say("imu stamps", f"{int((~near).sum())} are more than a day from the others", warning=True)
+            imu, times = imu[near], times[near]
     if len(times) > 10:
         check_imu(report, times, imu, sensors.imu if sensors else None)
     elif len(times):

@@ -278,7 +278,7 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
         image, name = event.value, getattr(event.value, "path", Path(str(event.value.stamp))).name
         sensor = recording.sensors.cameras.get(event.source) if recording.sensors else None
         mount = sensor.mount(event.source) if sensor else guessed_mount(event.source, image.width, image.height)
-        wires = LineDetectionConfig(appearance="red" if sensor and sensor.colour else "dark")
+        wires = LineDetectionConfig(appearance="red" if sensor and sensor.colour else "plain")
         try:
             found = look(image, mount, board, wires, sensor is not None)
         except ImageError as error:

@@ -166,7 +166,7 @@ class Perception:
         self._sensors, self._choice = sensors, choice
         common = {"sensors": choice.sensors}
         down, front = common | {"camera": choice.down}, common | {"camera": choice.front}
-        wires = "red" if sensors.cameras[choice.front].colour else "dark"
+        wires = "red" if sensors.cameras[choice.front].colour else "plain"
         self.vio: _Vio = self._make("vio", _Vio, down | {"level_ground": False})
         self.vio.frames, self.vio.gallery = [], Gallery()
         self.estimator: StateEstimator = self._make("estimator", StateEstimator, common)

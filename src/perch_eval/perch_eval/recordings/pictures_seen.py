@@ -14,7 +14,7 @@ from perch_core.tag_board import FAMILIES, Tag, TagBoard
 from perch_core.values import CameraImage, TargetPose
 from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_tags, draw_wires
 from perch_eval.recordings.gallery import Shown
-from perch_perception.images import mono_image
+from perch_perception.images import mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting, detect_lines
 from perch_perception.tags import BoardLocalizer, BoardPose, TagDetector, refine_corners
 
@@ -89,12 +89,12 @@ def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDet
         pose, message = found.board, found.message
     else:
         pose, message = None, "the camera is not calibrated: no pose"
-    return Seen(tags, pose, message, detect_lines(grey if wires.appearance == "dark" else image.pixels()[..., ::-1], mount.camera, wires),
-                mount)
+    pixels = rgb_image(image, mount.camera) if wires.appearance == "red" else grey
+    return Seen(tags, pose, message, detect_lines(pixels, mount.camera, wires), mount)
 
 
 def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[int, np.ndarray]]:
-    """Number and corners (TL, TR, BR, BL) [px], (4, 2), of every tag of a board's family in a grey image, several with one number included."""
+    """Number and corners (TL, TR, BR, BL) [px], (4, 2), of every tag of a board's family in a grey image, each time that it is there."""
     side = 0.1 * min(board.pad_size)
     anything = replace(board, grid=None, tags=tuple(Tag(number, (0.0, 0.0), side) for number in range(FAMILIES[board.family][1])))
     detection = TagDetector(anything, camera).search(grey)

@@ -88,9 +88,9 @@ def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
     if Path(given).is_file():
         return read_trajectory(Path(given))
     if isinstance(recording, BagRecording) and given.startswith("/"):
-        rows = [(stamp, *_pose(pose)) for stamp, pose in recording.poses(given)]
-        return _checked(f"{recording.path}: {given}", np.array([row[0] for row in rows], np.int64),
-                        np.array([row[1:] for row in rows], float))
+        rows = recording.poses(given)
+        stamps = np.array([row[0] for row in rows], np.int64)
+        return _checked(f"{recording.path}: {given}", stamps, np.array([row[1:] for row in rows], float))
     raise RecordingError(f"--truth {given}: is no file{', and no topic' if isinstance(recording, BagRecording) else ''}")
 
 
@@ -138,8 +138,3 @@ def _checked(source: str, stamps: np.ndarray, values: np.ndarray) -> Trajectory:
         raise RecordingError(f"{source}: columns 5 to 8 are no unit quaternions")
     return Trajectory(stamps, values[:, :3], values[:, 3:] / norms[:, None])
 
-
-def _pose(pose: object) -> tuple[float, ...]:
-    """x y z qx qy qz qw of a geometry_msgs Pose or Transform."""
-    p, q = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
-    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
