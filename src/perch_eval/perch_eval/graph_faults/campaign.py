@@ -123,15 +123,15 @@ def problems(row: dict[str, Any]) -> list[str]:
     if row["struck"] is None:
         return [f"the flight ended before the fault: {row['goal']}"]
     found = [] if row["end"] in SAFE else [f"ended {row['end']}"]
-    if not tolerated(row) and (row["named"] is None or row["named"] > NAMED):
+    if (row["named"] is None or row["named"] > NAMED) and not tolerated(row):
         found.append("not named" if row["named"] is None else f"named after {row['named']:.1f} s")
     found += [f"{name} ended, too" for name in row["ended"]] + [f"left: {one}" for one in row["left"]]
     return found
 
 
 def tolerated(row: dict[str, Any]) -> bool:
-    """Whether messages were disturbed and nobody noticed, as nothing came of it: the flight perched."""
-    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and row["named"] is None
+    """Whether messages were disturbed and nobody said so in time, as nothing came of it: the flight perched."""
+    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and (row["named"] is None or row["named"] > NAMED)
 
 
 def _ends(rows: Sequence[dict[str, Any]]) -> str:

@@ -190,7 +190,8 @@ class Group:
         """Segments of these processes, or of a port of their domain, that no process uses any more."""
         used = SharedMemory().used()
         found = (self._ports() - self._before) | {Path(name) for name in seen if Path(name).exists() and not _PORT.match(Path(name).name)}
-        return [f"shared memory {file.name}" for file in sorted(found) if re.sub("_[es]l$", "", str(file)) not in used]
+        return [f"shared memory {file.name}" for file in sorted(found)
+                if str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name))) not in used]
 
     def _ports(self) -> set[Path]:
         """Segments of the domain's ports; others are shared with other domains."""

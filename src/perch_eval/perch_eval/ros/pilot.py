@@ -236,6 +236,7 @@ class Pilot:
         if self._handler is not None:
             signal.signal(signal.SIGINT, self._handler)
         self._executor.shutdown()  # it holds the context, and so the middleware's threads, sockets and shared memory
+        self._client.destroy()
         self._node.destroy_node()
         self._context.try_shutdown()
         self._check_interrupt()
