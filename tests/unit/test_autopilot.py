@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 VEHICLE = load_vehicle("betaflight")
 VECTORS = st.lists(st.floats(-50, 50), min_size=3, max_size=3).map(np.array)
-ROTATIONS = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3).map(lambda q: Rotation.from_quat(q))
+ROTATIONS = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3).map(Rotation.from_quat)
 
 
 def answer(command: int, payload: bytes, direction: bytes = b">") -> bytes:
@@ -36,7 +36,8 @@ def answer(command: int, payload: bytes, direction: bytes = b">") -> bytes:
 
 # -- MSP -------------------------------------------------------------------------------------------------------------
 
-@given(payloads=st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=60)), max_size=5), noise=st.lists(st.binary(max_size=9), min_size=5, max_size=5),
+@given(payloads=st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=60)), max_size=5),
+       noise=st.lists(st.binary(max_size=9), min_size=5, max_size=5),
        cuts=st.lists(st.integers(1, 40), min_size=1, max_size=20))
 @settings(max_examples=100, deadline=None)
 def test_frames_are_found_in_whatever_pieces_and_between_noise(payloads, noise, cuts):
@@ -74,6 +75,8 @@ def test_another_firmware_is_refused_by_name(variant, number, words):
 
 
 def test_every_reason_not_to_arm_is_named():
+    known = {0: "gyro", 7: "throttle", 8: "tilted", 12: "calibrating", 13: "CLI", 16: "MSP", 18: "GPS", 21: "reboot", 24: "protocol", 27: "position"}
+    assert len(msp.ARMING_REASONS) == 28 and all(word in msp.ARMING_REASONS[bit] for bit, word in known.items())  # runtime_config.h of 4.6.0
     for count in (27, 29):  # 4.4 and 4.6
         for bit in range(count):
             payload = struct.pack("<HHHIBHBBBBIB", 0, 0, 0, 0, 0, 0, 3, 0, 0, count, 1 << bit, 0)

@@ -143,7 +143,8 @@ class Betaflight(Component[BetaflightParameters]):
 
     def _diagnose(self, now: int) -> None:
         silent = now - self._answered > NANOSECONDS
-        values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn, "skipped_bytes": self._parser.skipped}
+        values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn,
+                  "skipped_bytes": self._parser.skipped}
         if self._status is not None:
             values |= {"armed": self._status.armed, "refusals": ", ".join(self._status.refusals)}
         if self._battery is not None:

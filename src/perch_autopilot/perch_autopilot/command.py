@@ -19,7 +19,8 @@ EXAMPLES = """examples:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="betaflight.py", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = argparse.ArgumentParser(prog="betaflight.py", description=__doc__, epilog=EXAMPLES,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = out.add_subparsers(dest="verb", required=True)
     verbs.add_parser("build", help="make the program where it is not there yet")
     for verb, text in (("configure", "send the settings, have them saved"), ("check", "read the settings back")):

@@ -49,7 +49,8 @@ EDITS = (  # file, what stands there (a regular expression), what shall stand th
     ("main/fc/core.c", r"if \(lockMainPID\(\) != 0\) return;", ""),
     ("main/main.c", r"delayMicroseconds_real\(50\);", ""),
     # all that belongs to a cycle, in order, instead of by the clock
-    (_SCHEDULER, r"    if \(gyroEnabled\) \{\n        // Realtime.*?(?=    nowCycles = getCycleCounter\(\);\n    schedLoopRem[^;]*;\n\n    if \(!gyro)",
+    (_SCHEDULER, r"    if \(gyroEnabled\) \{\n        // Realtime.*?(?=    nowCycles = getCycleCounter\(\);\n"
+     r"    schedLoopRem[^;]*;\n\n    if \(!gyro)",
      """    if (gyroEnabled && lockMainPID() == 0) {
         currentTimeUs = micros();
         task_t *receiver = getTask(TASK_RX);

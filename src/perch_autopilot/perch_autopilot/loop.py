@@ -74,8 +74,8 @@ class FirmwareLoop:
         """Rotor speeds that the motors aim at in the period that begins now, shape (4,) [rad/s]; zero where they stand.
 
         Args:
-            now, x, speeds: as in `perch_sim.inner_loop`; of the state only the orientation goes to the firmware, whose rate loop does not look
-                at it.
+            now, x, speeds: as in `perch_sim.inner_loop`; of the state only the orientation goes to the firmware, whose rate loop does not
+                look at it.
             sample: what the IMU has read last.
         """
         sticks = self._channels if self._armed and self._turning else CENTRED  # it arms with the throttle down only

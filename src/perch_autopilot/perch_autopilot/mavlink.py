@@ -36,7 +36,7 @@ class MavlinkParameters:
 
     vehicle: str = text("snapdragon_rates", doc="config/vehicles/<name>.yaml, or a file")
     wire: str = text("/dev/ttyACM0@921600", doc="/dev/ttyACM0@921600, tcp:HOST:PORT")
-    system: int = quantity(1, low=1, high=255, doc="the autopilot's system id; ours is the same, with the component of a companion computer")
+    system: int = quantity(1, low=1, high=255, doc="the autopilot's system id; ours is the same, with a companion's component")
 
 
 class ClockOffset:
@@ -126,7 +126,8 @@ class Mavlink(Component[MavlinkParameters]):
     def _target(self, command: RatesThrust) -> None:
         rates = frames.body(np.array(command.w_B)) if command.armed else np.zeros(3)
         thrust = min(max(command.thrust / self._thrust_max, 0.0), 1.0) if command.armed else 0.0
-        self._send(self._mavlink.set_attitude_target_encode(0, self.config.system, 1, _IGNORE_ATTITUDE, (1.0, 0.0, 0.0, 0.0), *rates, thrust))
+        self._send(self._mavlink.set_attitude_target_encode(
+            0, self.config.system, 1, _IGNORE_ATTITUDE, (1.0, 0.0, 0.0, 0.0), *rates, thrust))
 
     # -- from it -----------------------------------------------------------------------------------------------------
 
@@ -165,8 +166,9 @@ class Mavlink(Component[MavlinkParameters]):
         elif kind == "HEARTBEAT" and message.get_srcComponent() == 1:
             self.offboard.heartbeat(now * 1e-9, message.autopilot, message.base_mode, message.custom_mode)
         elif kind == "HIGHRES_IMU" and self._clock.offset is not None:
-            f, w = (message.xacc, message.yacc, message.zacc), (message.xgyro, message.ygyro, message.zgyro)
-            self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(frames.body(w).tolist()), tuple(frames.body(f).tolist())))
+            f = frames.body(np.array([message.xacc, message.yacc, message.zacc]))
+            w = frames.body(np.array([message.xgyro, message.ygyro, message.zgyro]))
+            self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
         elif kind == "TIMESYNC":
             if message.tc1 == 0:
                 self._send(self._mavlink.timesync_encode(now, message.ts1))

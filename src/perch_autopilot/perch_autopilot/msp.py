@@ -20,10 +20,12 @@ GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000
 VERSIONS = ((4, 3), (4, 6))
 """Firmware with which the messages below have been read; later ones turn yaw's polarity."""
 ARMING_REASONS = (
-    "no gyro", "failsafe", "no radio signal (RX_FAILSAFE)", "not recovered from failsafe", "box failsafe switch", "runaway take-off", "crash detected",
-    "throttle is not low", "tilted beyond small_angle", "starting up (BOOT_GRACE_TIME)", "no pre-arm", "processor overload", "calibrating", "CLI is open",
-    "CMS menu is open", "OSD menu is open", "BST", "MSP connection blocks arming (configurator)", "paralyzed", "GPS rescue has no fix",
-    "RESC", "RPM filter without telemetry", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated", "motor protocol is not set",
+    "no gyro", "failsafe", "no radio signal (RX_FAILSAFE)", "not recovered from failsafe", "box failsafe switch", "runaway take-off",
+    "crash detected", "throttle is not low", "tilted beyond small_angle", "starting up (BOOT_GRACE_TIME)", "no pre-arm",
+    "processor overload", "calibrating", "CLI is open",
+    "CMS menu is open", "BST", "MSP connection blocks arming (configurator)", "paralyzed", "GPS rescue has no fix",
+    "RESC", "RPM filter without telemetry", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated",
+    "motor protocol is not set",
     "crash flip", "altitude hold", "position hold")
 """Why the firmware refuses to arm: by bit of its flags. Their number differs from 4.3 to 4.6, and the last one is always the same."""
 TOO_EARLY = "arming switch was on too early: switch it off first"

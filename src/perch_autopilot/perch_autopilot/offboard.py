@@ -1,4 +1,4 @@
-"""How an autopilot that speaks MAVLink is brought to follow: set points first, then its mode, then its motors. Pure: time is given to it."""
+"""How an autopilot that speaks MAVLink is brought to follow: set points, its mode, then its motors. Pure: time is given to it."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class RateCurve:
         return self.centre * stick + max(self.most - self.centre, 0.0) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
 
     def stick(self, rate: float) -> float:
-        """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. The curve rises, so it is found by bisection."""
+        """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. By bisection, as the curve rises."""
         if abs(rate) >= self.rate(1.0):
             return 1.0 if rate > 0 else -1.0
         low, high = 0.0, 1.0

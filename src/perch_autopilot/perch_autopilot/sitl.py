@@ -1,6 +1,6 @@
 """Betaflight's firmware in the loop: sensors and sticks in, motors out, one cycle per packet of the simulator.
 
-    UDP 9003  state   18 doubles: time [s], angular velocity (FRD), specific force (negated, FLU), orientation wxyz, velocity, position, pressure
+    UDP 9003  state   18 doubles: time [s], angular velocity (FRD), specific force (-FLU), orientation wxyz, velocity, position, pressure
     UDP 9004  sticks  double, 16 uint16: time [s], pulse widths [us]
     UDP 9002  motors  4 floats 0..1: front right, rear left, front left, rear right
     TCP 5761  CLI and MSP
