@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from perch_core.tag_board import load_board
-from perch_eval import demo
+from perch_eval import demo, soak
 from perch_eval.campaign import command as campaign
 from perch_eval.campaign.specification import load_campaign
 from perch_eval.evaluation import command as evaluation
+from perch_eval.graph_faults import campaign as faults
 from perch_eval.recordings import command as perceive
 from perch_eval.recordings import sensors_command
 from perch_eval.replay import command as replay
@@ -33,7 +34,7 @@ def start_stack_parser():
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
 PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
-           "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser}
+           "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser, "soak.py": soak.parser}
 
 
 def blocks(language):

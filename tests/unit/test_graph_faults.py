@@ -111,7 +111,7 @@ def test_processes_of_a_nursery_are_their_own_and_end_with_it(tmp_path, monkeypa
     os.killpg(pids[1], signal.SIGKILL)
 
 
-def until(done, patience=30.0):
+def until(done, patience=120.0):
     end = time.monotonic() + patience
     while not done():
         assert time.monotonic() < end
