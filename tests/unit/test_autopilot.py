@@ -75,8 +75,10 @@ def test_another_firmware_is_refused_by_name(variant, number, words):
 
 
 def test_every_reason_not_to_arm_is_named():
-    known = {0: "gyro", 7: "throttle", 8: "tilted", 12: "calibrating", 13: "CLI", 16: "MSP", 18: "GPS", 21: "reboot", 24: "protocol", 27: "position"}
-    assert len(msp.ARMING_REASONS) == 28 and all(word in msp.ARMING_REASONS[bit] for bit, word in known.items())  # runtime_config.h of 4.6.0
+    known = {0: "gyro", 7: "throttle", 8: "tilted", 12: "calibrating", 13: "CLI", 16: "MSP", 18: "GPS",
+             21: "reboot", 24: "protocol", 27: "position"}
+    assert len(msp.ARMING_REASONS) == 28  # runtime_config.h of 4.6.0
+    assert all(word in msp.ARMING_REASONS[bit] for bit, word in known.items())
     for count in (27, 29):  # 4.4 and 4.6
         for bit in range(count):
             payload = struct.pack("<HHHIBHBBBBIB", 0, 0, 0, 0, 0, 0, 3, 0, 0, count, 1 << bit, 0)
