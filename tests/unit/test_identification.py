@@ -18,7 +18,7 @@ PERIOD, FINE = 0.002, 20  # of commands and IMU [s]; steps of the test's own int
 
 
 def record(size=2.5, seconds=20.0, seed=1, oscillation=0.0):
-    """Commands held for a period, answers integrated in fine steps, IMU samples that are means over a period, and the data sheet's noise."""
+    """Commands held for a period, answers integrated in fine steps, IMU samples that are means over a period, with noise."""
     rng, n = np.random.default_rng(seed), round(seconds / PERIOD)
     command_t = PERIOD * np.arange(n)
     smooth = np.exp(-0.5 * (np.arange(-150, 151) / 30.0) ** 2)
@@ -68,7 +68,8 @@ def test_what_a_record_was_made_with_is_found(found):
 def test_a_hover_tells_nothing_and_says_so():
     found, _ = identify(record(size=0.05, seconds=10.0), VEHICLE)
     assert all(one.refused for one in found if one.key.startswith("actuation"))
-    assert "too small" in found[0].refused and "neither roll nor pitch" in next(one.refused for one in found if one.key == "actuation.delay")
+    assert "too small" in found[0].refused
+    assert "neither roll nor pitch" in next(one.refused for one in found if one.key == "actuation.delay")
 
 
 def test_a_loop_that_rings_is_none_of_first_order():
@@ -103,7 +104,8 @@ def test_the_program_flies_and_writes_a_vehicle_file(tmp_path, monkeypatch, caps
     """On a vehicle whose loop is 1.3 times as slow as its file says, and 4 % heavier."""
     (tmp_path / "slow.yaml").write_text("name: slow\nextends: surface_90\ndisturbance: {loop_lag_factor: 1.3, mass_factor: 1.04}\n")
     monkeypatch.setattr(command.flight, "ROUNDS", 1)
-    monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", "--scenario", str(tmp_path / "slow.yaml"), "--out", str(tmp_path)])
+    monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", "--scenario", str(tmp_path / "slow.yaml"), "--out",
+                                     str(tmp_path)])
     assert command.main() in (0, 1), capsys.readouterr().err  # drag needs a longer flight
     written, nominal = load_vehicle(tmp_path / "vehicle.yaml").actuation, VEHICLE.actuation
     wanted = [1.3 * lag + nominal.delay for lag in (*nominal.rate_lag, nominal.thrust_lag)]  # the rotors' own time counts as delay
@@ -114,7 +116,8 @@ def test_the_program_flies_and_writes_a_vehicle_file(tmp_path, monkeypatch, caps
     assert replace(load_vehicle(tmp_path / "vehicle.yaml"), name="x", drag=VEHICLE.drag, actuation=nominal) == replace(VEHICLE, name="x")
 
 
-@pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"), (["--vehicle", "snapdragon", "--recording", "/no/file"], "no such file")])
+@pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),
+                                              (["--vehicle", "snapdragon", "--recording", "/no/file"], "no such file")])
 def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["identify.py", *arguments])
     assert command.main() == 2

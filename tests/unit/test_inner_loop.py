@@ -37,13 +37,14 @@ def attitude_file(folder):
     return file
 
 
-# -- the controller's side -------------------------------------------------------------------------------------------------------------------
+# -- the controller's side -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("delay, gain", [(0.0, 1.0), (0.004, 1.0), (0.01, 0.8)])
 def test_a_loop_is_asked_for_what_the_rotors_would_do(delay, gain):
     """Rotors with their lag, and a loop of first order that is late: rates and thrust are the same, but for the delay."""
-    actuation = Actuation(type="rates_and_thrust", delay=delay, rate_lag=(0.03, 0.025, 0.06), rate_gain=(gain,) * 3, thrust_lag=0.04, thrust_gain=1 / gain)
+    actuation = Actuation(type="rates_and_thrust", delay=delay, rate_lag=(0.03, 0.025, 0.06), rate_gain=(gain,) * 3, thrust_lag=0.04,
+                          thrust_gain=1 / gain)
     vehicle, h = replace(VEHICLE, actuation=actuation), 0.002
     plant, estimate = Plant(vehicle, p=np.array([0.0, 0.0, 5.0])), stopped(vehicle).turning(HOVER)
     w, T, late = np.zeros(3), vehicle.hover_thrust, round(delay / h)
@@ -51,7 +52,8 @@ def test_a_loop_is_asked_for_what_the_rotors_would_do(delay, gain):
     for k in range(200):
         command = HOVER + np.array([[120, -60, -90, 60], [200, -200, 200, -200], [-150] * 4]).T @ np.sin(np.array([12, 9, 5]) * h * k)
         state = (*plant.p, *plant.v, 0.0, 0.0, 0.0, 1.0, *w)
-        estimate = estimate.after(h, vehicle.motor_time_constant).following(tuple(command), estimate.ahead(tuple(map(float, state)), vehicle), vehicle)
+        estimate = estimate.after(h, vehicle.motor_time_constant).following(tuple(command),
+                                                                            estimate.ahead(tuple(map(float, state)), vehicle), vehicle)
         queue.append((gain * np.array(estimate.sent.w_B), vehicle.mass * estimate.sent.thrust / gain))
         wanted, thrust = queue.pop(0)
         w = wanted + (w - wanted) * np.exp(-h / np.array(actuation.rate_lag))
@@ -66,7 +68,8 @@ def test_a_loop_is_asked_for_what_the_rotors_would_do(delay, gain):
 
 
 def test_commands_keep_to_the_loops_limits():
-    estimate = stopped(VEHICLE).turning(HOVER).following((VEHICLE.speed_max, VEHICLE.speed_min) * 2, (0.0,) * 9 + (1.0, 40.0, -40.0, 0.0), VEHICLE)
+    estimate = stopped(VEHICLE).turning(HOVER).following((VEHICLE.speed_max, VEHICLE.speed_min) * 2, (0.0,) * 9 + (1.0, 40.0, -40.0, 0.0),
+                                                         VEHICLE)
     assert np.abs(estimate.sent.w_B).max() <= VEHICLE.actuation.rate_max
     assert 0.0 <= estimate.sent.thrust <= 4 * VEHICLE.thrust_max / VEHICLE.mass
 
@@ -81,7 +84,8 @@ def test_an_attitude_is_that_at_which_its_loop_asks_for_the_rates(x):
     rates = stopped(VEHICLE).turning(HOVER).following(speeds, state, VEHICLE).sent
     sent = stopped(vehicle).turning(HOVER).following(speeds, state, vehicle, w_C).sent
     assert sent.w_B == w_C and sent.thrust == rates.thrust
-    np.testing.assert_allclose(rates_of_attitude(q, np.array(sent.q_WB), np.array(w_C), vehicle.actuation.attitude_lag), rates.w_B, atol=1e-9)
+    np.testing.assert_allclose(rates_of_attitude(q, np.array(sent.q_WB), np.array(w_C), vehicle.actuation.attitude_lag), rates.w_B,
+                               atol=1e-9)
 
 
 def test_rotors_without_a_loop_are_what_they_were():
@@ -103,7 +107,7 @@ def test_the_controller_speaks_the_vehicles_language_alone(attitude, tmp_path):
     assert not any(out.values())
 
 
-# -- the simulator's side --------------------------------------------------------------------------------------------------------------------
+# -- the simulator's side --------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=200)
@@ -183,7 +187,7 @@ def test_nonsense_is_refused_but_stops_the_motors_where_it_disarms():
     assert vehicle.simulation.plant.rotor_speed.max() < 50.0
 
 
-# -- the file, and flights -------------------------------------------------------------------------------------------------------------------
+# -- the file, and flights -------------------------------------------------------------------------------------------
 
 
 def test_the_planner_plans_for_the_rotors_below():
@@ -192,7 +196,8 @@ def test_the_planner_plans_for_the_rotors_below():
 
 def test_a_vehicle_takes_over_what_it_does_not_say_itself(tmp_path):
     vehicle = load_vehicle(attitude_file(tmp_path))
-    assert vehicle.actuation == replace(VEHICLE.actuation, type="attitude_and_thrust") and vehicle.inertia == load_vehicle("snapdragon").inertia
+    assert vehicle.actuation == replace(VEHICLE.actuation, type="attitude_and_thrust")
+    assert vehicle.inertia == load_vehicle("snapdragon").inertia
     (tmp_path / "odd.yaml").write_text("extends: snapdragon\nactuation: {type: thoughts}\n")
     with pytest.raises(ConfigError, match="thoughts"):
         load_vehicle(tmp_path / "odd.yaml")

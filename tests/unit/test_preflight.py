@@ -1,4 +1,4 @@
-"""Preflight: what is sound passes, every wrong axis, rate, stamp, clock and unit is named, and nothing is exercised that was not allowed."""
+"""Preflight: what is sound passes, every wrong axis, rate, stamp, clock and unit is named, and nothing is exercised unasked."""
 
 from dataclasses import replace
 from itertools import permutations, product
@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 VEHICLE = load_vehicle("snapdragon")
 PASSED, FAILED, OPEN = Verdict.PASSED, Verdict.FAILED, Verdict.OPEN
 MS = 1_000_000
-AXES = [R for order in permutations(range(3)) for signs in product((1, -1), repeat=3) if np.linalg.det(R := np.diag(signs)[:, order].astype(float)) > 0]
+AXES = [R for order in permutations(range(3)) for signs in product((1, -1),
+                                                                   repeat=3) if np.linalg.det(R := np.diag(signs)[:,
+                                                                                                                  order].astype(float)) > 0]
 
 
 def verdicts(found):
@@ -52,7 +54,8 @@ def test_units_and_motion_are_seen():
 
 @pytest.mark.parametrize("stamps, rate, even", [
     ([k * 2 * MS for k in range(500)], PASSED, PASSED), ([k * 20 * MS for k in range(50)], FAILED, PASSED),
-    ([k * 2 * MS + 30 * MS * (k > 200) for k in range(500)], PASSED, FAILED), ([k * 2 * MS - 4 * MS * (k == 200) for k in range(500)], PASSED, FAILED)])
+    ([k * 2 * MS + 30 * MS * (k > 200) for k in range(500)], PASSED, FAILED),
+                                                ([k * 2 * MS - 4 * MS * (k == 200) for k in range(500)], PASSED, FAILED)])
 def test_rates_and_stamps(stamps, rate, even):
     assert list(verdicts(checks.stream("imu/data_raw", stamps)).values()) == [rate, even]
 
@@ -80,12 +83,14 @@ def test_cameras_and_extrinsics_are_compared_with_the_file():
     assert {check.verdict for check in checks.extrinsics(frames, VEHICLE)} == {PASSED}
     assert {check.verdict for check in checks.extrinsics([], VEHICLE)} == {OPEN}
     moved = [f._replace(p=(f.p[0] + 0.05, *f.p[1:])) if f.child.startswith("camera_front") else f for f in frames]
-    assert [check.name for check in checks.extrinsics(moved, VEHICLE) if check.verdict is FAILED] == ["extrinsics camera_front_optical_frame"]
+    failed = [check.name for check in checks.extrinsics(moved, VEHICLE) if check.verdict is FAILED]
+    assert failed == ["extrinsics camera_front_optical_frame"]
 
 
 def test_shaking_too_little_is_no_verdict():
     rates = np.outer(np.sin(np.arange(60)), (1.0, 0.0, 0.0))  # about one axis alone
-    assert checks.shaken("down", rates, rates, VEHICLE).verdict is OPEN and checks.shaken("down", rates[:5], rates[:5], VEHICLE).verdict is OPEN
+    assert checks.shaken("down", rates, rates, VEHICLE).verdict is OPEN and checks.shaken("down", rates[:5], rates[:5],
+                                                                                          VEHICLE).verdict is OPEN
 
 
 def test_rotations_are_found_among_false_rays():
@@ -106,7 +111,8 @@ def test_a_camera_is_seen_to_turn():
     turns, rate = CameraTurns(camera), np.array([0.4, -0.6, 0.8])
     for k in range(4):
         R = Rotation.from_rotvec(rate * 0.033 * k).as_matrix()
-        turns.add(k * 33 * MS, cv2.warpPerspective(picture, camera.K @ R.T @ np.linalg.inv(camera.K), (camera.width, camera.height), borderMode=cv2.BORDER_REFLECT))
+        turns.add(k * 33 * MS, cv2.warpPerspective(picture, camera.K @ R.T @ np.linalg.inv(camera.K), (camera.width, camera.height),
+                                                   borderMode=cv2.BORDER_REFLECT))
     assert len(turns.spans) == 3
     for _, _, seen in turns.spans:
         np.testing.assert_allclose(seen, rate, atol=0.06)
@@ -149,7 +155,8 @@ def test_motors_that_go_on_without_commands_fail(motion, verdict):
     assert checks.stopped(10.0, motion).verdict is verdict
 
 
-@pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"), (["--vehicle", "rpg_published", "--listen", "0"], "[1, 300] s")])
+@pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),
+                                              (["--vehicle", "rpg_published", "--listen", "0"], "[1, 300] s")])
 def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["preflight.py", *arguments])
     assert command.main() == 2

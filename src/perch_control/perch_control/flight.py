@@ -263,7 +263,8 @@ class FlightController:
         self.position_error = norm(axpy(-1.0, setpoint.p, m.belief[0:3]))
         contact = m.time_to_contact
         state, delay = m.rotors.ahead(m.belief, self.vehicle), m.rotors.delay
-        out = self.law.control(state, Later(m, delay) if delay > 0.0 else m, m.rotors.led, self._compensation(contact), max(contact - delay, 0.0))
+        reference = Later(m, delay) if delay > 0.0 else m
+        out = self.law.control(state, reference, m.rotors.led, self._compensation(contact), max(contact - delay, 0.0))
         m.rotors = m.rotors.following(out.rotor_speed, state, self.vehicle, out.w_C)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
@@ -271,7 +272,8 @@ class FlightController:
         if self.supervisor.landed(setpoint):
             m.motors_off(self._lying, "landed, motors off")
             return self._idle()
-        return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event(), m.rotors.sent)
+        return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event(),
+                          m.rotors.sent)
 
     def _compensation(self, contact: float) -> tuple[float, ...]:
         """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""

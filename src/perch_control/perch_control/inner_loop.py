@@ -2,8 +2,8 @@
 
     w' = (rate_gain w_cmd - w) / rate_lag        T' = (thrust_gain T_cmd - T) / thrust_lag        on commands that are `delay` old
 
-The control laws ask for rotor speeds as always. What moment M and thrust T the rotors of the model have a period later, with their own lag and
-limits, is what the loop is asked for, by the inverse of its model; so it has no more to do than rotors can:
+The control laws ask for rotor speeds as always. What moment M and thrust T the rotors of the model have a period later, with their own
+lag and limits, is what the loop is asked for, by the inverse of its model; so it has no more to do than rotors can:
 
     w_cmd = w + rate_lag J^-1 (M - w x J w)      T_cmd = T_now + (T - T_now) / (1 - exp(-period / thrust_lag))
     q_cmd = q exp(attitude_lag (w_cmd - w_C)), for an attitude loop that asks for the rates w_C + error / attitude_lag
@@ -147,7 +147,8 @@ class InnerLoopEstimate(NamedTuple):
         constants = packed_vehicle(vehicle)
         return predicted(state, f, (0.0,) * 6, self.delay, constants[0][0], constants[0][1:4], constants[2])
 
-    def following(self, command: tuple[float, ...], state: tuple[float, ...], vehicle: Vehicle, w_C: tuple[float, ...] = _ZERO) -> InnerLoopEstimate:
+    def following(self, command: tuple[float, ...], state: tuple[float, ...], vehicle: Vehicle,
+                  w_C: tuple[float, ...] = _ZERO) -> InnerLoopEstimate:
         """The same with what makes the rotors follow commanded speeds.
 
         Args:

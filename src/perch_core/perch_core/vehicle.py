@@ -81,8 +81,8 @@ class ImuConfig:
 class Actuation:
     """What the vehicle takes from the controller, and how what stands between that and the rotors answers.
 
-    An inner loop is modelled by `w' = (rate_gain w_cmd - w) / rate_lag` on each axis and `T' = (thrust_gain T_cmd - T) / thrust_lag`, on commands
-    that are `delay` old; an attitude loop asks it for the rates that are fed forward + attitude error / `attitude_lag`.
+    An inner loop is modelled by `w' = (rate_gain w_cmd - w) / rate_lag` on each axis and `T' = (thrust_gain T_cmd - T) / thrust_lag`, on
+    commands that are `delay` old; an attitude loop asks it for the rates that are fed forward + attitude error / `attitude_lag`.
     """
 
     type: str = choice("rotor_speeds", options=("rotor_speeds", "rates_and_thrust", "attitude_and_thrust"))

@@ -1,7 +1,7 @@
 """An ideal rate or attitude loop in front of the rotors: first-order lags on the true state, and a mixer that saturates.
 
-It knows the vehicle as its file says, its own rotors' speeds and the true rates, and leads its rotors so far that moment and thrust are there
-after a control period wherever the rotors can reach them. Written apart from `perch_control.inner_loop`, which only has a model of it.
+It knows the vehicle as its file says, its own rotors' speeds and the true rates, and leads its rotors so far that moment and thrust are
+there after a control period wherever the rotors can reach them. Written apart from `perch_control.inner_loop`, which has a model of it.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ def targets(w, speeds, rates, thrust, J, mixing, coefficient, low, high, motor_l
         j, k = (i + 1) % 3, (i + 2) % 3
         moment[i] += (J[k] - J[j]) * w[j] * w[k]
     now = coefficient * (speeds * speeds).sum()
-    f = mixed(now + (thrust - now) * (1.0 - math.exp(-period / lags[3])), moment, mixing, coefficient * low * low, coefficient * high * high)
+    f = mixed(now + (thrust - now) * (1.0 - math.exp(-period / lags[3])), moment, mixing, coefficient * low * low,
+              coefficient * high * high)
     wanted = np.sqrt(f / coefficient)
     if motor_lag > 0.0:
         wanted = speeds + (wanted - speeds) / (1.0 - math.exp(-period / motor_lag))
@@ -118,8 +119,8 @@ class InnerLoop:
         self._rates, self._attitude = np.zeros(4), None
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
-        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop; one that is
-        not armed ends all before it."""
+        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop; one
+        that is not armed ends all before it."""
         if not armed:
             self._coming.clear()
             self._rates, self._attitude = np.zeros(4), None
@@ -138,7 +139,8 @@ class InnerLoop:
         """
         while self._coming and self._coming[0][0] <= now:
             _, self._rates, self._attitude = self._coming.popleft()
-        rates = self._rates[:3] if self._attitude is None else rates_of_attitude(x[3:7], self._attitude, self._rates[:3], self._attitude_lag)
+        rates = self._rates[:3] if self._attitude is None else rates_of_attitude(x[3:7], self._attitude, self._rates[:3],
+                                                                                 self._attitude_lag)
         rates = self._gain[:3] * np.clip(rates, -self._rate_max, self._rate_max)
         return targets(x[10:13], speeds, rates, self._gain[3] * self._rates[3], *self._rotors, self._lags, CONTROL_PERIOD)
 

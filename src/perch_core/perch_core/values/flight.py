@@ -74,8 +74,8 @@ class RatesThrust(NamedTuple):
 
 
 class AttitudeThrust(NamedTuple):
-    """Attitude xyzw, 4 floats, body rates to feed forward [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner attitude loop,
-    for the step with this stamp [ns]."""
+    """Attitude xyzw, 4 floats, body rates to feed forward [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner attitude
+    loop, for the step with this stamp [ns]."""
 
     stamp: int
     armed: bool

@@ -50,7 +50,8 @@ def main() -> int:
             flown = RecordedFlight(arguments.recording)
         found, answers = identify(record_of(flown), vehicle)
         arguments.out.mkdir(parents=True, exist_ok=True)
-        base = arguments.vehicle if not arguments.vehicle.endswith((".yaml", ".yml")) else config.find("vehicles", arguments.vehicle).resolve()
+        is_file = arguments.vehicle.endswith((".yaml", ".yml"))
+        base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
         (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base)))
         page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {arguments.recording or 'simulated flight'}")
     except PerchError as error:

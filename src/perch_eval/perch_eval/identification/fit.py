@@ -1,6 +1,6 @@
-"""Models of first order fitted to a record: by their output, as the commands were really given, with the scatter between parts of the flight.
+"""Models of first order fitted to a record by their output: the commands as they were given, and the scatter between parts of the flight.
 
-    w' = (rate_gain w_cmd(t - delay) - w) / rate_lag        f_z = T - drag_z v_z / mass,  T' = (thrust_gain T_cmd(t - delay) - T) / thrust_lag
+    w' = (rate_gain w_cmd(t - delay) - w) / rate_lag      f_z = T - drag_z v_z / mass,  T' = (thrust_gain T_cmd(t - delay) - T) / thrust_lag
     f_z = thrust_coefficient sum Omega^2 / mass - drag_z v_z / mass,  Omega' = (Omega_cmd - Omega) / motor_time_constant
     f_x = -drag_x v_x / mass + bias                         likewise y
 
@@ -46,7 +46,8 @@ class Found:
     refused: str = ""
 
     def __str__(self) -> str:
-        return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}" + (f"   not told: {self.refused}" if self.refused else "")
+        refused = f"   not told: {self.refused}" if self.refused else ""
+        return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{refused}"
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,10 @@ def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
 
 def _fitted(model: Callable[[np.ndarray, slice], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
             high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters of `model(parameters, samples)` and their standard deviations: the scatter of fits to parts, over the root of their number."""
+    """Parameters of `model(parameters, samples)`, and their standard deviations: the scatter of fits to parts / sqrt(their number)."""
     def fit(samples: slice, x0: Sequence[float]) -> np.ndarray:
-        return least_squares(lambda x: model(x, samples) - measured[samples], x0, bounds=(low, high), x_scale=np.maximum(np.abs(start), 1e-2),
-                             diff_step=1e-4).x
+        return least_squares(lambda x: model(x, samples) - measured[samples], x0, bounds=(low, high),
+                             x_scale=np.maximum(np.abs(start), 1e-2), diff_step=1e-4).x
 
     whole, cuts = fit(slice(None), start), np.linspace(0, len(measured), PARTS + 1).astype(int)
     parts = np.array([fit(slice(a, b), whole) for a, b in zip(cuts, cuts[1:])])
@@ -105,13 +106,15 @@ def rates(record: Record, axis: int, delay: float | None = None) -> tuple[list[F
 
     n = 4 if free else 3
     x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
-    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, record.rates[:, axis], 0.0), w, model(x, slice(None)))
+    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, record.rates[:, axis], 0.0), w,
+                    model(x, slice(None)))
     size, why = float(np.std(answer.command)), ""
     if size < LEAST_RATE:
         why = f"commands of {size:.2g} rad/s (1 sigma) are too small; {LEAST_RATE:g} are needed"
     elif answer.explained < EXPLAINED:
         why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
-    found = [_judged(f"actuation.rate_lag[{axis}]", x[0], sigma[0], "s", why), _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
+    found = [_judged(f"actuation.rate_lag[{axis}]", x[0], sigma[0], "s", why),
+             _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
     return found + ([_judged("actuation.delay", max(x[3], 0.0), sigma[3], "s", why, DELAY_CERTAIN)] if free else []), answer
 
 
@@ -136,7 +139,8 @@ def thrust(record: Record, vehicle: Vehicle, delay: float) -> tuple[list[Found],
         why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
     scale = vehicle.thrust_coefficient if rotors else 1.0
     certain = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's own offset looks like thrust
-    return [_judged(keys[0], x[0], sigma[0], "s", why), _judged(keys[1], scale * x[1], scale * certain, "N s^2/rad^2" if rotors else "", why),
+    return [_judged(keys[0], x[0], sigma[0], "s", why),
+            _judged(keys[1], scale * x[1], scale * certain, "N s^2/rad^2" if rotors else "", why),
             _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], answer
 
 

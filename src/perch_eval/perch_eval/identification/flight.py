@@ -61,7 +61,7 @@ def fly(scenario: Scenario, vehicle: str, seed: int) -> Flight:
             place, yaw = place + offset, yaw + turn
             go_on(duration + LEAD + PAUSE)
             if state.state is not State.HOVERING:
-                raise PerchError(f"the vehicle does not fly by its file: {state.message}; correct the file (mass, lags) or fly a calmer one")
+                raise PerchError(f"the vehicle does not fly by its file: {state.message}; correct its mass or its lags")
     finally:
         loop.close()
     return loop.trace.flight

@@ -17,7 +17,6 @@ from perch_eval.identification.fit import Answer, Found  # noqa: E402
 
 def entries(found: Sequence[Found], vehicle: Vehicle, base: str) -> str:
     """A vehicle file that extends `base` by what was told; what was not stays as it is there, with the reason in a comment."""
-    values: dict[str, object] = {}
     lines: list[str] = []
     for key in dict.fromkeys(one.key.split("[")[0] for one in found):
         group = [one for one in found if one.key.split("[")[0] == key]
@@ -28,14 +27,13 @@ def entries(found: Sequence[Found], vehicle: Vehicle, base: str) -> str:
             continue
         new = [old[i] if one.refused else one.value for i, one in enumerate(group)] if isinstance(old, tuple) else group[0].value
         told = not all(one.refused for one in group)
-        remark = "; ".join(f"{'xyz'[i] + ' ' if len(group) > 1 else ''}" + (f"not told ({one.refused})" if one.refused else f"+- {one.sigma:.2g} {one.unit}".rstrip())
-                           for i, one in enumerate(group))
-        values[key] = new
+        said = [f"not told ({one.refused})" if one.refused else f"+- {one.sigma:.2g} {one.unit}".rstrip() for one in group]
+        remark = "; ".join(f"{'xyz'[i]} {text}" if len(group) > 1 else text for i, text in enumerate(said))
         text = f"[{', '.join(f'{x:.4g}' for x in new)}]" if isinstance(new, list) else f"{new:.5g}"
         indent = "  " if key.startswith("actuation.") else ""
         lines.append(f"{indent}{'' if told else '# '}{name}: {text}".ljust(45) + f"# {remark}")
     mine, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]
-    head = [f"# Identified by scripts/identify.py; standard deviations beside the values.\nextends: {base}\nname: {vehicle.name}_identified"]
+    head = ["# Identified by scripts/identify.py, with standard deviations.", f"extends: {base}", f"name: {vehicle.name}_identified"]
     return "\n".join([*head, *mine, *(["actuation:", f"  type: {vehicle.actuation.type}", *inner] if inner else [])]) + "\n"
 
 

@@ -25,7 +25,8 @@ SHAKE = 5.0       # what the rotation from camera to IMU may differ from the fil
 TURNED = 0.3      # root mean square of the rates about the second axis that shaking needs [rad/s]
 ANSWER = 2.0      # from an order to its effect, heard by a program that shares the machine with others [s]
 STOPPED = 1.0     # from the last command to the motors' stop [s]
-RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0), "camera_front/camera_info": (5.0, 120.0)}
+RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
+         "camera_front/camera_info": (5.0, 120.0)}
 """Channel -> lowest and highest rate of its stamps [Hz]; a tenth is forgiven."""
 
 
@@ -47,7 +48,8 @@ class Check:
     advice: str = ""
 
     def __str__(self) -> str:
-        return f"{self.verdict.value:14s} {self.name:28s} {self.seen}" + (f"\n{'':15s}-> {self.advice}" if self.advice and self.verdict is not Verdict.PASSED else "")
+        what_to_do = f"\n{'':15s}-> {self.advice}" if self.advice and self.verdict is not Verdict.PASSED else ""
+        return f"{self.verdict.value:14s} {self.name:28s} {self.seen}{what_to_do}"
 
 
 def judged(name: str, good: bool, seen: str, advice: str) -> Check:
@@ -59,13 +61,16 @@ def stream(channel: str, stamps: Sequence[int]) -> list[Check]:
     """Rate of a channel, and whether its stamps [ns] go on evenly."""
     low, high = RATES[channel]
     if len(stamps) < 3:
-        return [Check(f"rate {channel}", Verdict.FAILED, f"{len(stamps)} messages", "start what publishes it; see namespaces, ROS_DOMAIN_ID and QoS (topic.py info)")]
+        return [Check(f"rate {channel}", Verdict.FAILED, f"{len(stamps)} messages",
+                      "start what publishes it; see namespaces, ROS_DOMAIN_ID and QoS (topic.py info)")]
     gaps = 1e-9 * np.diff(np.array(stamps, dtype=np.int64))
     period = float(np.median(gaps))
     rate = 1.0 / period if period > 0.0 else np.inf
-    return [judged(f"rate {channel}", 0.9 * low <= rate <= 1.1 * high, f"{rate:.4g} Hz", f"{low:g} to {high:g} Hz are needed: set the driver's rate"),
+    return [judged(f"rate {channel}", 0.9 * low <= rate <= 1.1 * high, f"{rate:.4g} Hz",
+                   f"{low:g} to {high:g} Hz are needed: set the driver's rate"),
             judged(f"stamps {channel}", bool((gaps > 0.0).all() and gaps.max() <= GAP * period),
-                   f"steps of {1e3 * gaps.min():.3g} to {1e3 * gaps.max():.3g} ms", "stamps must grow by a period each: stamp at the sensor, not at arrival; look for lost messages")]
+                   f"steps of {1e3 * gaps.min():.3g} to {1e3 * gaps.max():.3g} ms",
+                   "stamps must grow by a period each: stamp at the sensor, not at arrival; look for lost messages")]
 
 
 def rest(samples: Sequence[ImuSample]) -> list[Check]:
@@ -77,9 +82,10 @@ def rest(samples: Sequence[ImuSample]) -> list[Check]:
     tilt = degrees(acos(np.clip(f[2] / max(size, 1e-9), -1.0, 1.0)))
     axis = int(np.argmax(np.abs(f)))
     return [judged("gravity up", tilt < TILT, f"specific force [{f[0]:.2f}, {f[1]:.2f}, {f[2]:.2f}] m/s^2, {tilt:.1f} deg from +z",
-                   f"it must read +9.8 along z of base_link (forward-left-up); it reads it along {'-' if f[axis] < 0 else '+'}{'xyz'[axis]}: "
+                   f"it must read +9.8 along z of base_link (forward-left-up), not along {'-' if f[axis] < 0 else '+'}{'xyz'[axis]}: "
                    "stand the vehicle level, or turn the IMU's axes in its driver"),
-            judged("gravity's size", abs(size - GRAVITY) < FORCE, f"{size:.2f} m/s^2", "the accelerometer's unit or scale is wrong (m/s^2, not g or counts)"),
+            judged("gravity's size", abs(size - GRAVITY) < FORCE, f"{size:.2f} m/s^2",
+                   "the accelerometer's unit or scale is wrong (m/s^2, not g or counts)"),
             judged("gyroscope at rest", float(np.linalg.norm(w)) < STILL, f"{np.linalg.norm(w):.3f} rad/s",
                    "keep it still and calibrate the gyroscope; rates are rad/s, not deg/s")]
 
@@ -96,7 +102,8 @@ def clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence[tuple
     for camera, arrivals in frames.items():
         if imu and arrivals:
             late = shortest(arrivals) - shortest(imu)
-            found.append(judged(f"clock camera_{camera}", -0.02 < late < LATE, f"frames arrive {1e3 * late:.1f} ms after their stamp, by the IMU's clock",
+            found.append(judged(f"clock camera_{camera}", -0.02 < late < LATE,
+                                f"frames arrive {1e3 * late:.1f} ms after their stamp, by the IMU's clock",
                                 f"0 to {1e3 * LATE:.0f} ms are plausible: camera and IMU need one clock, and stamps of the exposure"))
     return found
 
@@ -110,7 +117,8 @@ def camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Chec
     off = max(abs(have.fx / want.fx - 1.0), abs(have.fy / want.fy - 1.0))
     return judged(title, (have.width, have.height) == (want.width, want.height) and off < CAMERA and model.frame == optical_frame(name),
                   f"{have.width} x {have.height} px, f {have.fx:.1f}, {have.fy:.1f} px, frame {model.frame}",
-                  f"the file says {want.width} x {want.height} px, f {want.fx:.1f}, {want.fy:.1f} px, frame {optical_frame(name)}: calibrate, or name the right file")
+                  f"the file says {want.width} x {want.height} px, f {want.fx:.1f}, {want.fy:.1f} px, "
+                  f"frame {optical_frame(name)}: calibrate, or name the right file")
 
 
 def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]:
@@ -119,18 +127,21 @@ def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]
     for want in fixed_frames(vehicle):
         have = next((t for t in transforms if t.child == want.child), None)
         if have is None:
-            found.append(Check(f"extrinsics {want.child}", Verdict.OPEN, "nobody publishes it", "fine where the nodes take it from the vehicle file; else start `description`"))
+            found.append(Check(f"extrinsics {want.child}", Verdict.OPEN, "nobody publishes it",
+                               "fine where the nodes take it from the vehicle file; else start `description`"))
             continue
         apart = float(np.linalg.norm(np.subtract(have.p, want.p)))
         turn = degrees(float(np.linalg.norm(so3.quat_log(so3.quat_multiply(so3.quat_conjugate(np.array(want.q)), np.array(have.q))))))
         found.append(judged(f"extrinsics {want.child}", have.parent == want.parent and apart < EXTRINSICS[0] and turn < EXTRINSICS[1],
-                            f"{1e3 * apart:.0f} mm, {turn:.1f} deg from the file", "one of them is wrong: measure, calibrate, and correct it"))
+                            f"{1e3 * apart:.0f} mm, {turn:.1f} deg from the file",
+                            "one of them is wrong: measure, calibrate, and correct it"))
     return found
 
 
 def frames(odometry: OdometryState | None, imu: ImuSample | None) -> list[Check]:
     """Names of frames."""
-    return [judged(f"frame {name}", value is not None and value.frame in good, "nothing" if value is None else repr(value.frame), f"must be {good[0]!r}")
+    return [judged(f"frame {name}", value is not None and value.frame in good, "nothing" if value is None else repr(value.frame),
+                   f"must be {good[0]!r}")
             for name, value, good in (("odometry", odometry, ("map",)), ("imu/data_raw", imu, ("imu_link", "base_link", "")))]
 
 
@@ -151,14 +162,16 @@ def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndar
 
 def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
     """The rotation between a camera and the IMU, from shaking the vehicle by hand; arguments as those of `camera_rotation`."""
-    title, advice = f"rotation camera_{name} to IMU", "turn the vehicle to and fro about all axes, by 20 deg, over something with texture (--shake)"
+    title, advice = f"rotation camera_{name} to IMU", (
+        "turn the vehicle to and fro about all axes, by 20 deg, over something with texture (--shake)")
     if len(turned_B) < 20:
         return Check(title, Verdict.OPEN, f"{len(turned_B)} pairs of frames", advice)
     R, second = camera_rotation(turned_B, turned_C)
     if second < TURNED:
         return Check(title, Verdict.OPEN, f"{second:.2f} rad/s about the second axis, {TURNED:g} are needed", advice)
     off = degrees(float(np.linalg.norm(so3.log(vehicle.mounts[name].R_BC.T @ R))))
-    return judged(title, off < SHAKE, f"{off:.1f} deg from the file", f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
+    return judged(title, off < SHAKE, f"{off:.1f} deg from the file",
+                  f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
 
 
 @dataclass(frozen=True)
@@ -180,8 +193,9 @@ def obeyed(name: str, order: Order, state: int, armed: bool) -> Check:
     """Whether an order has had its effect: the controller's state, and that of the commands to the vehicle."""
     status = order.status
     good = status is not None and status.state == state and order.delay <= ANSWER and order.armed is armed
+    sent = "none" if order.armed is None else "armed" if order.armed else "disarmed"
     said = "no controller/status" if status is None else (
-        f"state {status.state} after {order.delay:.2f} s, commands {'none' if order.armed is None else 'armed' if order.armed else 'disarmed'}: {status.message[:80]}")
+        f"state {status.state} after {order.delay:.2f} s, commands {sent}: {status.message[:80]}")
     return judged(name, good, said, "the controller's message says why; odometry must be there, and the vehicle stand level")
 
 
@@ -191,6 +205,8 @@ def stopped(last_command: float | None, last_motion: float | None, bound: float 
     if last_command is None:
         return Check(title, Verdict.OPEN, "commands did not end", advice)
     if last_motion is None:
-        return Check(title, Verdict.OPEN, "nobody tells whether the motors turn (rotor_state, or `armed` in /diagnostics)", "look at the motors")
-    return judged(title, last_motion - last_command <= bound, f"the motors stopped {last_motion - last_command:.2f} s after the last command",
+        return Check(title, Verdict.OPEN, "nobody tells whether the motors turn (rotor_state, or `armed` in /diagnostics)",
+                     "look at the motors")
+    return judged(title, last_motion - last_command <= bound,
+                  f"the motors stopped {last_motion - last_command:.2f} s after the last command",
                   f"they must stop within {bound:g} s: fly nothing until they do")

@@ -31,7 +31,8 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--vehicle", required=True, help="its file, a name in config/vehicles or a file")
     parser.add_argument("--namespace", default="", help="of its nodes")
     parser.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
-    parser.add_argument("--shake", choices=("down", "front"), help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
+    parser.add_argument("--shake", choices=("down", "front"),
+                        help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
     parser.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
     parser.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
     return parser
@@ -42,7 +43,8 @@ def listened(visitor: Any, vehicle: Vehicle) -> list[Check]:
     values = {channel: [value for _, value in entries] for channel, entries in visitor.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
     found = [check for channel in channels for check in checks.stream(channel, [value.stamp for value in values[channel]])]
-    found += checks.clocks(visitor.stamped("imu/data_raw"), {name: visitor.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts})
+    seen = {name: visitor.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts}
+    found += checks.clocks(visitor.stamped("imu/data_raw"), seen)
     found += checks.frames(visitor.newest("odometry"), visitor.newest("imu/data_raw"))
     found += checks.rest(values["imu/data_raw"])
     found += [checks.camera_model(name, visitor.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
@@ -56,7 +58,8 @@ def shaken(visitor: Any, vehicle: Vehicle, camera: str) -> Check:
         print("shake the vehicle about all axes for 10 s ...", flush=True)
         visitor.listen(10.0)
         imu = [value for _, value in visitor.values["imu/data_raw"]]
-        pairs = visitor.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3), vehicle.mounts[camera].stamp_offset)
+        pairs = visitor.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
+                                     vehicle.mounts[camera].stamp_offset)
     else:
         camera, pairs = next(iter(vehicle.mounts), ""), (np.zeros((0, 3)), np.zeros((0, 3)))
     return checks.shaken(camera, *pairs, vehicle)
@@ -64,11 +67,13 @@ def shaken(visitor: Any, vehicle: Vehicle, camera: str) -> Check:
 
 def exercised(visitor: Any, allowed: bool, watchdog: bool) -> list[Check]:
     """Arming, disarming, killing, and the watchdog, where the propellers are off."""
-    takeover = Check("pilot's takeover", Verdict.OPEN, "this program has no switch", "props off, armed: flip the pilot's switch, and see the autopilot's `mode` in /diagnostics")
+    takeover = Check("pilot's takeover", Verdict.OPEN, "this program has no switch",
+                     "props off, armed: flip the pilot's switch, and see the autopilot's `mode` in /diagnostics")
     if not allowed:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "watchdog")] + [takeover]
-    found = [checks.obeyed("armed state", visitor.order(ARM, ARMED), ARMED, True), checks.obeyed("disarming", visitor.order(DISARM, DISARMED), DISARMED, False)]
+    found = [checks.obeyed("armed state", visitor.order(ARM, ARMED), ARMED, True),
+             checks.obeyed("disarming", visitor.order(DISARM, DISARMED), DISARMED, False)]
     if found[0].verdict is Verdict.PASSED:
         visitor.order(ARM, ARMED)
         found.append(checks.obeyed("kill", visitor.order(KILL, FAILED), FAILED, False))
@@ -101,7 +106,8 @@ def main() -> int:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         visitor.await_first("imu/data_raw", arguments.listen)
         visitor.listen(arguments.listen)
-        found = [*listened(visitor, vehicle), shaken(visitor, vehicle, arguments.shake or ""), *exercised(visitor, arguments.props_off, arguments.watchdog)]
+        found = [*listened(visitor, vehicle), shaken(visitor, vehicle, arguments.shake or ""),
+                 *exercised(visitor, arguments.props_off, arguments.watchdog)]
     finally:
         visitor.close()
     print("\n".join(map(str, found)))

@@ -71,7 +71,8 @@ def unpack_rates(data: bytes) -> RatesThrust:
 
 def pack_attitude(command: AttitudeThrust) -> bytes:
     """`perch_msgs/AttitudeThrust` of a command."""
-    return _ATTITUDE.pack(*_stamp(command.stamp), "map", (command.armed,), (*map(float, command.q_WB), *map(float, command.w_B), float(command.thrust)))
+    floats = tuple(map(float, (*command.q_WB, *command.w_B, command.thrust)))
+    return _ATTITUDE.pack(*_stamp(command.stamp), "map", (command.armed,), floats)
 
 
 def unpack_attitude(data: bytes) -> AttitudeThrust:

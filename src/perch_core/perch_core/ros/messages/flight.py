@@ -121,7 +121,8 @@ def motor_value(msg: MotorMessage) -> MotorCommand:
 
 def rates_message(command: RatesThrust) -> RatesMessage:
     """To `perch_msgs/RatesThrust`."""
-    return RatesMessage(header=header(command.stamp, "base_link"), armed=bool(command.armed), body_rates=to_vector(command.w_B), thrust=float(command.thrust))
+    return RatesMessage(header=header(command.stamp, "base_link"), armed=bool(command.armed), body_rates=to_vector(command.w_B),
+                        thrust=float(command.thrust))
 
 
 def rates_value(msg: RatesMessage) -> RatesThrust:

@@ -21,7 +21,8 @@ from perch_eval.preflight.camera_turns import CameraTurns
 from perch_eval.preflight.checks import ANSWER, Order
 
 COMMANDS = ("motor_command", "rates_thrust_command", "attitude_thrust_command")
-CHANNELS = ("imu/data_raw", "odometry", "camera_down/camera_info", "camera_front/camera_info", "controller/status", "rotor_state", "/tf_static",
+CHANNELS = ("imu/data_raw", "odometry", "camera_down/camera_info", "camera_front/camera_info", "controller/status", "rotor_state",
+            "/tf_static",
             "/diagnostics", *COMMANDS)
 KEPT = 20_000       # values of a channel
 DEEP = 2000         # messages that wait while this program does not run
