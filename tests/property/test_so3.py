@@ -1,7 +1,7 @@
 """Rotations against scipy and against finite differences."""
 
 import numpy as np
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from perch_core import so3

@@ -2,7 +2,8 @@
 
 For given durations a QP is solved and its plan checked; where a limit is violated, linear bounds are added and the QP is
 solved again; where that does not help, the durations grow [M:IV-C.3]. Where no longer time helps, others are drawn.
-Each loop is bounded: a search ends after `iterations_max` programs, and the drawing as well. The procedure as the paper has it: `paper.paper_m`.
+Each loop is bounded: a search ends after `iterations_max` programs, and the drawing as well. The procedure as the paper
+has it: `paper.paper_m`.
 """
 
 from __future__ import annotations

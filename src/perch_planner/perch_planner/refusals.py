@@ -19,7 +19,6 @@ THRUST_FLOOR = "thrust_floor"
 BOX = "box"
 BODY_RATE = "body_rate"
 SOLVER = "solver"
-TIME_LIMIT = "time_limit"
 
 
 class PerchRefusal(PlanningRefusal):

@@ -1,8 +1,8 @@
 """What stands in the way of a plan: the smallest set of limits whose relaxation gives one, and how little of it.
 
-Each limit is taken away alone, and the plan that there is then says by how much it would have to give at most; bisection finds how little is
-enough. Where no limit alone is enough, all are taken away, and put back one by one where there is a plan with them. Every value that
-is named was tried: with it there is a plan.
+Each limit is taken away alone, and the plan that there is then says by how much it would have to give at most; bisection finds
+how little is enough. Where no limit alone is enough, all are taken away, and put back one by one where there is a plan with them.
+Every value that is named was tried: with it there is a plan.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perch_core.values import Certificate
 from perch_planner import plan_checks, refusals
 from perch_planner.certificates import certificates
 from perch_planner.plan_checks import MAXIMUM, MINIMUM
@@ -78,7 +77,8 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
         ways = [way]
     if not ways:
         return PerchRefusal(refusals.INFEASIBLE_WINDOW, "impact window and tube [M:eq14, M:eq15]", -inf,
-                            f"no plan, even without the other limits ({tried}); widen the impact speeds or the tube", proofs, search.iterations)
+                            f"no plan, even without the other limits ({tried}); widen the impact speeds or the tube", proofs,
+                            search.iterations)
     most = 4.0 * vehicle.thrust_max
     ways.sort(key=lambda way: sum(_far(name, asked[name], value, most) for name, value in way.items()))
     first, *others = [" and ".join(_said(name, value, most) for name, value in way.items()) for way in ways]
