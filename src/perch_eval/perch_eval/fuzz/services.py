@@ -215,23 +215,26 @@ def ask_mission(rng: random.Random) -> str:
     """Goals and departures at any time of a flight: one goal is taken, nonsense ends with BAD_GOAL, everything is answered."""
     one, later = _settled("surface", "mission", rng)
     mission, outcome = one.component, "taken"
-    busy = False
+    flown: Callable[[], bool] = lambda: False  # whether what was taken last is still under way
     for event in later[:20]:
         if rng.random() < 0.3:
             answers: list[Any] = []
+            busy = flown()
             one.call("on_depart", (Ask(), answers.append))
             if busy != bool(answers):
                 raise Nonsense(f"depart while {'a goal is flown' if busy else 'nothing is flown'}: {answers}")
-            busy = True
+            if not busy:
+                flown = lambda answers=answers: not answers
         goal, bad = _some_goal(rng)
-        sent = _Sent(goal)
+        sent, busy = _Sent(goal), flown()
         said = mission.on_perch(sent)
-        if busy:
-            if not said:
-                raise Nonsense("two goals at a time")
-        elif bad != (sent.result is not None and sent.result.error_code == 7):
+        if busy != bool(said):
+            raise Nonsense(f"a goal while {'another is flown' if busy else 'nothing is flown'}: {said!r}")
+        if not busy and bad != (sent.result is not None and sent.result.error_code == 7):
             raise Nonsense(f"{goal} {'makes no sense' if bad else 'makes sense'}: {sent.result}")
-        busy, outcome = busy or not bad, "refused" if bad else outcome
+        if not busy and not bad:
+            flown = lambda sent=sent: sent.result is None
+        outcome = "refused" if bad else outcome
         one.call(event.method, messages._handed(event))
     for event in later[20:]:
         one.call(event.method, messages._handed(event))
