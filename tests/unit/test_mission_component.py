@@ -357,3 +357,12 @@ def test_settings_change_in_flight():
     world.mission.reconfigure(replace(config, mission=replace(config.mission, contact_time=0.4)))
     world.run()
     assert world.goal.ending == "succeeded" and world.orders[-1].contact_time == 0.4
+
+
+@pytest.mark.parametrize("phase", ["take_off", "searching", "tracking"])
+def test_a_controller_that_falls_silent_ends_the_goal_within_a_second_and_a_half(phase):
+    world = World().send().run(until=lambda w: w.phase == phase)
+    world.mission.on_status, silent = lambda status: None, world.stamp
+    result = world.run().goal.result
+    assert (world.goal.ending, result.error_code) == ("aborted", int(Result.TRACKING_LOST)) and "the controller is silent" in result.message
+    assert world.stamp - silent < 1.5 * NANOSECONDS

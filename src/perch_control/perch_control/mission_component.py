@@ -224,9 +224,12 @@ class Mission(Component[MissionParameters]):
             self._finish(0, Outcome(Result.TIMEOUT, f"no odometry within {self.config.mission.arming_timeout:g} s"))
 
     def _decide(self, stamp: int) -> None:
-        machine = self._machine
+        machine, status = self._machine, self._status
         if machine is None:
             self._forces.clear()
+            return
+        if status is not None and self._odometry.stamp - status.stamp > STALE:  # it answers every sample, whatever its state
+            self._finish(stamp, Outcome(Result.TRACKING_LOST, f"the controller is silent: no controller/status for {seconds(STALE):g} s"))
             return
         time, answer, pending = seconds(stamp), None, self._pending
         if not self._started:

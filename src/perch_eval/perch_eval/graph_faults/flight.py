@@ -336,4 +336,4 @@ def _settled(pilot: Pilot, watcher: Watcher, director: _Director) -> str:
         waited = director.struck is None or time.time() - director.struck > 5.5
         if found in SAFE and watcher.time - since > SETTLE and waited:
             return found
-    return last
+    return f"{last}, which does not last" if last in SAFE else last
