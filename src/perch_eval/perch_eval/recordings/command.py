@@ -227,12 +227,14 @@ def _spread_words(figures: dict[str, Any]) -> str:
 def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
     f = e.figures()
     drift = f"{f['drift_percent']:.2f} % of the path" if np.isfinite(f["drift_percent"]) else "a path too short for a share"
-    return [(f"{name}: ATE (evo)", f"{100 * e.ate:.2f} cm, {e.ate_deg:.2f} deg rms over {e.duration:.1f} s and {e.path:.1f} m"),
-            (f"{name}: from the start on", f"{100 * f['final_error_m']:.1f} cm off at the end ({drift}), "
-             f"{100 * f['largest_error_m']:.1f} cm at most; attitude {f['attitude_rms_deg']:.2f} deg rms"),
+    start = (f"{name}: from the start on", f"{100 * f['final_error_m']:.1f} cm off at the end ({drift}), "
+             f"{100 * f['largest_error_m']:.1f} cm at most; attitude {f['attitude_rms_deg']:.2f} deg rms")
+    nees = (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (honest: 3)")
+    if not np.isfinite(e.ate):  # it stands, or moves along a line
+        return [start, nees]
+    return [(f"{name}: ATE (evo)", f"{100 * e.ate:.2f} cm, {e.ate_deg:.2f} deg rms over {e.duration:.1f} s and {e.path:.1f} m"), start,
             (f"{name}: RPE (evo)", f"{100 * e.rpe:.2f} cm, {e.rpe_deg:.2f} deg rms over {e.rpe_delta:g} m"),
-            (f"{name}: scale", f"{e.scale:.4f}"),
-            (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (honest: 3)")]
+            (f"{name}: scale", f"{e.scale:.4f}"), nees]
 
 
 def _trajectory(rows: list[tuple[int, Any, Any]]) -> Trajectory:
