@@ -334,6 +334,12 @@ def test_samples_are_flown_by_their_normalised_quaternions():
     assert np.linalg.norm(flight.component.flight.maneuvers.order.source.trajectory.q, axis=1) == pytest.approx(1.0, abs=1e-12)
 
 
+def test_attached_before_any_odometry_is_refused():
+    flight = Flight()
+    flight.order(Command.ATTACHED)
+    assert flight.state is State.DISARMED and "attached is refused: no usable odometry" in flight.said
+
+
 @pytest.mark.parametrize("command, stamp, said", [(77, 0, "77"), (int(Command.DISARM), 0, "land first"), (int(Command.LAND), 1000, "too old")])
 def test_commands_that_are_none_or_not_now_are_refused(command, stamp, said):
     flight = Flight().take_off()

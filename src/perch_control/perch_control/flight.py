@@ -115,6 +115,8 @@ class FlightController:
         if command is Command.KILL:
             m.motors_off(State.FAILED, f"killed{why}")
         elif command is Command.ATTACHED:
+            if not m.belief:
+                raise CommandRefused("attached is refused: no usable odometry yet")
             m.attach(f"attached, motors off{why}")
         elif command is Command.DISARM:
             if m.flying:
