@@ -133,3 +133,18 @@ def test_a_first_sample_that_is_not_finite_is_refused():
     estimator = Estimator()
     assert estimator.add_imu(ImuSample(0, (float("nan"),) * 3, (0.0, 0.0, 9.81))) is ImuOutcome.NOT_FINITE
     assert estimator.estimate is None
+
+
+def test_a_covariance_that_breaks_is_counted_named_and_survived():
+    flight = Flight(12).fly(end=1500)
+    before = flight.estimator.status
+    base = flight.estimator._base
+    flight.estimator._anchors = [replace(base, P=-base.P)]
+    pose = flight.poses[max(k for k in flight.poses if k < 1500)]
+    assert flight.estimator.add_vio(pose) is VioOutcome.BROKEN
+    status = flight.estimator.status
+    assert (status.health, status.broken, status.rejected) == (Health.DIVERGED, before.broken + 1, before.rejected)
+    assert "not positive definite" in status.message
+    flight.fly(1500, 2000)
+    assert flight.estimator.status.health is Health.RUNNING
+    flight.assert_sane()

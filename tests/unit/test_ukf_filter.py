@@ -194,12 +194,12 @@ def test_at_rest_tilt_and_accelerometer_bias_are_one_unknown():
     config, rng, tilt = UkfConfig(), np.random.default_rng(13), 0.005
     q = so3.quat_exp(np.array([0.02, -0.01, 0.7]))
     up_B = so3.quat_to_matrix(q).T @ np.array([0.0, 0.0, GRAVITY])
-    steps = np.column_stack([np.full(100, 0.002), np.zeros((100, 3)), up_B + rng.normal(0, 0.32, (100, 3)), np.full((100, 2), 0.01)])
+    steps = np.column_stack([np.full(100, 0.002), np.zeros((100, 3)), up_B + rng.normal(0, 0.32, (100, 3)), np.full(100, 1e-4), np.full(100, 0.1)])
     pose = VioPose(200_000_000, np.zeros(3), q, np.diag([1e-6] * 3 + [tilt**2] * 3), np.zeros(3), np.eye(3) * 1e-4)
     belief = start.from_pose(config, pose, steps)
     H = np.zeros((3, 15))
     H[:, at.D_ATTITUDE], H[:, at.D_ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
-    noise = config.imu.accel_noise**2 / 100
+    noise = config.imu.accel_noise_density**2 / 0.2
     assert np.linalg.eigvalsh(H @ belief.P @ H.T)[-1] < noise
     across = np.linalg.svd(so3.hat(up_B))[0][:, 0]
     own = across @ belief.P[at.D_ACCEL_BIAS, at.D_ACCEL_BIAS] @ across

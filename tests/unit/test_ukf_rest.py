@@ -20,7 +20,7 @@ class Resting:
         self.up_B = so3.quat_to_matrix(self.q).T @ [0.0, 0.0, 9.81]
         self.bias = self.rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
         self.walk = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(RATE)
-        self.noise = np.repeat([imu.gyro_noise, imu.accel_noise], 3)
+        self.noise = np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) * np.sqrt(RATE)
         self.estimator = Estimator(CONFIG)
         self.run(0.5)
         e = self.rng.normal(0.0, np.repeat(SIGMA, 3))
@@ -71,19 +71,43 @@ def test_a_departure_is_not_held_back():
     assert resting.estimator.estimate.p_WB[2] - resting.p[2] == pytest.approx(0.375, abs=0.13)
 
 
+def steps(gyro, accel, rate=500.0, n=None, seed=1):
+    """IMU steps of 0.2 s with the IMU's noise about readings, (n, 9)."""
+    rng, imu, n = np.random.default_rng(seed), CONFIG.imu, n or round(0.2 * rate)
+    sigma = np.array([imu.gyro_noise_density, imu.accel_noise_density]) * np.sqrt(rate)
+    rows = np.empty((n, 9))
+    rows[:, 0], rows[:, 7:] = 1.0 / rate, sigma**2
+    rows[:, 1:4], rows[:, 4:7] = gyro + rng.normal(0.0, sigma[0], (n, 3)), accel + rng.normal(0.0, sigma[1], (n, 3))
+    return rows
+
+
+UP, KNOWN = np.array([0.0, 0.0, 9.81]), np.full(6, 1e-6)
+
+
 def test_flight_fall_and_turning_are_not_rest():
-    rng, n, imu = np.random.default_rng(1), 100, CONFIG.imu
+    t, axis = 0.002 * np.arange(100), np.array([0.0, 1.0, 0.0])
+    shaken = 0.05 * np.sin(20.0 * t)[:, None] * axis
+    assert still(CONFIG.rest, steps(0.0, UP)) and still(CONFIG.rest, steps(0.004, -UP), np.r_[np.full(3, 0.004), np.zeros(3)], KNOWN)
+    for biases in ((), (np.zeros(6), KNOWN)):
+        assert not still(CONFIG.rest, steps(0.0, 0.0 * UP), *biases)             # it falls
+        assert not still(CONFIG.rest, steps(shaken, UP), *biases)                # held up by rotors
+        assert not still(CONFIG.rest, steps(0.0, 1.2 * UP), *biases)             # it climbs
+        assert not still(CONFIG.rest, steps(0.0, UP, n=50), *biases)             # too short to say
+        assert not still(CONFIG.rest, steps(0.5 * axis, UP), *biases)            # it turns as no bias does
+    assert not still(CONFIG.rest, steps(0.05 * axis, UP), np.zeros(6), KNOWN)    # it turns steadily
+    assert still(CONFIG.rest, steps(0.05 * axis, UP), np.zeros(6), np.full(6, 0.05**2))  # as far as anybody knows, it rests
 
-    def steps(gyro, accel):
-        rows = np.zeros((n, 9))
-        rows[:, 0] = 0.002
-        rows[:, 1:4], rows[:, 4:7] = gyro + rng.normal(0.0, imu.gyro_noise, (n, 3)), accel + rng.normal(0.0, imu.accel_noise, (n, 3))
-        return rows
 
-    up, t, axis = np.array([0.0, 0.0, 9.81]), 0.002 * np.arange(n), np.array([0.0, 1.0, 0.0])
-    assert still(CONFIG.rest, imu, steps(0.0, up)) and still(CONFIG.rest, imu, steps(0.004, -up), np.full(3, 0.004))
-    assert not still(CONFIG.rest, imu, steps(0.0, 0.0 * up))                                    # it falls
-    assert not still(CONFIG.rest, imu, steps(0.05 * np.sin(20.0 * t)[:, None] * axis, up))      # held up by rotors
-    assert not still(CONFIG.rest, imu, steps(0.05 * axis, up), np.zeros(3))                     # it turns steadily
-    assert not still(CONFIG.rest, imu, steps(0.0, 1.2 * up))                                    # it climbs
-    assert not still(CONFIG.rest, imu, steps(0.0, up)[:50])                                     # too short to say
+@pytest.mark.parametrize("rate", [100.0, 200.0, 400.0, 1000.0])
+@pytest.mark.parametrize("turn", [np.zeros(3), np.array([0.0, 1.5, 0.0]), np.array([3.0, 0.3, -1.0])], ids=["upright", "on its nose", "upside down"])
+def test_rest_is_in_the_variance_whatever_the_biases(rate, turn):
+    rng, R = np.random.default_rng(3), so3.exp(turn)
+    seen = []
+    for seed in range(20):
+        b_g, b_a = (size * v / np.linalg.norm(v) for size, v in zip((0.2, 1.0), rng.normal(size=(2, 3))))
+        rows = steps(b_g, R.T @ UP + b_a, rate, seed=seed)
+        seen += [still(CONFIG.rest, rows), still(CONFIG.rest, rows, np.r_[b_g, b_a], KNOWN)]
+        assert not still(CONFIG.rest, rows, np.zeros(6), KNOWN)
+        rows[:, 1:4] += rng.normal(0.0, 0.05, (len(rows), 3))
+        assert not still(CONFIG.rest, rows)
+    assert all(seen)

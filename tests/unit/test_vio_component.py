@@ -82,7 +82,7 @@ class Flight:
 @pytest.mark.parametrize(("lens", "rate"), [("equidistant", 500.0), ("equidistant", 100.0), ("equidistant", 200.0), ("equidistant", 1000.0),
                                             ("plumb_bob", 500.0), ("rational_polynomial", 200.0)])
 def test_a_climb_with_every_lens_and_imu_rate(lens, rate):
-    flight = Flight(lens, rate, **{"imu": {"accel_noise": 0.316 * math.sqrt(rate / 500), "gyro_noise": 0.01 * math.sqrt(rate / 500)}}).fly()
+    flight = Flight(lens, rate).fly()
     states = flight.out["state"]
     assert len(states) > 100 and isinstance(states[-1], InertialState)
     p, v, turn = flight.error(states[-1])

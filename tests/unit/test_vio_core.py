@@ -10,6 +10,7 @@ from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion
 from perch_perception.vio import bearing, ekf, lens
 from perch_perception.vio.bearing import observe, residuals
+from perch_perception.vio.gyro_bias import RayPair, solve_gyro_bias
 from perch_perception.vio.landmark_choice import Spread, cell
 from perch_perception.vio.motion_start import solve_motion
 from perch_perception.vio.preintegration import preintegrate
@@ -181,7 +182,7 @@ def test_update_is_the_information_form():
     P, columns, H, r = A @ A.T + np.eye(8), np.array([1, 4, 6]), rng.normal(size=(5, 3)), rng.normal(size=5)
     full = np.zeros((5, 8))
     full[:, columns] = H
-    dx, P_new = ekf.update(P, columns, H, r, 0.3)
+    dx, P_new, _ = ekf.update(P, columns, H, r, 0.3)
     expected = np.linalg.inv(np.linalg.inv(P) + full.T @ full / 0.3)
     np.testing.assert_allclose(P_new, expected, atol=1e-9)
     np.testing.assert_allclose(dx, expected @ full.T @ r / 0.3, atol=1e-9)
@@ -200,37 +201,59 @@ def test_landmarks_are_spread_over_the_view():
 # -- start in motion -----------------------------------------------------------------------------------------------------
 
 
-def test_velocity_and_gravity_from_half_a_second_of_motion():
-    motion = PerchMotion(seed=6)
-    times = 1.9 + np.arange(15) / 30
-    m = motion.sample(times)
-    R0, rng = m.R_WB[0], np.random.default_rng(7)
-    fine = motion.sample(np.arange(times[0], times[-1] + 1e-9, 0.002))
-    g = np.array([0.0, 0.0, -GRAVITY])
-    T = times - times[0]
-    dp = (m.p_WB - m.p_WB[0] - m.v_WB[0] * T[:, None] - 0.5 * g * T[:, None] ** 2) @ R0
-    dR = R0.T @ m.R_WB
-    centres = dR @ MOUNT.p_BC
-    X = np.column_stack([rng.uniform(-1, 1, (40, 2)), np.zeros(40)])
-    rays, frames = [], []
-    for x in X:
-        d = (x - m.p_WB) @ R0 - centres
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        rays.append(d + rng.normal(0, 1e-3, d.shape))
-        rays[-1] /= np.linalg.norm(rays[-1], axis=1, keepdims=True)
-        frames.append(np.arange(15))
-    found = solve_motion(T, dp, centres, rays, frames, 1e-3)
-    assert np.linalg.norm(found.v - R0.T @ m.v_WB[0]) < 0.05
-    assert np.degrees(so3.angle_between(found.g, R0.T @ g)) < 1.0
-    assert np.linalg.norm(found.g) == pytest.approx(GRAVITY)
-    assert fine.times[-1] <= times[-1] + 1e-9
+def start_in_motion(seed, accel_bias=np.zeros(3)):
+    """Half a second of a climb as `solve_motion` takes it, with rays that are 1 mrad wrong; and the velocity and up in B0."""
+    motion, rng, T = PerchMotion(seed=seed), np.random.default_rng(seed), np.arange(15) / 30
+    m, g = motion.sample(1.9 + T), np.array([0.0, 0.0, -GRAVITY])
+    R0 = m.R_WB[0]
+    dR, by_bias = R0.T @ m.R_WB, -0.5 * T[:, None, None] ** 2 * np.eye(3)  # of a body that hardly turns
+    dp = (m.p_WB - m.p_WB[0] - m.v_WB[0] * T[:, None] - 0.5 * g * T[:, None] ** 2) @ R0 - by_bias @ accel_bias
+    dv = R0.T @ (m.v_WB[-1] - m.v_WB[0] - g * T[-1]) + accel_bias * T[-1]
+    centres, X = dR @ MOUNT.p_BC, np.column_stack([rng.uniform(-1, 1, (40, 2)), np.zeros(40)])
+    rays = (X[:, None] - m.p_WB) @ R0 - centres
+    rays += 1e-3 * np.linalg.norm(rays, axis=2, keepdims=True) * rng.normal(size=rays.shape)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    return (T, dp, dv, by_bias, centres, rays, np.ones((40, 15), bool), 1e-3), R0.T @ m.v_WB[0], -R0.T @ g
+
+
+@pytest.mark.parametrize("seed", [6, 7, 8])
+@pytest.mark.parametrize("bias", [0.0, 1.0])
+def test_velocity_and_gravity_from_half_a_second_of_motion(seed, bias):
+    """With an accelerometer that is 1 m/s^2 wrong, too, if that is what its data sheet allows: as well as the covariance says."""
+    given, v, up = start_in_motion(seed, np.array([0.6, -0.5, 0.6]) * bias)
+    found = solve_motion(*given, 0.05 if bias == 0.0 else 1.0)
+    assert np.linalg.norm(found.g) == pytest.approx(GRAVITY) and found.residual < 2e-3
+    error = found.v - v
+    assert error @ np.linalg.solve(found.covariance[:3, :3], error) < 16.3  # chi2, 3, 99.9 %
+    if bias == 0.0:
+        assert np.linalg.norm(error) < 0.08
+        assert np.degrees(so3.angle_between(-found.g, up)) < 1.0
 
 
 def test_a_vehicle_that_stands_still_tells_no_scale():
-    rays = [np.tile([0.1 * k, 0.2, -1.0] / np.linalg.norm([0.1 * k, 0.2, -1.0]), (15, 1)) for k in range(20)]
-    T = np.arange(15) / 30
-    dp = 0.5 * GRAVITY * np.outer(T**2, [0, 0, 1])
-    assert solve_motion(T, dp, np.zeros((15, 3)), rays, [np.arange(15)] * 20, 1e-3) is None
+    rays = np.array([np.tile([0.1 * k, 0.2, -1.0] / np.linalg.norm([0.1 * k, 0.2, -1.0]), (15, 1)) for k in range(20)])
+    T, up = np.arange(15) / 30, np.array([0.0, 0.0, 1.0])
+    assert solve_motion(T, 0.5 * GRAVITY * np.outer(T**2, up), GRAVITY * T[-1] * up, np.zeros((15, 3, 3)), np.zeros((15, 3)), rays,
+                        np.ones((20, 15), bool), 1e-3, 0.05) is None
+
+
+@pytest.mark.parametrize("moving", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_gyro_bias_is_found_in_motion(seed, moving):
+    """0.2 rad/s in any direction, from a view that moves, or only turns; a tenth of the tracks goes its own way."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=3)
+    bias, sigma, pairs = 0.2 * direction / np.linalg.norm(direction), 1e-3, []
+    for _ in range(7):
+        X = rng.uniform([-2.0, -2.0, 1.0], [2.0, 2.0, 4.0], (60, 3))
+        R, t, dt = so3.exp(rng.normal(0.0, 0.1, 3)), moving * rng.normal(0.0, 0.1, 3), 0.25
+        first, second = X + rng.normal(0.0, sigma, X.shape) * X[:, 2:], (X - t) @ R + rng.normal(0.0, sigma, X.shape) * X[:, 2:]
+        second[:6] += rng.normal(0.0, 0.5, (6, 3))
+        read = R @ so3.exp(bias * dt)  # what the gyro says; a bias that is taken off turns it back
+        pairs.append(RayPair(read, -dt * np.eye(3), *(v / np.linalg.norm(v, axis=1, keepdims=True) for v in (first, second))))
+    found, P = solve_gyro_bias(pairs, sigma, 0.1)
+    assert np.linalg.norm(found - bias) < 0.012
+    assert np.sqrt(np.linalg.eigvalsh(P)[-1]) < 0.005
 
 
 # -- bookkeeping ---------------------------------------------------------------------------------------------------------

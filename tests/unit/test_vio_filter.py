@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.perch_motion import PerchMotion, read_imu
@@ -121,7 +122,29 @@ def test_nees_of_the_filter_on_simulated_tracks():
             pass
         P = run.filter.state.P[:9, :9]
         values.append(error @ np.linalg.solve(P, error) / 9)
-    assert 0.3 < np.mean(values) < 2.0
+    low, high = chi2.ppf([0.00005, 0.99995], 9 * len(values)) / (9 * len(values))  # 0.64, 1.46
+    assert low < np.mean(values) < high
+
+
+def test_the_nis_of_a_frame_is_that_of_its_joint_innovations():
+    """Summed over single landmarks it would leave out what they have in common: the pose."""
+    run, expected = Run(2), []
+    filter_ = run.filter
+    original = filter_.apply
+
+    def checked(columns, H, r, variance):
+        S = H @ filter_.state.P[np.ix_(columns, columns)] @ H.T + variance * np.eye(len(r))
+        expected[-1] += np.array([r @ np.linalg.solve(S, r), len(r)])
+        return original(columns, H, r, variance)
+
+    filter_.apply, reports, run.tracks.noise = checked, [], 0.6  # as the filter is told
+    expected.append(np.zeros(2))
+    for report, _ in run.frames(40):
+        reports.append((report.nis, report.nis_dimension))
+        expected.append(np.zeros(2))
+    np.testing.assert_allclose(reports, expected[:-1], rtol=1e-6)
+    nis, dimension = np.sum(reports, axis=0)
+    assert dimension > 500 and 0.8 < nis / dimension < 1.15
 
 
 def test_yaw_and_position_stay_unobservable():

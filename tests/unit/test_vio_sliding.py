@@ -48,24 +48,3 @@ def test_points_walk_across_the_line_of_sight_only():
     along = R_WC @ np.array([0.0, 1.0, 0.0])
     angle = np.sqrt(np.einsum("i,nij,j->n", along, P, along)) / d[1:]
     assert angle**2 == pytest.approx(Sliding(CONFIG, FOCAL).steps(b[:-1], b[1:], d[:-1], d[1:]))
-
-
-def test_a_view_that_sways_within_what_a_patch_bears_is_held():
-    sliding, t = Sliding(dataclasses.replace(CONFIG, slide_free_turn=0.06, slide_free_zoom=0.02), FOCAL), np.linspace(0.0, 50.0, 400)
-    held = np.array([[0.0, 0.0, 1.0]]), np.array([1.5])
-    for a, d in zip(0.055 * np.sin(t), 1.5 * np.exp(0.019 * np.cos(t))):
-        view = sliding.dragged(*held, np.array([[np.sin(a), 0.0, np.cos(a)]]), np.array([d]))
-        assert sliding.steps(held[0], view[0], held[1], view[1]) == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_view_that_goes_on_is_dragged_along():
-    """What walks in the end is the whole change but what a patch bears, and as much again on the way back."""
-    sliding, walked = Sliding(dataclasses.replace(CONFIG, slide_free_turn=0.06, slide_free_zoom=0.02), FOCAL), 0.0
-    held = np.array([[0.0, 0.0, 1.0]]), np.array([1.0])
-    there = np.linspace(0.0, 1.0, 200)
-    for s in [*there, *there[::-1]]:
-        b = np.array([[np.sin(0.5 * s), 0.0, np.cos(0.5 * s)]])
-        view = sliding.dragged(*held, b, np.array([np.exp(0.3 * s)]))
-        walked, held = walked + sliding.steps(held[0], view[0], held[1], view[1])[0], view
-    turned, zoomed = (0.5 - 0.06) + (0.5 - 0.12), (0.3 - 0.02) + (0.3 - 0.04)
-    assert walked == pytest.approx((CONFIG.slide_turn**2 * turned + CONFIG.slide_zoom**2 * zoomed) / FOCAL**2, rel=1e-3)

@@ -126,7 +126,7 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def _emit(self, stamp: int, e: Estimate) -> None:
         if self._covariance_age >= self.config.covariance_stride:
-            self._covariances = covariances(so3.quat_to_matrix(e.q_WB), e.v_WB, e.P, self.config.imu.gyro_noise)
+            self._covariances = covariances(so3.quat_to_matrix(e.q_WB), e.v_WB, e.P, self._estimator.gyro_sigma)
             self._covariance_age = 0
         self._covariance_age += 1
         q_WB = tuple(e.q_WB.tolist())
@@ -142,4 +142,4 @@ class StateEstimator(Component[EstimatorConfig]):
         s = self._estimator.status
         level = 0 if s.health.name == "RUNNING" else 2 if s.health.name == "DIVERGED" else 1
         self.diagnostics(Diagnostics(stamp, {"state": s.health.name, "vio_age_s": s.vio_age, "updates_accepted": s.accepted,
-                                             "updates_rejected": s.rejected}, level, s.message))
+                                             "updates_rejected": s.rejected, "covariance_failures": s.broken}, level, s.message))

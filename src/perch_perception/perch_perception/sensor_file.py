@@ -33,7 +33,7 @@ def camera_mounts(sensors: str, vehicle: str) -> dict[str, CameraMount]:
 
 
 def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:
-    """The IMU's noise, of one sample, by the sensor file; what was given where none is named.
+    """The IMU's noise by the sensor file; what was given where none is named.
 
     Raises:
         ConfigError: no such file, or it has no IMU.
@@ -43,7 +43,7 @@ def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:
     imu = load_sensors(sensors).imu
     if imu is None:
         raise ConfigError(sensors, "imu", "missing")
-    return ImuNoise(imu.accel_noise, imu.gyro_noise, imu.accel_bias_walk, imu.gyro_bias_walk, imu.accel_bias, imu.gyro_bias,
+    return ImuNoise(imu.accel_noise_density, imu.gyro_noise_density, imu.accel_bias_walk, imu.gyro_bias_walk, imu.accel_bias, imu.gyro_bias,
                     imu.accel_range, imu.gyro_range, imu.integration)
 
 

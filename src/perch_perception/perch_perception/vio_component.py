@@ -125,7 +125,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         self.state(InertialState(e.stamp, e.p_WB, q, e.v_WB, e.gyro_bias, e.accel_bias, e.P, ODOM))
         q_WB = tuple(q.tolist())
         self.odometry(OdometryState(e.stamp, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(e.w_WB_B.tolist()),
-                                    *covariances(e.R_WB, e.v_WB, e.P, self.config.imu.gyro_noise), ODOM))
+                                    *covariances(e.R_WB, e.v_WB, e.P, self._vio.gyro_sigma), ODOM))
 
     def _draw(self, image: CameraImage, pixels: np.ndarray, result: VioResult) -> None:
         features = self._vio.tracker.latest

@@ -9,14 +9,14 @@ from perch_core.config import choice, part, quantity, text
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """What the filter assumes of the IMU: noise of one sample, bias walks, ranges."""
+    """What the filter assumes of the IMU: noise densities, bias walks, ranges. They hold at any sample rate."""
 
-    accel_noise: float = quantity(0.316, unit="m/s^2", above=0.0, doc="1 sigma of one sample, vibration included")
-    gyro_noise: float = quantity(0.01, unit="rad/s", above=0.0, doc="1 sigma of one sample")
+    accel_noise_density: float = quantity(0.0141, unit="m/s^2/sqrt(Hz)", above=0.0, doc="vibration included")
+    gyro_noise_density: float = quantity(0.00045, unit="rad/s/sqrt(Hz)", above=0.0, doc="vibration included")
     accel_bias_walk: float = quantity(0.002, unit="m/s^2/sqrt(s)", above=0.0)
     gyro_bias_walk: float = quantity(0.0002, unit="rad/s/sqrt(s)", above=0.0)
     accel_bias_init: float = quantity(0.05, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
-    gyro_bias_init: float = quantity(0.005, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias")
+    gyro_bias_init: float = quantity(0.005, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias; at rest it is measured")
     accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, doc="saturation of one axis")
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, doc="saturation of one axis")
     integration: str = choice("mean", options=("mean", "instant"), doc=(
@@ -36,11 +36,16 @@ class ImuFaults:
 
 @dataclass(frozen=True)
 class RestConfig:
-    """How rest is recognised, and how still it is: on the ground, on a wall, on a wire, in any attitude."""
+    """How rest is recognised, and how still it is: on the ground, on a wall, on a wire, in any attitude.
+
+    Before a filter knows the biases, readings as large as the largest turn-on biases of MEMS sensors are still rest.
+    """
 
     window: float = quantity(0.2, unit="s", above=0.02, high=2.0, doc="IMU over which rest is judged")
     energy: float = quantity(1.8, unit="-", above=1.0, high=20.0, doc="largest energy of the IMU about rest, in that of its noise: 1 is rest")
     velocity: float = quantity(0.002, unit="m/s", above=0.0, doc="1 sigma of the velocity at rest")
+    gyro_bias: float = quantity(0.35, unit="rad/s", above=0.0, doc="largest turn-on bias (data sheets: 20 deg/s)")
+    accel_bias: float = quantity(1.5, unit="m/s^2", above=0.0, doc="largest turn-on bias (data sheets: 150 mg)")
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class Estimator:
         self._lag = 0
         self._waiting: list[VioPose] = []
         self._refused_in_row = 0
-        self._accepted = self._rejected = 0
+        self._accepted = self._rejected = self._breaks = 0
         self._nis = 0.0
         self._broken = False
         self._message = "waiting for the IMU"
@@ -79,7 +79,7 @@ class Estimator:
                 outcome = self._apply(pose) if self._base is not None else self._begin(pose)
             except CovarianceError as error:
                 self._break(str(error))
-                return VioOutcome.GATED
+                return VioOutcome.BROKEN
         if outcome is VioOutcome.GATED:
             self._rejected += 1
         elif outcome.used:
@@ -111,6 +111,11 @@ class Estimator:
             P=P)
 
     @property
+    def gyro_sigma(self) -> float:
+        """1 sigma of the newest gyro sample [rad/s]."""
+        return self._imu.gyro_sigma
+
+    @property
     def status(self) -> Status:
         """Health and figures for people and for the mission."""
         age, position, attitude = float("inf"), start.UNKNOWN_POSITION, start.UNKNOWN_YAW
@@ -122,7 +127,7 @@ class Estimator:
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
             lost = position > self.config.diverged_position or attitude > self.config.diverged_attitude
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
-        return Status(health, age, self._accepted, self._rejected, self._nis, position, attitude, self._message)
+        return Status(health, age, self._accepted, self._rejected, self._breaks, self._nis, position, attitude, self._message)
 
     def _compile(self) -> None:
         """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
@@ -203,7 +208,7 @@ class Estimator:
         now, config = self._imu.last.stamp, self.config
         if self._base is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
             return
-        if not still(config.rest, config.imu, window(config.rest, self._imu, now), self._base.x[at.GYRO_BIAS]):
+        if not still(config.rest, window(config.rest, self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
             self._resting = False
             return
         belief, middle = self._base, now - round(0.5e9 * config.rest.window)
@@ -237,5 +242,5 @@ class Estimator:
     def _break(self, why: str) -> None:
         """Start again with the next VIO pose."""
         self._base = self._live = None
-        self._anchors = []
+        self._anchors, self._breaks = [], self._breaks + 1
         self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"

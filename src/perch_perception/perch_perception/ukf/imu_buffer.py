@@ -46,7 +46,7 @@ class ImuBuffer:
     def __init__(self, imu: ImuNoise, faults: ImuFaults, history: float) -> None:
         self._imu, self._faults = imu, faults
         self._instant = imu.integration == "instant"
-        self._variances = (imu.gyro_noise**2, imu.accel_noise**2)
+        self._densities = (imu.gyro_noise_density**2, imu.accel_noise_density**2)
         self._keep = round(history * 1e9)
         self._intervals: deque[int] = deque(maxlen=_PERIODS)
         self._ends: list[int] = []
@@ -78,7 +78,7 @@ class ImuBuffer:
             u, g = last.w_B, last.f_B
             w = (0.5 * (w[0] + u[0]), 0.5 * (w[1] + u[1]), 0.5 * (w[2] + u[2]))
             f = (0.5 * (f[0] + g[0]), 0.5 * (f[1] + g[1]), 0.5 * (f[2] + g[2]))
-        gyro, accel = self._variances
+        gyro, accel = self._densities[0] / dt, self._densities[1] / dt
         if self._is_gap(interval):
             # the error persists over the gap: its variance must not average out over the one long step
             gyro, accel = gyro + faults.gap_gyro**2, accel + faults.gap_accel**2
@@ -105,6 +105,11 @@ class ImuBuffer:
     def latest(self) -> tuple[float, ...]:
         """The newest step (dt, gyro, accel, gyro variance, accel variance)."""
         return self._rows[-1]
+
+    @property
+    def gyro_sigma(self) -> float:
+        """1 sigma of the newest gyro sample [rad/s]; 0 before the second."""
+        return float(np.sqrt(self._rows[-1][7])) if self._rows else 0.0
 
     def run(self, start: int, end: int) -> np.ndarray:
         """The steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9)."""

@@ -19,6 +19,7 @@ class VioOutcome(enum.Enum):
     JUMPED = "applied after a jump: many poses in a row disagreed"
     WAITING = "kept until the IMU has reached its stamp"
     GATED = "refused by the innovation gate"
+    BROKEN = "refused: the filter's covariance is not positive definite; it starts again with the next one"
     DUPLICATE = "refused: a pose of this stamp was used before"
     OUT_OF_ORDER = "refused: older than a pose that was used before"
     TOO_OLD = "refused: older than the IMU history"
@@ -133,6 +134,7 @@ class Status:
         health: see `Health`.
         vio_age: time since the stamp of the last applied VIO pose [s]; inf before the first.
         accepted, rejected: VIO poses applied and gated so far.
+        broken: covariances that lost their positive definiteness, each of which was a start anew.
         nis: normalised innovation squared of the last pose that reached the gate.
         position_sigma, attitude_sigma: largest 1 sigma [m], [rad].
         message: the last event, for people.
@@ -142,6 +144,7 @@ class Status:
     vio_age: float
     accepted: int
     rejected: int
+    broken: int
     nis: float
     position_sigma: float
     attitude_sigma: float

@@ -42,7 +42,8 @@ def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> 
     H[3:, at.D_ATTITUDE] = so3.hat(up_B)
     residual = np.concatenate([steps[:, GYRO].mean(axis=0) - x[at.GYRO_BIAS], steps[:, ACCEL].mean(axis=0) - x[at.ACCEL_BIAS] - up_B])
     still = Belief(stamp, x, P)
-    return UnscentedTransform.correct(still, _innovation(still, H, residual, np.repeat([imu.gyro_noise**2, imu.accel_noise**2], 3) / len(steps)))
+    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) / T
+    return UnscentedTransform.correct(still, _innovation(still, H, residual, variance))
 
 
 def _innovation(belief: Belief, H: np.ndarray, residual: np.ndarray, variance: np.ndarray) -> Innovation:

@@ -13,6 +13,7 @@ from perch_perception.ukf.stillness import still
 from perch_perception.ukf.unscented import Belief
 
 _REGULAR = 1e-12  # variance that a state has at least, in each direction: a covariance may be singular, a factor's may not
+_STANDS = 0.02  # speed that may be rest [m/s]
 UNKNOWN_POSITION, UNKNOWN_VELOCITY, UNKNOWN_YAW = 1e3, 1e2, np.pi  # 1 sigma before the first VIO pose [m, m/s, rad]
 
 
@@ -68,7 +69,7 @@ def from_pose(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:
         pose: VIO's pose; its velocity is taken where it has one.
         steps: IMU steps before the pose, shape (m, 9).
     """
-    at_rest = still(config.rest, config.imu, steps) and (pose.v_B is None or np.linalg.norm(pose.v_B) < 0.1)
+    at_rest = still(config.rest, steps) and (pose.v_B is None or np.linalg.norm(pose.v_B) < _STANDS)
     R_WB = so3.quat_to_matrix(pose.q_WB)
     x = np.zeros(at.NOMINAL_SIZE)
     x[at.POSITION], x[at.QUATERNION] = pose.p_WB, pose.q_WB

@@ -1,9 +1,13 @@
 """Rest, told from the IMU alone: the stance hypothesis of Skog et al. (Zero-velocity detection - an algorithm evaluation, 2010).
 
 Rotors that carry a vehicle shake it, and its controller never stops correcting; what rests is as quiet as the sensor. Under the
-hypothesis that the vehicle rests, the accelerometer reads gravity in an unknown constant direction, and the gyro its bias:
+hypothesis that the vehicle rests, gyro and accelerometer read constants with the noise of the sensor,
 
-    T = 1/N sum ( |f_k - g f_mean/|f_mean||^2 / sigma_a^2 + |w_k - b_g|^2 / sigma_w^2 ),    E[T] = 6.
+    T = 1/(N - 1) sum ( |f_k - f_mean|^2 / sigma_a^2 + |w_k - w_mean|^2 / sigma_w^2 ),    E[T] = 6,
+
+and these constants are the gyro's bias and, with the accelerometer's bias, g in any direction. What the means may differ by from that
+follows from how well the biases are known and from how much the readings vary; before a filter knows the biases it is what the largest
+turn-on biases make of it.
 
 It holds in any attitude, and needs neither an image nor word from the controller. Constant motion it cannot tell from rest: whoever
 says "zero velocity" on it asks first whether that can be (`ukf.rest`, `vio.rest`).
@@ -14,31 +18,53 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core.vehicle import GRAVITY
-from perch_perception.ukf.config import ImuNoise, RestConfig
+from perch_perception.ukf.config import RestConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer
-from perch_perception.ukf.unscented import ACCEL, DT, GYRO
+from perch_perception.ukf.unscented import ACCEL, ACCEL_VARIANCE, DT, GYRO, GYRO_VARIANCE
 
-_LEAST = 10  # samples
-_ENTIRE = 0.9  # share of the window that must be there
+_LEAST = 10     # samples
+_ENTIRE = 0.9   # share of the window that must be there
+_LATEST = 4     # part of the window, its last, that must look like rest as well: a departure has just begun
+_CERTAIN = 6.0  # sigma of a mean that still is taken for zero
 
 
-def still(config: RestConfig, noise: ImuNoise, steps: np.ndarray, gyro_bias: np.ndarray | None = None) -> bool:
+def energy(steps: np.ndarray) -> float:
+    """T / 6 of IMU steps (m, 9), m > 1: how much they vary, in what the noise of the sensor does."""
+    f, w = steps[:, ACCEL], steps[:, GYRO]
+    T = (((f - f.mean(axis=0)) ** 2).sum(axis=1) / steps[:, ACCEL_VARIANCE]).sum()
+    T += (((w - w.mean(axis=0)) ** 2).sum(axis=1) / steps[:, GYRO_VARIANCE]).sum()
+    return float(T) / (6 * (len(steps) - 1))
+
+
+def still(config: RestConfig, steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndarray | None = None,
+          seen: bool = False) -> bool:
     """Whether IMU steps are those of a vehicle at rest.
 
     Args:
-        config: the limit.
-        noise: 1 sigma of one sample.
+        config: the limits.
         steps: as from `ImuBuffer.run`, shape (m, 9).
-        gyro_bias: what the gyro reads at rest [rad/s], shape (3,); None: it is not known, and its mean stands for it.
+        biases: of gyro and accelerometer [rad/s, m/s^2], shape (6,); None: not known.
+        variance: of the biases, shape (6,).
+        seen: a camera sees that nothing moves: what shakes the vehicle then, be it its own rotors, does not move it.
     """
     if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * config.window:
         return False
-    f, w = steps[:, ACCEL], steps[:, GYRO]
-    mean = f.mean(axis=0)
-    f = f - mean * (GRAVITY / max(float(np.linalg.norm(mean)), 1e-6))
-    w = w - (w.mean(axis=0) if gyro_bias is None else gyro_bias)
-    energy = ((f**2).sum() / noise.accel_noise**2 + (w**2).sum() / noise.gyro_noise**2) / (6 * len(steps))
-    return bool(energy < config.energy)
+    known = np.array([config.gyro_bias, config.accel_bias]) if biases is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
+    sigma = np.sqrt(steps[:, [GYRO_VARIANCE, ACCEL_VARIANCE]].mean(axis=0))
+    off = _beyond(steps, biases, known)
+    if not seen and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > config.energy:
+        return False
+    spread = np.maximum(sigma, steps[:, 1:7].std(axis=0).reshape(2, 3).max(axis=1))
+    latest = steps[-max(len(steps) // _LATEST, 2):]
+    if (seen or biases is None) and (off > _CERTAIN * spread / np.sqrt(len(steps))).any():
+        return False
+    return bool((_beyond(latest, biases, known) < _CERTAIN * spread / np.sqrt(len(latest))).all())
+
+
+def _beyond(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:
+    """How far the means of gyro and accelerometer are from rest, beyond what is `known` of their biases, each (2,)."""
+    mean = steps[:, 1:7].mean(axis=0) - (0.0 if biases is None else biases)
+    return np.maximum(np.abs([np.linalg.norm(mean[:3]), np.linalg.norm(mean[3:]) - GRAVITY]) - known, 0.0)
 
 
 def window(config: RestConfig, imu: ImuBuffer, end: int) -> np.ndarray:

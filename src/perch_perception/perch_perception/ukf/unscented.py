@@ -22,7 +22,7 @@ from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.measurement import VioPose
 
 # columns of a run of IMU steps
-DT, GYRO, ACCEL = 0, slice(1, 4), slice(4, 7)
+DT, GYRO, ACCEL, GYRO_VARIANCE, ACCEL_VARIANCE = 0, slice(1, 4), slice(4, 7), 7, 8
 
 
 class CovarianceError(PerchError):

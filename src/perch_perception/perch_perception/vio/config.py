@@ -16,7 +16,7 @@ class TrackerConfig:
     features: int = quantity(100, low=10, high=400, doc="tracks to keep up")
     refill: float = quantity(0.85, low=0.1, high=1.0, doc="detect new features below this share of them")
     spacing: float = quantity(18.0, unit="px", above=2.0, doc="least distance between features")
-    crowding: float = quantity(0.0, unit="-", low=0.0, high=1.0,
+    crowding: float = quantity(0.6, unit="-", low=0.0, high=1.0,
                                doc="features nearer to an older one than this share of the spacing are let go; 0: none")
     flatten: float = quantity(20.0, unit="px", low=0.0, high=200.0,
                               doc="sigma over which brightness is averaged and taken off (vignetting, shadows); 0: not at all")
@@ -42,26 +42,21 @@ class FilterConfig:
     pixel_noise: float = quantity(0.085, unit="px", above=0.0, doc="1 sigma of a track, white from frame to frame")
     slide_turn: float = quantity(0.9, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the angle that its bearing moves")
     slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
-    slide_free_turn: float = quantity(0.06, unit="rad", low=0.0, high=0.5, doc="change of bearing that a patch bears without a walk")
-    slide_free_zoom: float = quantity(0.02, unit="-", low=0.0, high=0.5, doc="as much of its distance's logarithm")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
     tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
-    least_parallax_deg: float = quantity(2.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
+    least_parallax_deg: float = quantity(1.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
     landmark_strikes: int = quantity(3, low=1, doc="refused observations after which a landmark is dropped")
 
 
 @dataclass(frozen=True)
 class CalibrationPriors:
-    """1 sigma of what calibration leaves open; zero fixes a quantity.
+    """1 sigma of what a careful calibration leaves open; zero fixes a quantity."""
 
-    A careful calibration (0.5 deg, 2 ms, 0.3 %) of which one that is off by more than two sigma is repeated: 0.96 of that.
-    """
-
-    rotation: float = quantity(0.00838, unit="rad", low=0.0, high=0.2, doc="camera against IMU, all axes together")
+    rotation: float = quantity(0.0087, unit="rad", low=0.0, high=0.2, doc="camera against IMU, all axes together")
     translation: float = quantity(0.002, unit="m", low=0.0, high=0.1)
-    time_offset: float = quantity(0.0019, unit="s", low=0.0, high=0.05)
-    focal: float = quantity(0.0029, unit="-", low=0.0, high=0.05, doc="relative error of each focal length")
-    centre: float = quantity(0.48, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
+    time_offset: float = quantity(0.002, unit="s", low=0.0, high=0.05)
+    focal: float = quantity(0.003, unit="-", low=0.0, high=0.05, doc="relative error of each focal length")
+    centre: float = quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
 
 
 @dataclass(frozen=True)
@@ -71,8 +66,8 @@ class StartConfig:
     position_sigma: float = quantity(0.001, unit="m", above=0.0)
     yaw_sigma: float = quantity(0.001, unit="rad", above=0.0)
     motion_time: float = quantity(0.5, unit="s", above=0.2, high=3.0, doc="frames needed for a start in motion")
-    motion_noise: float = quantity(2.0, unit="px", above=0.0, doc="1 sigma of a track about its point over the frames of a start in motion")
-    rest_disparity: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of the tracks at rest")
+    motion_noise: float = quantity(1.0, unit="px", above=0.0, doc="1 sigma of a track about its point over the frames of a start in motion")
+    rest_motion: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of tracks over the window of rest")
     rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
     ground_sigma: float = quantity(0.005, unit="m", above=0.0, doc="1 sigma of the ground about its plane")
     ground_least_height: float = quantity(0.08, unit="m", above=0.0, doc="a camera standing lower sees no landmarks on the ground")
@@ -81,13 +76,17 @@ class StartConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """When odometry counts as lost, and when it starts again."""
+    """When odometry counts as blind, as lost, and when it starts again."""
 
     least_tracks: int = quantity(8, low=3, doc="tracks below which a frame says nothing")
-    degraded_after: float = quantity(0.15, unit="s", above=0.0, doc="time without a visual update")
+    dark_after: float = quantity(0.15, unit="s", above=0.0, doc="time without a visual update that is blindness where nothing is tracked")
+    blind_after: float = quantity(0.5, unit="s", above=0.0, doc="time without a visual update that is blindness whatever is tracked")
+    leaving_time: float = quantity(1.0, unit="s", above=0.0, doc="from rest on, in which a take-off may go on blind")
     leaving_velocity: float = quantity(0.05, unit="m/s", above=0.0, doc="1 sigma up to which a take-off may go on blind")
     restart_velocity: float = quantity(1.0, unit="m/s", above=0.0, doc="1 sigma that ends a run")
-    rejected_frames: int = quantity(12, low=2, doc="frames in a row with most observations refused that end a run")
+    speed: float = quantity(25.0, unit="m/s", above=0.0, doc="faster flies no vehicle that this is for: the filter has diverged")
+    frames: int = quantity(15, low=2, doc="frames over which observations that are refused and used are counted")
+    refused: int = quantity(20, low=1, doc="a run ends where more are refused than used, and than this")
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,8 @@ def compress(H: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return R[:n, :n], R[:n, n]
 
 
-def update(P: np.ndarray, columns: np.ndarray, H: np.ndarray, r: np.ndarray, variance: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def update(P: np.ndarray, columns: np.ndarray, H: np.ndarray, r: np.ndarray,
+           variance: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Kalman update with a Jacobian that touches only some columns.
 
     Args:
@@ -102,11 +103,12 @@ def update(P: np.ndarray, columns: np.ndarray, H: np.ndarray, r: np.ndarray, var
         variance: of the measurement noise, a number or one per row (m,).
 
     Returns:
-        Error estimate (n,) and new covariance (n, n), symmetric.
+        Error estimate (n,), new covariance (n, n), symmetric, and the normalised innovation squared r^T S^-1 r, of dimension m.
     """
     HP = H @ P[columns]
     S = HP[:, columns] @ H.T
     S.flat[:: len(S) + 1] += variance
     L = _cholesky(S)
     half = _solve_lower(L, HP)  # P H^T S^-1 H P = half^T half, symmetric to the last bit
-    return half.T @ _solve_lower(L, r), P - half.T @ half
+    white = _solve_lower(L, r)
+    return half.T @ white, P - half.T @ half, float(white @ white)

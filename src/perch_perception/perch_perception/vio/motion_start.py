@@ -1,170 +1,260 @@
-"""Start in motion: gravity, velocity and scale from the IMU and the tracks of about half a second, in closed form.
+"""Start in motion: gyro bias, gravity, velocity and scale from the IMU and the tracks of half a second or more, in closed form.
 
-In the body frame B0 of the first frame, with preintegrated dR, dp and p_k = v0 T + g0 T^2/2 + dp_k, every observation says
-that the point lies on its ray:  (I - d d^T)(X_j - p_k - dR_k p_BC) = 0,  d = dR_k R_BC b.  That is linear in v0, g0 and all
-X_j; the points are eliminated, and the 6 x 6 rest is solved with |g0| = g. (Dong-Si and Mourikis 2012.)
+First the gyro's bias, which a wrong rotation would carry into everything else (`gyro_bias`). Then, in the body frame B0 of the first
+frame, with preintegrated dR, dp and p_k = v0 T + g0 T^2/2 + dp_k + (d dp_k / d b_a) b_a, every observation says that the point lies on
+its ray:  (I - d d^T)(X_j - p_k - dR_k p_BC) = 0,  d = dR_k R_BC b.  That is linear in v0, g0, b_a and all X_j; the points are
+eliminated, b_a has its prior, and the 9 x 9 rest is solved with |g0| = g. (Dong-Si and Mourikis 2012.)
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.covariance import largest_sigma
 from perch_core.vehicle import GRAVITY
 
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.vio import start
+from perch_perception.vio import state as at
 from perch_perception.vio.bearing import Bearings
 from perch_perception.vio.config import VioConfig
-from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.gyro_bias import RayPair, solve_gyro_bias
+from perch_perception.vio.preintegration import Preintegration, preintegrate
 from perch_perception.vio.start import KnownPose
 from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Tracks
 
 _LEAST_FEATURES = 12
 _LEAST_FRAMES = 6
+_MOST_FRAMES = 16      # of the longest stretch; more cost time and tell little
+_ITERATIONS = 10
+_LONGEST = 3.0         # stretch that is kept, in that after which a start is tried
+_GYRO_SIGMA = 0.02     # bias known at least so well before anything else is solved [rad/s]
+_TILT, _SPEED = 0.2, 0.5  # 1 sigma with which a filter may start [rad, m/s]
 
 
 @dataclass(frozen=True)
 class MotionSolution:
-    """Velocity and gravity in B0 (3,), covariance of both stacked (6, 6), and the mean residual [rad]."""
+    """Velocity and gravity in B0 and the accelerometer's bias (3,), covariance of all stacked (9, 9), and the RMS residual [rad].
+
+    The covariance is that of tracks twice as noisy as they are said to be.
+    """
 
     v: np.ndarray
     g: np.ndarray
+    accel_bias: np.ndarray
     covariance: np.ndarray
     residual: float
 
 
-def solve_motion(T: np.ndarray, dp: np.ndarray, centres: np.ndarray, rays: list[np.ndarray], frames: list[np.ndarray],
-                 sigma: float) -> MotionSolution | None:
-    """Velocity and gravity from rays.
+def solve_motion(T: np.ndarray, dp: np.ndarray, dv: np.ndarray, by_bias: np.ndarray, centres: np.ndarray, rays: np.ndarray,
+                 seen: np.ndarray, sigma: float, bias_sigma: float) -> MotionSolution | None:
+    """Velocity, gravity and accelerometer bias from rays: the maximum of their likelihood.
+
+    The closed form weighs a far point more than a near one, and so prefers a scale that is too small: it is where Gauss-Newton on the
+    bearings begins. Where it has collapsed, gravity along the mean force, and larger velocities, are better beginnings; the likeliest
+    end counts.
 
     Args:
         T: time since the first frame [s], shape (n,).
         dp: preintegrated positions in B0 [m], shape (n, 3).
+        dv: preintegrated velocity at the last of the frames in B0 [m/s], shape (3,).
+        by_bias: derivatives of dp by the accelerometer's bias, shape (n, 3, 3).
         centres: dR_k p_BC, camera centres relative to the body in B0 [m], shape (n, 3).
-        rays: for each feature its unit rays in B0, shape (m_j, 3).
-        frames: for each feature the frames of its rays, shape (m_j,).
+        rays: unit rays of m features in B0, shape (m, n, 3).
+        seen: in which frames they are, shape (m, n).
         sigma: 1 sigma of a ray [rad].
+        bias_sigma: 1 sigma of the accelerometer's bias before [m/s^2].
 
     Returns:
         None where the motion does not tell velocity and gravity.
     """
-    weights = [np.ones(len(f)) for f in frames]
-    y = np.zeros(6)
-    for _ in range(3):
-        N, b, systems = np.zeros((6, 6)), np.zeros(6), []
-        for d, k, w in zip(rays, frames, weights):
-            M = (np.eye(3) - d[:, :, None] * d[:, None, :]) * w[:, None, None]
-            G = np.zeros((len(k), 3, 6))
-            G[:, :, :3] = T[k, None, None] * np.eye(3)
-            G[:, :, 3:] = 0.5 * T[k, None, None] ** 2 * np.eye(3)
-            e = dp[k] + centres[k]
-            MG, Me = M @ G, np.einsum("nij,nj->ni", M, e)
-            A = M.sum(axis=0)
-            if np.linalg.eigvalsh(A)[0] < 1e-6 * np.trace(A):
-                continue  # no parallax yet: nothing to learn from this feature
-            A_inv = np.linalg.inv(A)
-            SG, Se = MG.sum(axis=0), Me.sum(axis=0)
-            N += np.einsum("nji,njk->ik", G, MG) - SG.T @ A_inv @ SG
-            b -= np.einsum("nji,nj->i", G, Me) - SG.T @ A_inv @ Se
-            systems.append((A_inv, SG, Se, G, e, d, k))
-        if len(systems) < _LEAST_FEATURES or np.linalg.eigvalsh(N)[0] < 1e-9:
+    G = np.concatenate([T[:, None, None] * np.eye(3), 0.5 * T[:, None, None] ** 2 * np.eye(3), by_bias], axis=2)
+    along = dv * (-GRAVITY / max(float(np.linalg.norm(dv)), 1e-9))
+    found = [_refined(G, dp + centres, rays, seen, sigma, bias_sigma, *begin)
+             for begin in ((None, 1.0), (along, 1.0), (along, 3.0), (along, 10.0))]
+    return min((end for end in found if end is not None), key=lambda end: end[0], default=(0.0, None))[1]
+
+
+def _refined(G: np.ndarray, e: np.ndarray, rays: np.ndarray, seen: np.ndarray, sigma: float, bias_sigma: float,
+             gravity: np.ndarray | None, scale: float) -> tuple[float, MotionSolution] | None:
+    """Gauss-Newton from the closed form, with a given gravity (3,) in it and its velocity scaled, or with none; its cost and its end.
+
+    Camera k is at G_k y + e_k, shapes (n, 3, 9), (n, 3), with y = (v, g, b_a).
+    """
+    u, distance = rays, np.ones(seen.shape)
+    prior = np.diag(np.repeat([0.0, 0.0, (sigma / bias_sigma) ** 2], 3))
+    y, used = np.zeros(9), seen
+    for iteration in range(_ITERATIONS):
+        M = (np.eye(3) - u[..., :, None] * u[..., None, :]) * (used / distance**2)[..., None, None]
+        A = M.sum(axis=1)
+        eigenvalues = np.linalg.eigvalsh(A)
+        told = eigenvalues[:, 0] > 1e-6 * eigenvalues.sum(axis=1)
+        if told.sum() < _LEAST_FEATURES:
+            return None  # too little parallax
+        u, distance, rays, seen, used, M, A = (x[told] for x in (u, distance, rays, seen, used, M, A))
+        target = e + distance[..., None] * rays  # the point is X = target + G y, but for what M does not see
+        MG, Mt = np.einsum("fkij,kjl->fkil", M, G), np.einsum("fkij,fkj->fki", M, target)
+        inverse, SG, St = np.linalg.inv(A), MG.sum(axis=1), Mt.sum(axis=1)
+        N = np.einsum("kji,fkjl->il", G, MG) - np.einsum("fji,fjk,fkl->il", SG, inverse, SG)
+        b = np.einsum("fji,fjk,fk->i", SG, inverse, St) - np.einsum("kji,fkj->i", G, Mt)
+        if np.linalg.eigvalsh(N[:6, :6])[0] < 1e-9:
             return None
-        y = _with_gravity(N, b)
-        weights, rays, frames, residuals = [], [], [], []
-        for A_inv, SG, Se, G, e, d, k in systems:
-            v = A_inv @ (SG @ y + Se) - G @ y - e
-            distance = np.maximum(np.linalg.norm(v, axis=1), 0.05)
-            off = np.linalg.norm(v - d * np.sum(v * d, axis=1, keepdims=True), axis=1) / distance
-            if np.sqrt(np.mean(off**2)) > 8 * sigma and len(systems) > 2 * _LEAST_FEATURES:
-                continue  # not a point of the static world
-            residuals.append(off)
-            weights.append(1.0 / distance**2)
-            rays.append(d)
-            frames.append(k)
-    covariance = sigma**2 * np.linalg.inv(N)
-    return MotionSolution(y[:3], y[3:], covariance, float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))))
+        if iteration == 0:  # in metres, not in radians: no prior can be weighed against it
+            y[:6] = _with_gravity(N[:6, :6], b[:6]) if gravity is None else np.concatenate(
+                [scale * np.linalg.solve(N[:3, :3], b[:3] - N[:3, 3:6] @ gravity), gravity])
+        else:
+            y = _with_gravity(N + prior, b, y[3:6])
+        v = (np.einsum("fij,fj->fi", inverse, SG @ y + St)[:, None] - G @ y - e)
+        distance = np.maximum(np.linalg.norm(v, axis=2), 0.01)
+        u = v / distance[..., None]
+        cosine = (u * rays).sum(axis=2)
+        off2 = np.maximum(1.0 - cosine**2, 0.0)
+        bad = np.where(seen & (cosine < 0.0), 1.0, np.where(seen, off2, 0.0)).sum(axis=1) / seen.sum(axis=1) > (4.0 * sigma) ** 2
+        used = seen if iteration < 2 or (~bad).sum() < _LEAST_FEATURES else seen & ~bad[:, None]  # not points of the static world
+    if (used & (cosine < 0.5)).any():
+        return None
+    rms2 = off2[used].mean()
+    cost = float((np.minimum(off2, (4.0 * sigma) ** 2)[seen]).sum() / sigma**2 + (y[6:] ** 2).sum() / bias_sigma**2)
+    covariance = np.linalg.inv(N / (2.0 * sigma) ** 2 + prior / sigma**2)
+    return cost, MotionSolution(y[:3], y[3:6], y[6:], covariance, float(np.sqrt(rms2)))
 
 
-def _with_gravity(N: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Minimise y^T N y - 2 b^T y over (v, g) with |g| = GRAVITY: Gauss-Newton on the sphere from the free solution."""
-    y = np.linalg.solve(N, b)
-    g = y[3:] if np.linalg.norm(y[3:]) > 1e-6 else np.array([0.0, 0.0, -1.0])
+def _with_gravity(N: np.ndarray, b: np.ndarray, g: np.ndarray | None = None) -> np.ndarray:
+    """Minimise y^T N y - 2 b^T y over (v, g, ...) with |g| = GRAVITY: Gauss-Newton on the sphere from a given g or the free solution."""
+    if g is None:
+        y = np.linalg.solve(N, b)
+        g = y[3:6] if np.linalg.norm(y[3:6]) > 1e-6 else np.array([0.0, 0.0, -1.0])
+    n = len(N)
     for _ in range(8):
         g = g * (GRAVITY / np.linalg.norm(g))
         u = np.linalg.svd(g[None])[2][1:].T  # tangent plane of the sphere
-        J = np.zeros((6, 5))
-        J[:3, :3], J[3:, 3:] = np.eye(3), u
-        step = np.linalg.solve(J.T @ N @ J, J.T @ (b - N @ np.concatenate([np.zeros(3), g])))
-        y = np.concatenate([step[:3], g + u @ step[3:]])
-        g = y[3:]
-    return np.concatenate([y[:3], g * (GRAVITY / np.linalg.norm(g))])
+        J = np.zeros((n, n - 1))
+        J[:3, :3], J[3:6, 3:5], J[6:, 5:] = np.eye(3), u, np.eye(n - 6)
+        step = np.linalg.solve(J.T @ N @ J, J.T @ (b - N[:, 3:6] @ g))
+        g = g + u @ step[3:5]
+    return np.concatenate([step[:3], g * (GRAVITY / np.linalg.norm(g)), step[5:]])
 
 
 class MotionStart:
-    """Gathers frames until they tell velocity and gravity."""
+    """Gathers frames until they tell the gyro's bias, velocity and gravity.
 
-    def __init__(self, config: VioConfig, mount: CameraMount) -> None:
+    Attributes:
+        gyro_bias: as far as it is known [rad/s], shape (3,).
+        gyro_sigma: 1 sigma of each of its components [rad/s].
+    """
+
+    def __init__(self, config: VioConfig, mount: CameraMount, gyro_bias: np.ndarray | None = None) -> None:
+        """
+        Args:
+            config: all settings.
+            mount: the camera as calibrated.
+            gyro_bias: as a filter found it that was lost; None: there was none.
+        """
         self._config, self._mount = config, mount
         self._tracks, self._stamps = Tracks(), {}
+        self.gyro_bias = np.zeros(3) if gyro_bias is None else gyro_bias
+        self.gyro_sigma = config.imu.gyro_bias_init
 
     def add(self, frame: int, stamp: int, ids: np.ndarray, bearings: Bearings) -> None:
         """Take a frame: number, exposure on the IMU's clock [ns], feature numbers (n,) and bearings."""
         self._tracks.take_ended(ids)
         self._tracks.observe(frame, ids, bearings)
         self._stamps[frame] = stamp
-        oldest = stamp - round(1e9 * self._config.start.motion_time)
+        oldest = stamp - round(1e9 * _LONGEST * self._config.start.motion_time)
         self._stamps = {f: s for f, s in self._stamps.items() if s >= oldest}
         self._tracks.forget_before(min(self._stamps))
 
-    def solve(self, imu: ImuBuffer, pose: KnownPose, gyro_bias: np.ndarray) -> State | None:
+    def solve(self, imu: ImuBuffer, known: Callable[[np.ndarray], KnownPose]) -> State | None:
         """A state at the newest frame, or None while there is too little motion, time or texture.
 
         Args:
             imu: samples over all frames.
-            pose: position and heading at the newest frame, as far as they are known.
-            gyro_bias: last known [rad/s], shape (3,).
+            known: position and heading at the newest frame, as far as they are known, with a gyro bias (3,).
         """
-        frames = sorted(self._stamps)
-        if len(frames) < _LEAST_FRAMES or self._span(frames) < 0.85 * self._config.start.motion_time:
+        for stretch in (1.0, _LONGEST):  # as short as it can be: tracks end, and noise grows
+            frames = self._frames(imu, stretch * self._config.start.motion_time)
+            state = None if frames is None else self._solve(frames, imu, known)
+            if state is not None:
+                return state
+        return None
+
+    def _frames(self, imu: ImuBuffer, duration: float) -> list[int] | None:
+        """Frames over the last `duration` [s], evenly thinned; None where there are not enough."""
+        newest = max(self._stamps.values())
+        frames = [f for f, s in sorted(self._stamps.items()) if s >= max(newest - round(1e9 * duration), imu.oldest)]
+        if len(frames) < _LEAST_FRAMES or (newest - self._stamps[frames[0]]) * 1e-9 < 0.85 * duration:
             return None
-        if self._stamps[frames[0]] < imu.oldest:
-            return None
+        chosen = np.unique(np.round(np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FRAMES))).astype(int))
+        return [frames[k] for k in chosen]
+
+    def _solve(self, frames: list[int], imu: ImuBuffer, known: Callable[[np.ndarray], KnownPose]) -> State | None:
         place = {f: k for k, f in enumerate(frames)}
-        parts = [preintegrate(imu.run(self._stamps[frames[0]], self._stamps[f]), gyro_bias, np.zeros(3)) for f in frames]
-        T = np.array([p.duration for p in parts])
-        dR, dp = np.array([p.dR for p in parts]), np.array([p.dp for p in parts])
-        R_C = dR @ self._mount.R_BC
         rays, seen = [], []
         for track in self._tracks.by_id.values():
-            k = np.array([place[f] for f in track.frames if f in place], int)
-            if len(k) >= _LEAST_FRAMES:
-                rays.append(np.einsum("nij,nj->ni", R_C[k], np.array(track.b_C[-len(k):])))
-                seen.append(k)
+            there = [(place[f], b) for f, b in zip(track.frames, track.b_C) if f in place]
+            if len(there) >= _LEAST_FRAMES:
+                seen.append(np.array([k for k, _ in there]))
+                rays.append(np.array([b for _, b in there]) @ self._mount.R_BC.T)
         if len(rays) < _LEAST_FEATURES:
             return None
         sigma = self._config.start.motion_noise / self._mount.camera.fx
-        found = solve_motion(T, dp, dR @ self._mount.p_BC, rays, seen, sigma)
-        if found is None or found.residual > 4 * sigma:
+        self._find_gyro_bias(frames, imu, rays, seen, sigma)
+        if self.gyro_sigma > _GYRO_SIGMA:
             return None
-        return self._state(found, parts, pose, gyro_bias, self._stamps[frames[-1]])
-
-    def _span(self, frames: list[int]) -> float:
-        return (self._stamps[frames[-1]] - self._stamps[frames[0]]) * 1e-9
-
-    def _state(self, found: MotionSolution, parts: list, pose: KnownPose, gyro_bias: np.ndarray, stamp: int) -> State | None:
-        last = parts[-1]
-        # twice the formal figure: biases and the IMU's noise are not in it
-        tilt = 2 * largest_sigma(found.covariance[3:, 3:]) / GRAVITY
-        speed = 2 * largest_sigma(found.covariance[:3, :3])
-        if tilt > 0.2 or speed > 0.5:
+        parts = [preintegrate(imu.run(self._stamps[frames[0]], self._stamps[f]), self.gyro_bias, np.zeros(3)) for f in frames]
+        dR, there = np.array([p.dR for p in parts]), np.zeros((len(rays), len(frames)), bool)
+        all_rays = np.broadcast_to([0.0, 0.0, 1.0], (*there.shape, 3)).copy()
+        for row, (k, d) in enumerate(zip(seen, rays)):
+            there[row, k], all_rays[row, k] = True, np.einsum("nij,nj->ni", dR[k], d)
+        found = solve_motion(
+            np.array([p.duration for p in parts]), np.array([p.dp for p in parts]), parts[-1].dv, np.array([p.J[3:6, 3:] for p in parts]),
+            dR @ self._mount.p_BC, all_rays, there, sigma, self._config.imu.accel_bias_init)
+        if found is None or found.residual > 2 * sigma:
             return None
-        bias_tilt = self._config.imu.accel_bias_init / GRAVITY
-        up_B = last.dR.T @ (-found.g / GRAVITY)
+        return self._state(found, parts[-1], known(self.gyro_bias), self._stamps[frames[-1]])
+
+    def _find_gyro_bias(self, frames: list[int], imu: ImuBuffer, rays: list[np.ndarray], seen: list[np.ndarray], sigma: float) -> None:
+        """From pairs of frames that are half the stretch apart, each frame in one of them."""
+        half, pairs = len(frames) // 2, []
+        for i in range(half):
+            j = i + half
+            both = [(d[k == i][0], d[k == j][0]) for d, k in zip(rays, seen) if i in k and j in k]
+            if len(both) >= _LEAST_FEATURES:
+                part = preintegrate(imu.run(self._stamps[frames[i]], self._stamps[frames[j]]), self.gyro_bias, np.zeros(3))
+                first, second = np.array(both).swapaxes(0, 1)
+                pairs.append(RayPair(part.dR, part.J[:3, :3], first, second))
+        step, P = solve_gyro_bias(pairs, sigma, self._config.imu.gyro_bias_init)
+        self.gyro_bias, self.gyro_sigma = self.gyro_bias + step, largest_sigma(P)
+
+    def _state(self, found: MotionSolution, last: Preintegration, pose: KnownPose, stamp: int) -> State | None:
+        """The state at the end of the stretch, if it is known well enough.
+
+        With v_B = dR^T (v0 + g0 T + dv + (d dv / d b_a) b_a) and up_B = -dR^T g0 / g: errors of v0, g0 and b_a go into tilt, velocity
+        and b_a together.
+        """
+        to_end = last.dR.T
+        up_B = to_end @ (-found.g / GRAVITY)
         R_WB = start.levelled(pose.R_WB, up_B)
-        v_B0 = found.v + found.g * last.duration + last.dv
-        return start.fresh(self._config, self._mount, stamp, R_WB, pose, R_WB @ (last.dR.T @ v_B0), gyro_bias.copy(),
-                           float(np.hypot(tilt, bias_tilt)), float(np.hypot(speed, 0.1)), self._config.imu.gyro_bias_init)
+        v_B = to_end @ (found.v + found.g * last.duration + last.dv + last.J[6:, 3:] @ found.accel_bias)
+        # theta: what turns up_B by the error of g0; the heading is the pose's
+        by_theta = so3.hat(up_B) @ to_end / GRAVITY
+        by_y = np.zeros((9, 9))
+        by_y[:3, 3:6] = by_theta
+        by_y[3:6] = R_WB @ (to_end @ np.hstack([np.eye(3), last.duration * np.eye(3), last.J[6:, 3:]])
+                            - so3.hat(v_B) @ np.hstack([np.zeros((3, 3)), by_theta, np.zeros((3, 3))]))
+        by_y[6:, 6:] = np.eye(3)
+        P = by_y @ found.covariance @ by_y.T
+        if largest_sigma(P[:3, :3]) > _TILT or largest_sigma(P[3:6, 3:6]) > _SPEED:
+            return None
+        state = start.fresh(self._config, self._mount, stamp, R_WB, pose, R_WB @ v_B, self.gyro_bias.copy(), 0.0, 0.05,
+                            2.0 * self.gyro_sigma)
+        state.accel_bias = found.accel_bias.copy()
+        rows = np.r_[at.THETA, at.VELOCITY, at.ACCEL_BIAS]
+        state.P[at.ACCEL_BIAS, at.ACCEL_BIAS] = 0.0
+        state.P[np.ix_(rows, rows)] += P
+        return state

@@ -27,7 +27,11 @@ _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
 
 @dataclass
 class FrameReport:
-    """What a frame's update did: observations used and refused; normalised innovations (value, dimension)."""
+    """What a frame's update did: observations used and refused.
+
+    Attributes:
+        nis, nis_dimension: normalised innovation squared of what was used, with its joint covariance, and its dimension.
+    """
 
     landmarks_used: int = 0
     tracks_used: int = 0
@@ -84,15 +88,22 @@ class Msckf:
         self._used &= self.tracks.by_id.keys()
         return report
 
-    def apply(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, variance: float | np.ndarray) -> None:
-        """Kalman update of the whole state with a Jacobian over some columns.
+    def apply(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, variance: float | np.ndarray) -> float:
+        """Kalman update of the whole state with a Jacobian over some columns; returns the normalised innovation squared.
 
         The lens is *considered*: its uncertainty counts in every gain and covariance, but it is not estimated (Schmidt).
         """
         lens = self.state.P[at.LENS, at.LENS]
-        dx, self.state.P = ekf.update(self.state.P, columns, H, r, variance)
+        dx, self.state.P, nis = ekf.update(self.state.P, columns, H, r, variance)
         dx[at.LENS], self.state.P[at.LENS, at.LENS] = 0.0, lens
         self.state.inject(dx)
+        return nis
+
+    def _use(self, report: FrameReport, columns: np.ndarray, rows: list[np.ndarray], rests: list[np.ndarray]) -> None:
+        """Update with the stacked rows of several observations; they are one innovation."""
+        H, r = ekf.compress(np.concatenate(rows), np.concatenate(rests))
+        report.nis += self.apply(columns, H, r, self.sigma**2)
+        report.nis_dimension += len(r)
 
     # -- landmarks in the state --------------------------------------------------------------------------------------
 
@@ -128,8 +139,7 @@ class Msckf:
                 bad.add(i)
         report.landmarks_used, report.refused = int(good.sum()), report.refused + int((~good).sum())
         if good.any():
-            report.nis, report.nis_dimension = float(distance[good].sum()), 2 * int(good.sum())
-            self.apply(columns, H[good].reshape(-1, len(columns)), r[good].ravel(), self.sigma**2)
+            self._use(report, columns, [H[good].reshape(-1, len(columns))], [r[good].ravel()])
         self._used |= bad
         s.drop_landmarks(bad)
 
@@ -159,7 +169,7 @@ class Msckf:
         columns, rows, rests = self._window_columns(), [], []
         P = s.P[np.ix_(columns, columns)]
         candidates = {i: t for i, t in spanning.items() if spread.admits(t.b_C[-1])}
-        for i, prepared in self._prepare_some(candidates, limits.landmarks_per_frame):
+        for i, prepared in self._prepare_some(candidates, limits.landmarks_per_frame, report):
             if report.landmarks_new >= limits.landmarks_per_frame:
                 break
             if prepared is None or not spread.admits(spanning[i].b_C[-1]):
@@ -183,7 +193,7 @@ class Msckf:
             rests.append(r_0)
             report.landmarks_new += 1
         if rows:
-            self.apply(columns, *ekf.compress(np.concatenate(rows), np.concatenate(rests)), self.sigma**2)
+            self._use(report, columns, rows, rests)
 
     # -- tracks that have ended --------------------------------------------------------------------------------------
 
@@ -196,32 +206,31 @@ class Msckf:
             return
         columns, rows, rests = self._window_columns(), [], []
         P = s.P[np.ix_(columns, columns)]
-        for prepared in self._prepare(useful):
+        for prepared in self._prepare(useful, report):
             if prepared is None:
                 continue
             _, H_x, H_f, r = prepared
             _, _, _, H_0, r_0 = ekf.eliminate(H_x, H_f, r)
-            distance = ekf.squared_distance(H_0, P, r_0, self.sigma**2)
-            if distance > self._gate.limit(len(r_0)):
+            if ekf.squared_distance(H_0, P, r_0, self.sigma**2) > self._gate.limit(len(r_0)):
                 report.refused += 1
                 continue
             report.tracks_used += 1
-            report.nis, report.nis_dimension = report.nis + distance, report.nis_dimension + len(r_0)
             rows.append(H_0)
             rests.append(r_0)
         if rows:
-            H, r = ekf.compress(np.concatenate(rows), np.concatenate(rests))
-            self.apply(columns, H, r, self.sigma**2)
+            self._use(report, columns, rows, rests)
 
-    def _prepare_some(self, tracks: dict[int, Track], size: int) -> Iterator[tuple[int, tuple | None]]:
+    def _prepare_some(self, tracks: dict[int, Track], size: int, report: FrameReport) -> Iterator[tuple[int, tuple | None]]:
         """`_prepare` by number, a few at a time as they are asked for."""
         ids = list(tracks)
         for begin in range(0, len(ids), size):
             chunk = ids[begin : begin + size]
-            yield from zip(chunk, self._prepare([tracks[i] for i in chunk]))
+            yield from zip(chunk, self._prepare([tracks[i] for i in chunk], report))
 
-    def _prepare(self, tracks: list[Track]) -> list[tuple | None]:
+    def _prepare(self, tracks: list[Track], report: FrameReport) -> list[tuple | None]:
         """Triangulate tracks and linearise their observations over calibration and window (`_window_columns`).
+
+        Rays with parallax that meet in no point are refused observations: of something that moves, or by poses that are wrong.
 
         Returns:
             For each track: X_W (3,), H_x (2m, k), H_f (2m, 3), r (2m,); None where it is not usable.
@@ -239,12 +248,14 @@ class Msckf:
                             np.array([track.shape[k] for _, track, ks in chosen for k in ks]))
         centres = (p + R @ s.p_BC)[js]
         rays = np.einsum("nij,nj->ni", (R @ s.R_BC)[js], bearings.b_C)
-        X, parts, begin = np.zeros((len(js), 3)), [], 0
+        X, parts, begin, least = np.zeros((len(js), 3)), [], 0, np.radians(limits.least_parallax_deg)
         for number, _, ks in chosen:
             rows = slice(begin, begin + len(ks))
             begin = rows.stop
-            X_W = triangulate(centres[rows], rays[rows], np.radians(limits.least_parallax_deg), self.sliding.spread(bearings.b_C[rows]))
-            if X_W is not None:
+            X_W = triangulate(centres[rows], rays[rows], least, self.sliding.spread(bearings.b_C[rows]))
+            if X_W is None:
+                report.refused += int(rays[rows.start] @ rays[rows.stop - 1] < np.cos(least))
+            else:
                 X[rows] = X_W
                 parts.append((number, X_W, rows))
         if not parts:
@@ -287,13 +298,9 @@ class Msckf:
             return
         before, landmarks = s.clones[-2], list(s.landmarks.values())
         last = np.linalg.norm(np.array([k.X_W for k in landmarks]) - before.p_WB - before.R_WB @ s.p_BC, axis=1)
-        views = [k.view or (t.b_C[-2] if len(t.b_C) > 1 else t.b_C[-1], d) for k, t, d in zip(landmarks, tracks, last)]
-        b_held, d_held = np.array([b for b, _ in views]), np.array([d for _, d in views])
-        b_next, d_next = self.sliding.dragged(b_held, d_held, np.array([t.b_C[-1] for t in tracks]), distance)
-        for k, b, d in zip(landmarks, b_next, d_next.tolist()):
-            k.view = b, d
+        b_last, b_now = (np.array([t.b_C[max(k, -len(t.b_C))] for t in tracks]) for k in (-2, -1))
         rows = s.landmark_start + np.arange(3 * len(tracks)).reshape(-1, 3)
-        s.P[rows[:, :, None], rows[:, None, :]] += self.sliding.of_points(b_held, b_next, d_held, d_next, s.clones[-1].R_WB @ s.R_BC)
+        s.P[rows[:, :, None], rows[:, None, :]] += self.sliding.of_points(b_last, b_now, last, distance, s.clones[-1].R_WB @ s.R_BC)
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)

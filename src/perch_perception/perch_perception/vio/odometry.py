@@ -10,10 +10,12 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
+from perch_core import so3
 from perch_core.camera import Camera, CameraMount
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
-from perch_perception.ukf.stillness import still, window
+from perch_perception.ukf.stillness import energy, still, window
+from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, observe, residuals
@@ -25,6 +27,7 @@ from perch_perception.vio.start import KnownPose
 from perch_perception.vio.tracker import Features, Tracker
 from perch_perception.vio.triangulation import triangulate
 
+_STANDS = 0.8  # what is seen not to move for so long stands, however it is shaken [s]
 _FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
 
@@ -52,7 +55,9 @@ class VisualInertialOdometry:
         self._known = start.told(config, p_WB, yaw)
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposed, features) of frames at rest that the filter has not passed
-        self._gyro_bias = np.zeros(3)
+        self._seen: deque[tuple[int, Features]] = deque()   # frames over which motion in view is judged
+        self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
+        self._lost: tuple[int, float] | None = None  # when the last filter ended, and how fast it was [ns, m/s]
         self._resting = False
         self._told = True     # it stands where it was told to start
         self._sight: int | None = None  # when vision last changed the state; None: not since the last rest
@@ -60,13 +65,14 @@ class VisualInertialOdometry:
         self._last_image = -1           # stamp of the last frame used, on the board's clock
         self._last_exposed: int | None = None
         self._informed = 0              # when vision or rest last updated the filter
-        self._bad_frames = 0
+        self._fates: deque[tuple[int, int]] = deque(maxlen=self.config.loss.frames)  # observations used and refused
         self._look_through(mount)
 
     def _look_through(self, mount: CameraMount) -> None:
         self.mount = mount
         self.tracker = Tracker(self.config.tracker, mount.camera)
-        self._moving = motion_start.MotionStart(self.config, mount)
+        self._seen.clear()
+        self._await()
         _compile(mount.camera)
 
     def use_camera(self, mount: CameraMount) -> None:
@@ -76,8 +82,21 @@ class VisualInertialOdometry:
             self.filter, self._resting = None, False  # nothing is lost: it still stands there
         elif self.filter is not None:
             self._forget_state()
+        else:
+            self._known = self._known_with(self._turned_bias)
         self._views.clear()
         self._look_through(mount)
+
+    def _await(self) -> None:
+        """Gather frames for a start in motion from now on."""
+        self._moving = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
+        # rotation since the pose was known, by the gyro less a bias, and its derivative by that
+        self._turned, self._turned_bias = (np.eye(3), np.zeros((3, 3))), self._moving.gyro_bias
+
+    @property
+    def gyro_sigma(self) -> float:
+        """1 sigma of the newest gyro sample [rad/s]."""
+        return self._imu.gyro_sigma
 
     @property
     def time_offset(self) -> float:
@@ -132,24 +151,30 @@ class VisualInertialOdometry:
     def _track(self, image: np.ndarray, exposed: int) -> Features:
         state = self.filter.state if self.filter else None
         R_BC = state.R_BC if state else self.mount.R_BC
-        turn = np.eye(3)
+        turn, slack = np.eye(3), 0.0
         if self._last_exposed is not None:
             steps = self._imu.run(self._last_exposed, exposed)
-            turn = preintegrate(steps, state.gyro_bias if state else self._gyro_bias, np.zeros(3)).dR
+            turn = preintegrate(steps, state.gyro_bias if state else self._moving.gyro_bias, np.zeros(3)).dR
             if state is None:
-                self._known = replace(self._known, R_WB=self._known.R_WB @ turn)
-        return self.tracker.track(image, R_BC.T @ turn.T @ R_BC)
+                part = preintegrate(steps, self._turned_bias, np.zeros(3))
+                self._turned = self._turned[0] @ part.dR, part.dR.T @ self._turned[1] + part.J[:3, :3]
+                slack = 2e-9 * self._moving.gyro_sigma * (exposed - self._last_exposed)
+        features = self.tracker.track(image, R_BC.T @ turn.T @ R_BC, slack)
+        self._seen.append((exposed, features))
+        while len(self._seen) > 2 and self._seen[1][0] <= exposed - round(1e9 * _STANDS):
+            self._seen.popleft()
+        return features
 
     # -- before the start --------------------------------------------------------------------------------------------
 
     def _try_start(self, exposed: int, features: Features) -> VioResult:
-        """Start at rest or, when the vehicle moves, from the frames of the last half second."""
+        """Start at rest or, when the vehicle moves, from the frames of the last half second and more."""
         steps = window(self.config.rest, self._imu, exposed)
-        if self._quiet(features) and still(self.config.rest, self.config.imu, steps):
-            self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known))
+        if self._quiet() is not False and still(self.config.rest, steps, *(self._biases or (None, None)), seen=bool(self._quiet(_STANDS))):
+            self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known_with(steps[:, GYRO].mean(axis=0))))
             return self._hold(exposed, features)
         self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
-        state = self._moving.solve(self._imu, self._known, self._gyro_bias)
+        state = self._moving.solve(self._imu, self._known_with)
         if state is not None:
             self._begin(state)
             self._told, self._sight = False, exposed
@@ -157,14 +182,25 @@ class VisualInertialOdometry:
         outcome = FrameOutcome.LOST if self.restarts else FrameOutcome.INITIALISING
         return VioResult(outcome, None, len(features.ids), restarts=self.restarts, message=outcome.value)
 
+    def _known_with(self, gyro_bias: np.ndarray) -> KnownPose:
+        """What is known of the present pose, with the heading carried on by a gyro with this bias."""
+        dR, J = self._turned
+        return replace(self._known, R_WB=self._known.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._turned_bias)))
+
     def _begin(self, state: at.State) -> None:
+        if self._lost is not None:  # it has moved since by nobody knows what
+            since, speed = self._lost
+            reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
+            state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
+            self._lost = None
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
-        self._informed, self._bad_frames = state.stamp, 0
+        self._informed = state.stamp
+        self._fates.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 
     def _step(self, exposed: int, features: Features) -> VioResult:
-        if self._is_still(exposed, features):
+        if self._is_still(exposed):
             return self._hold(exposed, features)
         if self._resting and self._told and self._floor is not None and not self.filter.state.landmarks:
             self._stand_on(features)
@@ -175,21 +211,33 @@ class VisualInertialOdometry:
             self._sight, self._told = exposed, False
         return self._judge(exposed, features, report)
 
-    def _is_still(self, exposed: int, features: Features) -> bool:
+    def _is_still(self, exposed: int) -> bool:
         """Whether the vehicle rests: the IMU says so, nothing moves in the image, and it is not known to move steadily.
 
         While vision says where the vehicle is, nobody asks: a very quiet hover looks like rest.
         """
         state = self.filter.state
-        if self._sight is not None and exposed - self._sight < round(1e9 * self.config.loss.degraded_after):
+        if self._sight is not None and exposed - self._sight < round(1e9 * self.config.loss.dark_after):
             return False
-        return (self._quiet(features) and still(self.config.rest, self.config.imu, window(self.config.rest, self._imu, exposed), state.gyro_bias)
-                and (self._resting or rest.can_stand(state)))
+        quiet = self._quiet()
+        return (quiet is not False and (self._resting or rest.can_stand(state))
+                and still(self.config.rest, window(self.config.rest, self._imu, exposed), *_biases(state),
+                          seen=bool(quiet) and (self._resting or bool(self._quiet(_STANDS)))))
 
-    def _quiet(self, features: Features) -> bool:
-        """Nothing moves in the image, or there is nothing in it."""
-        return (features.disparity < self.config.start.rest_disparity or not np.isfinite(features.disparity)
-                or len(features.ids) < self.config.loss.least_tracks)
+    def _quiet(self, duration: float | None = None) -> bool | None:
+        """Whether nothing has moved in the image for so long [s], whatever the gyro says; None where there is nothing in it.
+
+        A hover, too, stands still for the duration in which rest is judged, which is the default: it is not for the image alone to say.
+        """
+        span = duration or self.config.rest.window
+        until, now = self._seen[-1]
+        since, then = next(((t, f) for t, f in reversed(self._seen) if t <= until - round(0.8e9 * span)), self._seen[0])
+        if len(now.ids) < self.config.loss.least_tracks:
+            return None
+        _, i, j = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
+        if len(i) < self.config.loss.least_tracks or until - since < round(0.8e9 * span):
+            return False
+        return float(np.median(np.linalg.norm(now.pixels[j] - then.pixels[i], axis=1))) < self.config.start.rest_motion
 
     def _hold(self, exposed: int, features: Features) -> VioResult:
         """Tell the filter that the vehicle stood still, up to a little before now.
@@ -206,7 +254,8 @@ class VisualInertialOdometry:
             self._views.clear()
         steps = self._imu.run(state.stamp, until)
         if len(steps):
-            rest.hold(self.filter, steps, until)
+            shaken = max(1.0, energy(window(self.config.rest, self._imu, exposed)))
+            rest.hold(self.filter, steps, until, shaken)
         self._informed = exposed
         self._views.append((exposed, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
@@ -231,24 +280,30 @@ class VisualInertialOdometry:
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
         """Whether the filter still sees, or has to start again."""
         loss, s = self.config.loss, self.filter.state
-        if report.used or len(features.ids) - features.new >= loss.least_tracks:
-            self._informed = exposed  # tracks that go on carry information that is used when they end
-        self._bad_frames = self._bad_frames + 1 if report.refused > 2 * report.used + 2 else 0
-        sigma = np.sqrt(np.diag(s.P))
+        if report.used:
+            self._informed = exposed
+        self._fates.append((report.used, report.refused))
+        used, refused = np.sum(self._fates, axis=0)
+        sigma, speed = np.sqrt(np.diag(s.P)), float(np.linalg.norm(s.v_WB))
+        gyro, accel = float(np.linalg.norm(s.gyro_bias)), float(np.linalg.norm(s.accel_bias))
         why = ""
         if not np.isfinite(s.P).all() or not np.isfinite(s.p_WB).all():
             why = "state is not finite"
-        elif self._bad_frames >= loss.rejected_frames:
-            why = f"most observations refused in {self._bad_frames} frames in a row"
+        elif refused > max(used, loss.refused):
+            why = f"{refused} observations refused and {used} used in {len(self._fates)} frames"
         elif sigma[at.VELOCITY].max() > loss.restart_velocity:
             why = f"velocity known only to {sigma[at.VELOCITY].max():.1f} m/s"
+        elif speed > loss.speed:
+            why = f"a speed of {speed:.1f} m/s"
+        elif gyro > 2.0 * self.config.rest.gyro_bias or accel > 2.0 * self.config.rest.accel_bias:
+            why = f"biases of {gyro:.2f} rad/s and {accel:.1f} m/s^2: gravity and motion do not fit"
         if why:
             return self._lose(features, why)
         blind = (exposed - self._informed) * 1e-9
         outcome = FrameOutcome.TRACKING
-        if blind > loss.degraded_after:
+        if blind > (loss.blind_after if len(features.ids) - features.new >= loss.least_tracks else loss.dark_after):
             # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
-            leaving = self._sight is None and sigma[at.VELOCITY].max() < loss.leaving_velocity
+            leaving = self._sight is None and blind < loss.leaving_time and sigma[at.VELOCITY].max() < loss.leaving_velocity
             outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 
@@ -259,7 +314,9 @@ class VisualInertialOdometry:
 
     def _forget_state(self) -> None:
         self._know()
-        self._moving = motion_start.MotionStart(self.config, self.mount)
+        speed, most = float(np.linalg.norm(self.filter.state.v_WB)), self.config.loss.speed
+        self._lost = self.filter.state.stamp, speed if speed < most else most
+        self._await()
         self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
 
     def _know(self) -> None:
@@ -268,7 +325,7 @@ class VisualInertialOdometry:
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
             self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), self._estimate().pose_covariance[rows])
-            self._gyro_bias = s.gyro_bias.copy()
+            self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
         s = self.filter.state
@@ -279,6 +336,11 @@ class VisualInertialOdometry:
         s = self.filter.state
         return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), self.filter.w_WB_B.copy(), s.gyro_bias.copy(),
                                s.accel_bias.copy(), s.P[np.ix_(_INERTIAL, _INERTIAL)])
+
+
+def _biases(state: at.State) -> tuple[np.ndarray, np.ndarray]:
+    """Biases of gyro and accelerometer, and their variances, shape (6,)."""
+    return np.concatenate([state.gyro_bias, state.accel_bias]), np.diag(state.P)[9:15].copy()
 
 
 def _compile(camera: Camera) -> None:

@@ -33,10 +33,10 @@ def stop(filter: Msckf) -> None:
     filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, filter.config.rest.velocity**2)
 
 
-def hold(filter: Msckf, steps: np.ndarray, stamp: int) -> None:
+def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
     """The vehicle has rested over IMU steps (m, 9), m > 0, up to their end `stamp` [ns].
 
-    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f.
+    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f;  n has `shaken` times the variance of the sensor's noise.
     """
     s, imu = filter.state, filter.config.imu
     T = float(steps[:, DT].sum())
@@ -49,5 +49,6 @@ def hold(filter: Msckf, steps: np.ndarray, stamp: int) -> None:
     H[:3, at.GYRO_BIAS] = H[3:, at.ACCEL_BIAS] = np.eye(3)
     H[3:, at.THETA] = so3.hat(up_B)
     residual = np.concatenate([steps[:, GYRO].mean(axis=0) - s.gyro_bias, steps[:, ACCEL].mean(axis=0) - s.accel_bias - up_B])
-    filter.apply(np.arange(at.INERTIAL_SIZE), H, residual, np.repeat([imu.gyro_noise**2, imu.accel_noise**2], 3) / len(steps))
+    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) * shaken / T
+    filter.apply(np.arange(at.INERTIAL_SIZE), H, residual, variance)
     s.stamp = stamp

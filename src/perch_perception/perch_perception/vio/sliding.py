@@ -5,9 +5,8 @@ of a track is hardly white (0.09 px); it walks, and stands still where the view 
 
     q = slide_turn^2 |d beta| + slide_zoom^2 |d ln distance|,
 
-with beta the direction in which the camera sees the point. A point in the state walks over the scene by that, but for what a patch
-bears: in a hover, where the view only sways, nothing walks. A track's observations get the covariance sigma^2 I + walk, counted back
-from the last one, whose point is the one that is solved for.
+with beta the direction in which the camera sees the point. A point in the state walks over the scene by that. A track's observations
+get the covariance sigma^2 I + walk, counted back from the last one, whose point is the one that is solved for.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ class Sliding:
     def __init__(self, config: FilterConfig, focal_length: float) -> None:
         self._sigma = config.pixel_noise / focal_length
         self._turn, self._zoom = (config.slide_turn / focal_length) ** 2, (config.slide_zoom / focal_length) ** 2
-        self._free_turn, self._free_zoom = config.slide_free_turn, config.slide_free_zoom
 
     def steps(self, b_before: np.ndarray, b_now: np.ndarray, d_before: np.ndarray, d_now: np.ndarray) -> np.ndarray:
         """Variance q of one frame's walk [rad^2].
@@ -50,24 +48,6 @@ class Sliding:
         u = b_now @ R_WC.T
         q = self.steps(b_before, b_now, d_before, d_now) * d_now**2
         return q[:, None, None] * (np.eye(3) - u[:, :, None] * u[:, None, :])
-
-    def dragged(self, b_held: np.ndarray, d_held: np.ndarray, b_now: np.ndarray, d_now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Views that are held until the present ones are further away than a patch bears, and are dragged along at that distance then.
-
-        Args:
-            b_held, d_held: bearings and distances of the views that are held, shapes (n, 3), (n,).
-            b_now, d_now: of the present ones.
-
-        Returns:
-            Those that are held from now on.
-        """
-        chord = np.linalg.norm(b_now - b_held, axis=1)
-        angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
-        part = np.maximum(angle - self._free_turn, 0.0) / np.maximum(angle, 1e-12)
-        b = b_held + part[:, None] * (b_now - b_held)
-        zoom = np.log(d_now / d_held)
-        d = d_held * np.exp(np.sign(zoom) * np.maximum(np.abs(zoom) - self._free_zoom, 0.0))
-        return b / np.linalg.norm(b, axis=1, keepdims=True), d
 
     def whitened(self, steps: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Rows of one track's observations, transformed so that their noise is white with the variance sigma^2.

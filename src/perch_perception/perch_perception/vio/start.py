@@ -9,7 +9,8 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.vehicle import GRAVITY
 
-from perch_perception.ukf.unscented import ACCEL, GYRO
+from perch_perception.ukf.stillness import energy
+from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
 from perch_perception.vio.config import VioConfig
@@ -75,11 +76,16 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     """
     gyro, accel = steps[:, GYRO].mean(axis=0), steps[:, ACCEL].mean(axis=0)
     R_WB = levelled(pose.R_WB, accel)
-    gyro_sigma = config.imu.gyro_noise / np.sqrt(len(steps))
-    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.1, config.rest.velocity, gyro_sigma)
+    imu, T = config.imu, steps[:, DT].sum()
+    shaken = max(1.0, energy(steps))
+    gyro_sigma = imu.gyro_noise_density * np.sqrt(shaken / T)
+    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, config.rest.velocity, gyro_sigma)
+    # a bias that shows along g is, as far as anybody knows, no smaller across it
+    accel_sigma = max(imu.accel_bias_init, abs(float(np.linalg.norm(accel)) - GRAVITY))
+    state.P[at.ACCEL_BIAS, at.ACCEL_BIAS] = accel_sigma**2 * np.eye(3)
     up_B = R_WB.T @ np.array([0.0, 0.0, GRAVITY])
     H = np.zeros((3, at.INERTIAL_SIZE))
     H[:, at.THETA], H[:, at.ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
-    dx, state.P = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, config.imu.accel_noise**2 / len(steps))
+    dx, state.P, _ = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, imu.accel_noise_density**2 * shaken / T)
     state.inject(dx)
     return state

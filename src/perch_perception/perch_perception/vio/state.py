@@ -97,15 +97,11 @@ class Clone:
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), that at which it is linearised, refused observations in a row, and the view that is held.
-
-    The view is a bearing in C (3,) and a distance [m], see `Sliding.dragged`; None before the first frame with the point in the state.
-    """
+    """A point in the state: position in W (3,), that at which it is linearised, refused observations in a row."""
 
     X_W: np.ndarray
     X_linear: np.ndarray
     strikes: int = 0
-    view: tuple[np.ndarray, float] | None = None
 
 
 @dataclass

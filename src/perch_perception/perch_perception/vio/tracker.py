@@ -55,13 +55,11 @@ class Features:
         ids: numbers, shape (n,); the last `new` of them are new in this frame.
         pixels: shape (n, 2).
         new: how many are new.
-        disparity: median motion since the frame before, rotation removed [px]; inf without tracks.
     """
 
     ids: np.ndarray
     pixels: np.ndarray
     new: int
-    disparity: float
 
 
 class Tracker:
@@ -87,18 +85,18 @@ class Tracker:
         self._previous, self._pixels, self._ids = None, np.zeros((0, 2), np.float32), np.zeros(0, int)
         self._reference, self._origins = None, {}
 
-    def track(self, image: np.ndarray, R_now_before: np.ndarray) -> Features:
+    def track(self, image: np.ndarray, R_now_before: np.ndarray, slack: float = 0.0) -> Features:
         """Follow the features into a new frame and refill them.
 
         Args:
             image: grey, uint8 (height, width).
             R_now_before: rotation of the camera since the frame before, takes rays of then into C of now, (3, 3).
+            slack: what it may be wrong by [rad].
         """
         if self.config.flatten > 0.0:
             image = flattened(image, self.config.flatten)
-        disparity = np.inf
         if self._previous is not None and len(self._pixels):
-            disparity = self._follow(image, R_now_before)
+            self._follow(image, R_now_before, slack)
             self._return_to_reference(image)
             self._thin()
         self._previous = image
@@ -106,10 +104,10 @@ class Tracker:
         if len(self._pixels) < self.config.features * self.config.refill:
             new = self._refill(image)
         self._choose_reference(image)
-        self.latest = Features(self._ids, self._pixels.astype(float), new, disparity)
+        self.latest = Features(self._ids, self._pixels.astype(float), new)
         return self.latest
 
-    def _follow(self, image: np.ndarray, R_now_before: np.ndarray) -> float:
+    def _follow(self, image: np.ndarray, R_now_before: np.ndarray, slack: float) -> None:
         c, rays = self.config, observe(self.camera, self._pixels).b_C @ R_now_before.T
         guess, valid = self.camera.project(rays)
         # what has left the view would be searched for longest
@@ -121,10 +119,8 @@ class Tracker:
         good = found & self.camera.contains(after) & (self._view[place[:, 1], place[:, 0]] > 0)
         back, returned = self._search(image, self._previous, after[good], before[good], 0, _CHECK)
         good[good] = returned & (np.linalg.norm(back - before[good], axis=1) < c.back_check)
-        good &= self._one_translation(rays, after, good)
-        disparity = float(np.median(np.linalg.norm(after - guess, axis=1)[good])) if good.any() else np.inf
+        good &= self._one_translation(rays, after, good, slack)
         self._pixels, self._ids = after[good], ids[good]
-        return disparity
 
     def _search(self, source: np.ndarray, image: np.ndarray, pixels: np.ndarray, guess: np.ndarray,
                 levels: int, stop: tuple[int, int, float] = _STOP) -> tuple[np.ndarray, np.ndarray]:
@@ -172,8 +168,8 @@ class Tracker:
         self._reference = image
         self._origins = dict(zip(self._ids.tolist(), self._pixels.copy()))
 
-    def _one_translation(self, rays: np.ndarray, after: np.ndarray, good: np.ndarray) -> np.ndarray:
-        """Tracks that agree with the translation most of them share, (n,) bool; rays are those before, turned."""
+    def _one_translation(self, rays: np.ndarray, after: np.ndarray, good: np.ndarray, slack: float) -> np.ndarray:
+        """Tracks that agree with the translation most of them share, (n,) bool; rays are those before, turned up to `slack` [rad]."""
         index = np.flatnonzero(good)
         if len(index) < 8:
             return good
@@ -184,7 +180,7 @@ class Tracker:
         t = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
         length = np.linalg.norm(t, axis=1, keepdims=True)
         t = np.where(length > 1e-12, t / np.maximum(length, 1e-12), 0.0)
-        inliers = np.abs(normals @ t.T) < self.config.epipolar / self.camera.fx
+        inliers = np.abs(normals @ t.T) < self.config.epipolar / self.camera.fx + slack
         best = inliers[:, np.argmax(inliers.sum(axis=0) * (length.ravel() > 1e-12))]
         out = np.zeros(len(good), bool)
         out[index[best]] = True

@@ -1,0 +1,191 @@
+"""VIO with large IMU biases at every rate, from rest and in motion; what it says of itself where it is blind or wrong. Simulated tracks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from perch_core import so3
+from perch_core.values import ImuSample
+from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_eval.perch_motion import PerchMotion, read_imu
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
+from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
+from perch_perception.vio import state as at
+from perch_perception.vio.msckf import Msckf
+from perch_perception.vio.start import fresh, told
+from perch_perception.vio.tracker import Features, Tracker
+
+from unit.test_vio_filter import SimulatedTracks
+
+VEHICLE = load_vehicle("snapdragon")
+MOUNT = VEHICLE.mounts["down"]
+GYRO_BIAS, ACCEL_BIAS = 0.2 * np.array([0.48, -0.6, 0.64]), 1.0 * np.array([0.6, 0.48, -0.64])
+BLANK = np.zeros((MOUNT.camera.height, MOUNT.camera.width), np.uint8)
+
+
+class GivenTracks(Tracker):
+    """Features as somebody else has them."""
+
+    def __init__(self, see):
+        super().__init__(VioConfig().tracker, MOUNT.camera)
+        self.see = see
+
+    def track(self, image, R_now_before, slack=0.0):
+        ids, pixels = self.see()
+        self.latest = Features(ids, pixels, 0)
+        return self.latest
+
+
+class Flown:
+    """A climb to a hover; the ground is a blur up to 0.3 m. The IMU's biases are large."""
+
+    def __init__(self, rate, begin=0.0, seed=1):
+        self.rng, self.motion, self.rate = np.random.default_rng(seed), PerchMotion(seed=seed), rate
+        self.begin, self.tracks, self.now = begin, SimulatedTracks(np.random.default_rng(seed), 0.2), 0.0
+        times = np.arange(begin, self.motion.perch_time, 1.0 / rate)
+        noise = np.sqrt(rate / 500.0)  # the same density
+        imu = replace(VEHICLE.imu, rate=rate, accel_noise=VEHICLE.imu.accel_noise * noise, gyro_noise=VEHICLE.imu.gyro_noise * noise)
+        read = read_imu(self.motion.sample(times), imu, self.rng)
+        gyro, accel = read.gyro + GYRO_BIAS, read.accel + ACCEL_BIAS
+        self.samples = [ImuSample(round(t * 1e9), tuple(w), tuple(f)) for t, w, f in zip(times, gyro.tolist(), accel.tolist())]
+        config = VioConfig()
+        config = replace(config, imu=replace(config.imu, accel_bias_init=0.6, gyro_bias_init=0.1), filter=replace(config.filter, pixel_noise=0.2))
+        start = self.motion.sample(np.array([begin])).p_WB[0]
+        self.vio = VisualInertialOdometry(config, MOUNT, start)
+        self.vio.tracker = GivenTracks(self.see)
+
+    def see(self):
+        m = self.motion.sample(np.array([self.now]))
+        if m.p_WB[0, 2] < 0.3:
+            return np.zeros(0, int), np.zeros((0, 2))
+        return self.tracks(m.p_WB[0], m.R_WB[0], MOUNT.R_BC)
+
+    def fly(self):
+        """(time, result, error of the velocity in B and its covariance, error of up in B [rad]) of each frame with a pose."""
+        out, frame = [], self.begin + 0.1
+        for sample in self.samples:
+            self.vio.add_imu(sample)
+            if sample.stamp * 1e-9 > frame + 0.02:
+                self.now = frame
+                result = self.vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), BLANK)
+                if result.estimate is not None:
+                    e, m = result.estimate, self.motion.sample(np.array([result.estimate.stamp * 1e-9]))
+                    v = m.R_WB[0].T @ m.v_WB[0] - e.R_WB.T @ e.v_WB
+                    out.append((frame, result, v, so3.angle_between(m.R_WB[0][2], e.R_WB[2])))
+                frame += 1 / 30
+        return out
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0, 400.0, 1000.0])
+@pytest.mark.parametrize("begin", [0.0, 1.9], ids=["at rest", "in motion"])
+def test_large_biases_are_found(rate, begin):
+    flown = Flown(rate, begin)
+    seen = flown.fly()
+    first = seen[0][1]
+    if begin == 0.0:
+        assert first.outcome is FrameOutcome.RESTING and seen[0][0] < 0.5
+        np.testing.assert_allclose(first.estimate.gyro_bias, GYRO_BIAS, atol=0.02)
+        assert all(r.outcome is FrameOutcome.RESTING for t, r, _, _ in seen if 0.5 < t < 1.0)
+    else:
+        assert first.outcome is FrameOutcome.TRACKING
+        np.testing.assert_allclose(first.estimate.gyro_bias, GYRO_BIAS, atol=0.05)
+    _, last, v, tilt = seen[-1]
+    assert last.outcome is FrameOutcome.TRACKING and last.restarts == 0
+    np.testing.assert_allclose(last.estimate.gyro_bias, GYRO_BIAS, atol=0.03)
+    # a bias across g looks like a tilt: 1 m/s^2 is 5.8 deg at rest, and a climb tells little of it
+    assert np.linalg.norm(v) < 0.15 and np.degrees(tilt) < 6.5
+    assert v @ np.linalg.solve(last.estimate.velocity_covariance, v) < 16.3  # chi2, 3, 99.9 %
+
+
+def standing(see, until, shake=0.0):
+    """VIO on a vehicle that rests for 1 s before a dark camera; then features as `see(k)` has them in frame k, while the IMU shakes."""
+    rng, vio, out, frame = np.random.default_rng(2), VisualInertialOdometry(VioConfig(), MOUNT), [], 0.1
+    vio.tracker = GivenTracks(lambda: see(len(out)) if frame > 1.0 else (np.zeros(0, int), np.zeros((0, 2))))
+    for k in range(round(500 * until)):
+        w = rng.normal(0.0, 0.01, 3) + (shake * np.sin(60.0 * 0.002 * k) if k > 500 else 0.0)
+        vio.add_imu(ImuSample(2_000_000 * k, tuple(w), tuple(rng.normal(0.0, 0.3, 3) + [0.0, 0.0, GRAVITY])))
+        if 0.002 * k > frame + 0.02:
+            out.append((frame, vio.add_image(round(1e9 * frame), BLANK), vio.filter.state.P.copy() if vio.filter else None))
+            frame += 1 / 30
+    return out
+
+
+def test_tracks_that_are_never_used_are_blindness():
+    """Each lives for three frames: there are always 60 of them, and they tell nothing."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform([40, 40], [600, 440], (400, 60, 2))
+    out = standing(lambda k: (60 * (k // 3) + np.arange(60), pixels[k // 3] + 2.0 * (k % 3)), 4.0, shake=0.3)
+    assert all(r.features == 60 and r.used == 0 for t, r, _ in out if t > 1.1)
+    late = [(t, r, P) for t, r, P in out if t > 2.5 and P is not None]
+    assert late and all(r.outcome is FrameOutcome.BLIND and r.estimate is None and r.blind_for > 0.5 for _, r, _ in late)
+    (t_1, _, first), (t_2, _, last) = late[0], late[-1]
+    grown = np.diag(last - first)[at.VELOCITY]
+    assert (grown >= 0.99 * VioConfig().imu.accel_noise_density**2 * (t_2 - t_1)).all()
+
+
+def test_a_filter_that_does_not_fit_what_it_sees_starts_again_and_says_so():
+    """The camera flies over a scene at 2 m/s, and the IMU knows nothing of it."""
+    points = np.random.default_rng(1).uniform([-3.0, -3.0, 1.0], [12.0, 3.0, 1.5], (400, 3))
+
+    def see(k):
+        pixels, valid = MOUNT.camera.project(points - [2.0 / 30 * k, 0.0, 0.0])
+        ids = np.flatnonzero(valid & MOUNT.camera.contains(pixels, 8))[:80]
+        return ids, pixels[ids]
+
+    out = standing(see, 3.5, shake=0.3)
+    lost = [r for _, r, _ in out if r.message.startswith("lost:") and r.outcome is FrameOutcome.LOST]
+    assert lost and "refused" in lost[0].message and lost[0].estimate is None
+    assert out[-1][1].restarts >= 1
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda s: s.v_WB.__setitem__(0, 40.0), "a speed of 40"), (lambda s: s.accel_bias.__setitem__(0, 6.0), "6.0 m/s^2")])
+def test_a_state_that_cannot_be_is_noticed(change, words):
+    seen = []
+
+    def see(k):
+        if len(seen) == 1:
+            change(vio().filter.state)
+        seen.append(k)
+        rng = np.random.default_rng(k)
+        return 60 * k + np.arange(60), rng.uniform([40, 40], [600, 440], (60, 2))
+
+    made = []
+    original = VisualInertialOdometry.__init__
+
+    def vio():
+        return made[0]
+
+    def init(self, *args, **kwargs):
+        original(self, *args, **kwargs)
+        made.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(VisualInertialOdometry, "__init__", init)
+        out = standing(see, 1.6, shake=0.3)
+    assert any(words in r.message and r.outcome is FrameOutcome.LOST for _, r, _ in out)
+
+
+def test_drift_hardly_depends_on_the_rate_of_the_imu():
+    """One second on the IMU alone, at 1000 Hz and at 100 Hz with means of ten samples: errors, and what the filter says of them."""
+    config, ends, sigmas = VioConfig(), {1: [], 10: []}, {}
+    imu = replace(VEHICLE.imu, rate=1000.0, accel_noise=config.imu.accel_noise_density * np.sqrt(1000.0),
+                  gyro_noise=config.imu.gyro_noise_density * np.sqrt(1000.0), accel_bias_init=0.0, gyro_bias_init=0.0)
+    for seed in range(15):
+        times = 1.2 + 0.001 * np.arange(1001)
+        m = PerchMotion(seed=seed).sample(times)
+        read = read_imu(m, imu, np.random.default_rng(seed))
+        for every in ends:
+            buffer = ImuBuffer(config.imu, config.faults, 5.0)
+            for k in range(0, len(times), every):
+                past = slice(max(0, k - every + 1), k + 1)
+                sample = ImuSample(round(times[k] * 1e9), *(tuple(x[past].mean(axis=0)) for x in (read.gyro, read.accel)))
+                assert buffer.add(sample) is ImuOutcome.USED
+            start, end = round(times[0] * 1e9), round(times[-1] * 1e9)
+            s = fresh(config, MOUNT, start, m.R_WB[0], told(config, m.p_WB[0], 0.0), m.v_WB[0], np.zeros(3), 1e-6, 1e-6, 1e-6)
+            Msckf(config, s, MOUNT.camera.fx).propagate(buffer.run(start, end), end)
+            ends[every].append(m.p_WB[-1] - s.p_WB)
+            sigmas[every] = np.sqrt(np.diag(s.P)[at.POSITION])
+    drift = {every: np.sqrt(np.mean(np.square(e))) for every, e in ends.items()}
+    assert drift[10] < 1.3 * drift[1]
+    np.testing.assert_allclose(sigmas[10], sigmas[1], rtol=0.02)
