@@ -8,12 +8,13 @@ back the same way, and on its topics for everybody else; nothing that others pub
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from perch_core.component import Client, Component, Input, Service, ports
+from perch_core.component import Client, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.component_node import ComponentNode
@@ -28,6 +29,7 @@ from rclpy.clock import Clock, ClockType
 KNOCK = 0.1     # between looks for the vehicle [s]
 LOOK = 0.005    # between looks whether what a batch waits for has come [s]
 PATIENCE = 0.01  # with which a batch is waited for before other events are looked at [s]
+ANSWERED = 65.0  # an answer that has not come for so long was lost with its server: no planner is given more than 60 s [s]
 BURST = 40      # batches between which other events are looked at
 OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken as they come by who only keeps messages
 
@@ -50,6 +52,7 @@ class ParticipantNode(ComponentNode):
         self._intake = Intake(self)
         self._asking: dict[str, Callable[[Any, int], None]] = {}
         self._answers: dict[str, Answer] = {}
+        self._asked: dict[str, float] = {}  # channel -> when its last request was made, monotonic clock [s]
         self._busy = False  # with a batch
         self._vehicle: Connection | None = None
         self._waiting = Waiting()
@@ -66,6 +69,8 @@ class ParticipantNode(ComponentNode):
         self.serve()
         for port in self._observed:
             self._intake.add(port)
+        if self._asking:
+            self.create_timer(1.0, self._give_up, clock=self._steady)
         if self.wiring.schedule_here:
             return
         if is_slow(self.get_name()):
@@ -151,6 +156,7 @@ class ParticipantNode(ComponentNode):
     def _ask(self, channel: str, request: Any) -> Answer:
         """Send a component's request by its service; the answer is handed over by the participant when it counts."""
         answer = self._answers[channel] = Answer()
+        self._asked[channel] = time.monotonic()
         self._asking[channel](request, 0)
         return answer
 
@@ -159,6 +165,14 @@ class ParticipantNode(ComponentNode):
         if answer is not None:
             answer(value)
         self._progress()
+
+    def _give_up(self) -> None:
+        """A request that was under way when its server ended is never answered; the flight must not wait for ever."""
+        for channel, answer in self._answers.items():
+            if not answer.done() and time.monotonic() - self._asked[channel] > ANSWERED:
+                self.get_logger().error(f"{channel} has not answered for {ANSWERED:g} s: its answer is given up")
+                answer(Unavailable(f"{channel} has not answered within {ANSWERED:g} s"))
+                self._progress()
 
     def _progress(self) -> None:
         """What the present batch waits for may have come."""
