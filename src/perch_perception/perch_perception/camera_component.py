@@ -23,7 +23,6 @@ from perch_perception.world_frames import is_world
 
 MOST_WAITING = 10   # images; the oldest gives way to more
 FUTURE = 0.5        # an image stamped this much ahead of the odometry cannot be right [s]
-LARGEST = 1e8       # a variance beyond that says nothing [m^2, rad^2]
 
 
 class CameraConfig(Protocol):
@@ -150,7 +149,6 @@ class LocatedCameraComponent(CameraComponent[C]):
     def __init__(self, config: C) -> None:
         super().__init__(config)
         self._guard = StampGuard()
-        self._checked: np.ndarray | None = None  # covariance checked last
         self._begin()
 
     def _begin(self) -> None:
@@ -177,9 +175,8 @@ class LocatedCameraComponent(CameraComponent[C]):
 
     def on_odometry(self, state: OdometryState) -> None:
         """Where the vehicle was; images may have waited for it."""
-        problem = self._problem(state)
-        if problem:
-            self.warn(f"odometry: at {state.stamp} ns {problem}: not used", 1.0)
+        if not is_world(state.frame):
+            self.warn(f"odometry: frame {state.frame!r} is no fixed frame known here: not used", 1.0)
             return
         verdict = self._guard.judge(state.stamp)
         if verdict is StampVerdict.REFUSED:
@@ -192,22 +189,6 @@ class LocatedCameraComponent(CameraComponent[C]):
                                   np.array(state.w_B), state.pose_covariance))
         if self._waiting:
             self.advance()
-
-    def _problem(self, state: OdometryState) -> str:
-        """Why a state cannot be used; empty where it can. It runs at every step."""
-        if not is_world(state.frame):
-            return f"frame {state.frame!r} is no fixed frame known here"
-        p, q, v, w = state.p_WB, state.q_WB, state.v_B, state.w_B
-        if not math.isfinite(sum(p) + sum(q) + sum(v) + sum(w)):
-            return "not finite"
-        if abs(math.hypot(*q) - 1.0) > 1e-3:
-            return "no unit quaternion"
-        covariance = state.pose_covariance
-        if covariance is not self._checked:  # the same one comes several times
-            if covariance.shape != (6, 6) or not (0.0 <= covariance.diagonal().min() and np.abs(covariance).max() <= LARGEST):
-                return "the covariance is none"
-            self._checked = covariance
-        return ""
 
     def covers(self, image: CameraImage) -> bool:
         """Whether the odometry has passed its exposure, or it must be refused."""

@@ -9,7 +9,6 @@ import numpy as np
 from perch_core.values import ImuSample, Transform
 from perch_perception.stamp_guard import StampGuard, StampVerdict
 from perch_perception.static_transforms import BASE, StaticTransforms
-from perch_perception.ukf.imu_buffer import is_sane
 
 AXES_OF_B = frozenset(("imu_link", BASE, ""))
 
@@ -42,9 +41,6 @@ class ImuIntake:
     def take(self, sample: ImuSample) -> ImuSample | None:
         """The sample in the axes of B; None where it cannot be used."""
         self.restarted = False
-        if not is_sane(sample):  # before its stamp counts: it may be another writer's
-            self._warn("imu/data_raw: not finite, or beyond any sensor's range: not used", 1.0)
-            return None
         if self._R_BI is not None:
             sample = _turned(sample, self._R_BI)
         elif sample.frame not in AXES_OF_B:
