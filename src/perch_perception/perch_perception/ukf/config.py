@@ -11,8 +11,8 @@ from perch_core.config import choice, part, quantity, text
 class ImuNoise:
     """What the filter assumes of the IMU: noise densities, bias walks, ranges. They hold at any sample rate."""
 
-    accel_noise_density: float = quantity(0.0141, unit="m/s^2/sqrt(Hz)", above=0.0, doc="vibration included")
-    gyro_noise_density: float = quantity(0.00045, unit="rad/s/sqrt(Hz)", above=0.0, doc="vibration included")
+    accel_noise_density: float = quantity(0.015, unit="m/s^2/sqrt(Hz)", above=0.0, doc="vibration included")
+    gyro_noise_density: float = quantity(0.0005, unit="rad/s/sqrt(Hz)", above=0.0, doc="vibration included")
     accel_bias_walk: float = quantity(0.002, unit="m/s^2/sqrt(s)", above=0.0)
     gyro_bias_walk: float = quantity(0.0002, unit="rad/s/sqrt(s)", above=0.0)
     accel_bias_init: float = quantity(0.05, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
