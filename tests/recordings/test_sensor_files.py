@@ -114,7 +114,7 @@ def test_calibrations_that_are_none_are_refused(tmp_path, old, new, words):
 def test_components_take_everything_from_the_file(files):
     name, sensors = str(files / "mine.yaml"), load_sensors(files / "mine.yaml")
     vio = VioComponent(VioComponentConfig(sensors=name, camera="cam0"))
-    assert vio.config.imu.accel_noise == sensors.imu.accel_noise and vio.config.imu.integration == "instant"
+    assert vio.config.imu.accel_noise_density == sensors.imu.accel_noise_density and vio.config.imu.integration == "instant"
     assert vio.config.calibration.time_offset == sensors.cameras["cam0"].sigma.time_offset
     target = TargetLocalizer(TargetLocalizerConfig(sensors=name, camera="cam0"))
     assert target.mounted.nominal.camera == sensors.mounts["cam0"].camera
