@@ -79,6 +79,20 @@ def test_orders_are_refused_where_they_make_no_sense():
     assert loop.controller.state is State.DISARMED
 
 
+def test_motors_that_idle_without_an_order_are_stopped():
+    loop = make_loop(settings=FlightSettings(idle_time=0.5))
+    loop.run(0.02)
+    loop.controller.command(Command.ARM)
+    loop.run(0.45)
+    assert loop.controller.state is State.ARMED
+    loop.run(0.1)
+    assert loop.controller.state is State.DISARMED and "no trajectory for 0.5 s" in loop.controller.maneuvers.message
+    loop.controller.command(Command.ARM)
+    loop.follow(rest_to_rest(np.zeros(3), np.array([0, 0, 1.0]), 0, 0, 2.0))
+    loop.run(0.9)
+    assert loop.controller.state is State.TRACKING, "a trajectory was to follow"
+
+
 def test_arming_is_refused_on_the_side():
     loop = make_loop()
     loop.odometry = lambda plant: moved(plant.state, q=(np.sin(0.7), 0, 0, np.cos(0.7)))

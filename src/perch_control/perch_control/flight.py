@@ -148,6 +148,7 @@ class FlightController:
         if axes_of(m.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
         m.enter(State.ARMED, "armed")
+        m.start = m.now
         m.rotors = m.rotors.turning(self.vehicle.speed_min)
         m.ground = m.belief[2]
 
@@ -306,6 +307,8 @@ class FlightController:
 
     def _idle(self) -> StepResult:
         m = self.maneuvers
+        if m.state is State.ARMED and not self._schedule.waiting and m.elapsed > self.settings.idle_time:
+            m.motors_off(State.DISARMED, f"disarmed: no trajectory for {self.settings.idle_time:g} s")
         armed = m.state is State.ARMED
         speed = (self.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
         m.rotors = m.rotors.following(speed, m.belief or _STILL, self.vehicle)

@@ -47,6 +47,7 @@ class FlightSettings:
     coasting_time: float = quantity(1.0, unit="s", above=0.0, doc="estimator without VIO for so long: hover")
     coasting_land_time: float = quantity(3.0, unit="s", above=0.0, doc="estimator without VIO for so long: descend")
     silence_time: float = quantity(60.0, unit="s", above=0.0, doc="hovering without a new order for so long: land")
+    idle_time: float = quantity(10.0, unit="s", above=0.0, doc="armed on the ground without a trajectory for so long: motors off")
     odometry: OdometryLimits = part(OdometryLimits)
     recovery: RecoverySettings = part(RecoverySettings)
     rotors: RotorHealthSettings = part(RotorHealthSettings)

@@ -21,6 +21,11 @@ class Schedule:
         self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
         self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a trajectory is to follow."""
+        return self._pending is not None
+
     def put(self, order: Order, source: Any) -> None:
         """The next trajectory, by the reference made from it."""
         self._pending = order, source
