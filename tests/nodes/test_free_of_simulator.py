@@ -39,7 +39,7 @@ def test_time_may_be_that_of_a_clock_topic(graph):
     names = [graph[name].name for name in ("estimator", "controller", "vio")]
     try:
         for name in names:
-            assert run_script("param.py", "set", name, "use_sim_time", "true").returncode == 0
+            assert run_script("param.py", "set", name, "use_sim_time", "true", "--spin-time", "60").returncode == 0
         check_chain(plain("states.py", "200", "400", "clock"))
     finally:
         for name in names:

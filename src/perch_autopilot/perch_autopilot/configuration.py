@@ -20,6 +20,10 @@ class CliError(PerchError):
     """The firmware's command line does not answer, or does not take a line."""
 
 
+class CliSilent(CliError):
+    """The command line does not answer."""
+
+
 @dataclass(frozen=True)
 class Configuration:
     """What the firmware shall be set to.
@@ -82,14 +86,14 @@ class Cli:
         """The answer to a line.
 
         Raises:
-            CliError: there is none.
+            CliSilent: there is none.
         """
         self._send((line + end).encode())
         text, last = b"", time.monotonic() + _ANSWER_TIME
         while not text.endswith(b"\n# "):
             text += self._receive(0.1)
             if time.monotonic() > last:
-                raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s: {text[-80:]!r}")
+                raise CliSilent(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s: {text[-80:]!r}")
         return text.decode("ascii", "replace")
 
     def apply(self, configuration: Configuration) -> None:

@@ -11,7 +11,7 @@ from perch_core.vehicle import Vehicle
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.firmware import FirmwareError
 from perch_autopilot.rates import Sticks, rate_curves
-from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
+from perch_autopilot.sitl import GRAVITY, LEVEL, STARTS, Sitl
 from perch_autopilot.watchdog import CENTRED, OFF, ON
 
 _TOGGLE, _LAST = 600, 20000    # cycles from one attempt to arm to the next, and in all: calibrations last 4000
@@ -45,12 +45,18 @@ class FirmwareLoop:
         self._low, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self._idle = float(loaded.settings.get("motor_idle", 550)) * 1e-4  # motors of an armed vehicle with the throttle down
         self._armed, self._turning, self._channels = False, False, CENTRED
-        self.sitl = Sitl(loaded)
-        try:
-            self._arm_once()
-        except BaseException:
-            self.sitl.close()
-            raise
+        for start in range(1, STARTS + 1):
+            self.sitl = Sitl(loaded)
+            try:
+                self._arm_once()
+                return
+            except FirmwareError:  # now and then it starts with a sensor that it does not believe
+                self.sitl.close()
+                if start == STARTS:
+                    raise
+            except BaseException:
+                self.sitl.close()
+                raise
 
     def _arm_once(self) -> None:
         for cycle in range(_LAST):

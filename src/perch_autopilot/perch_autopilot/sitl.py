@@ -13,11 +13,12 @@ import struct
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from perch_core.timing import CONTROL_PERIOD
 from perch_autopilot import firmware, msp
-from perch_autopilot.configuration import Cli, CliError, Configuration
+from perch_autopilot.configuration import Cli, CliError, CliSilent, Configuration
 from perch_autopilot.firmware import FirmwareError
 from perch_autopilot.namespace import IsolatedProgram
 
@@ -28,7 +29,7 @@ _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct
 _START = 10.0                     # for the firmware to open its port [s]
 _ANSWER = 1.0                     # for motors after a state; a busy machine takes its time [s]
 _TRIES = 5                        # packets that stay unanswered before the firmware counts as frozen
-_STARTS = 4                       # of one that freezes
+STARTS = 4                        # of one that freezes
 _EEPROM = "eeprom.bin"
 LEVEL = (1.0, 0.0, 0.0, 0.0)      # w x y z
 GRAVITY = (0.0, 0.0, 9.81)
@@ -73,16 +74,23 @@ class Sitl:
         """The firmware's memory with the configuration in it, made once."""
         memory = self._program.parent / f"{self._configuration.identity}.eeprom"
         if not memory.exists():
-            self._launch()
-            Cli(self.send, self.receive).apply(self._configuration)
+            self._command_line().apply(self._configuration)
             self._running.process.wait(_START)  # saving restarts it, which here is its end
-            self._launch()
-            Cli(self.send, self.receive).check(self._configuration)
+            self._command_line().check(self._configuration)
             self._stop()
             draft = memory.with_suffix(f".{id(self)}")
             shutil.copy2(Path(self._folder.name, _EEPROM), draft)
             draft.replace(memory)
         return memory
+
+    def _command_line(self) -> Cli:
+        """Of a firmware that has just been started, again where it freezes."""
+        for _ in range(STARTS - 1):
+            self._launch()
+            with suppress(CliSilent):
+                return Cli(self.send, self.receive)
+        self._launch()
+        return Cli(self.send, self.receive)
 
     def _launch(self) -> None:
         self._stop()
@@ -109,7 +117,7 @@ class Sitl:
                 self.step((0.0, 0.0, 0.0), GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
                 return
             except Frozen:
-                if self.starts >= _STARTS:
+                if self.starts >= STARTS:
                     raise
 
     # -- cycles ------------------------------------------------------------------------------------------------------
