@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -27,14 +26,14 @@ def visit(monkeypatch, ros_domain):
 def test_ctrl_c_ends_the_wait_for_nodes(visit, tmp_path):
     loading = Program("loading", (sys.executable, "-S", "-c", "import time; time.sleep(1000)"), ("/loading",))
     with Stack([loading], tmp_path) as stack, pytest.raises(KeyboardInterrupt), visit() as graph:
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         stack.wait_until_ready(graph.nodes, timeout=60.0)
     assert stack.pids == {}
 
 
 def test_ctrl_c_that_nobody_looked_for_counts_at_the_end_of_the_visit(visit):
     with pytest.raises(KeyboardInterrupt), visit():
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
