@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -46,9 +47,10 @@ def children(process: subprocess.Popen) -> dict[str, psutil.Process]:
     """The nodes that a start_stack.py has started, by name of the executable."""
     found = {}
     for child in psutil.Process(process.pid).children():
-        for word in child.cmdline():
-            if "/install/" in word:
-                found[os.path.basename(word)] = child
+        with suppress(psutil.NoSuchProcess):  # it has ended, or is a zombie
+            for word in child.cmdline():
+                if "/install/" in word:
+                    found[os.path.basename(word)] = child
     return found
 
 
