@@ -24,8 +24,20 @@ def test_domains_keep_below_the_ephemeral_ports():
     assert 7400 + 250 * max(USABLE) + 250 <= 32_900 and min(USABLE) > 0
 
 
-def test_a_process_does_not_use_a_domain_twice_in_a_row():
-    with reserved_domain() as first:
+def test_a_process_does_not_use_a_domain_twice_in_a_row(tmp_path):
+    with reserved_domain(folder=tmp_path) as taken:
+        with reserved_domain(folder=tmp_path) as first:
+            pass
+        with reserved_domain(folder=tmp_path) as second:
+            assert len({taken, first, second}) == 3
+
+
+def test_what_another_process_holds_does_not_bring_a_domain_back(tmp_path):
+    with reserved_domain(folder=tmp_path) as first:
         pass
-    with reserved_domain() as second:
-        assert second != first
+    after = USABLE[(USABLE.index(first) + 1) % len(USABLE)]
+    with reserved_domain([after], tmp_path):
+        with reserved_domain(folder=tmp_path) as second:
+            pass
+        with reserved_domain(folder=tmp_path) as third:
+            assert len({first, after, second, third}) == 4

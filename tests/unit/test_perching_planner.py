@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.component import Job
 from perch_core.errors import ConfigError
 from perch_core.isolated import IsolatedRunner
 from perch_core.surface import PerchSurface
@@ -23,6 +22,7 @@ from perch_core.values import PerchPlan, PerchPlanRequest
 from perch_planner import perching_planner
 from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
 from perch_planner.verifier import Requirements, verify
+from unit.planner_asker import Asked
 
 WALL = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.4]), math.radians(90.0))
 
@@ -34,31 +34,13 @@ def request(surface: PerchSurface = WALL, **changes: Any) -> PerchPlanRequest:
     return PerchPlanRequest(**fields | changes)
 
 
-class Asked:
-    """Asks a component; its jobs run at once or in a runner."""
-
-    def __init__(self, parameters: PerchingPlannerParameters, runner: IsolatedRunner | None = None) -> None:
-        self.component = PerchingPlanner(parameters)
-        self.lines: list[str] = []
-        self.component.log.receivers.append(lambda line: self.lines.append(line.text))
-        self.runner = runner
-        if runner is not None:
-            self.component.work = self._isolated
-
-    def _isolated(self, job: Job) -> None:
-        future = self.runner.submit(job)
-        job.then(future.exception(60.0) or future.result())
-
-    def __call__(self, asked: PerchPlanRequest) -> PerchPlan:
-        answers: list[PerchPlan] = []
-        self.component.on_plan_perch(asked, answers.append)
-        answer, = answers
-        return answer
+def planner(parameters: PerchingPlannerParameters, runner: IsolatedRunner | None = None) -> Asked:
+    return Asked(PerchingPlanner(parameters), "plan_perch", runner)
 
 
 @pytest.fixture(scope="module")
 def ask() -> Asked:
-    return Asked(PerchingPlannerParameters())
+    return planner(PerchingPlannerParameters())
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +48,7 @@ def isolated() -> Iterator[Asked]:
     parameters = PerchingPlannerParameters(time_limit=10.0)
     runner = IsolatedRunner(PerchingPlanner(parameters).preload())
     assert runner.wait_ready()
-    yield Asked(parameters, runner)
+    yield planner(parameters, runner)
     runner.close()
 
 
@@ -194,19 +176,19 @@ def test_many_waypoints_do_not_outlast_the_longest_plan(ask: Asked) -> None:
     waypoints = np.array([[-8.0 * (k % 2), 3.0 * (k % 3), 1.4] for k in range(50)])
     plan = ask(request(waypoints=waypoints))
     assert plan.error_code == X and "duration_max 20 s" in plan.message
-    enough = Asked(PerchingPlannerParameters(duration_max=1.0))(request())
+    enough = planner(PerchingPlannerParameters(duration_max=1.0))(request())
     assert enough.error_code == X and "duration_max 1 s" in enough.message
 
 
 def test_a_plan_that_takes_too_long_is_stopped(isolated: Asked) -> None:
-    slow = Asked(replace(isolated.component.config, time_limit=1e-4), isolated.runner)
+    slow = planner(replace(isolated.component.config, time_limit=1e-4), isolated.runner)
     plan = slow(request())
     assert plan.error_code == PerchPlanError.TIME_LIMIT and "time_limit 0.0001 s" in plan.message
     assert isolated(request()).success
 
 
 def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked) -> None:
-    waits = Asked(isolated.component.config, isolated.runner)
+    waits = planner(isolated.component.config, isolated.runner)
     answers: list[PerchPlan] = []
     futures = []
     waits.component.work = lambda job: futures.append((job, isolated.runner.submit(replace(job, function=time.sleep, arguments=(60.0,)))))
@@ -231,7 +213,7 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
 
 
 def test_all_parameters_but_the_vehicle_may_change() -> None:
-    asked = Asked(PerchingPlannerParameters())
+    asked = planner(PerchingPlannerParameters())
     assert "vehicle" not in PerchingPlanner.changeable and "duration_max" in PerchingPlanner.changeable
     asked.component.reconfigure(PerchingPlannerParameters(thrust_max=3.8, contact_time=0.7))
     plan = asked(request())

@@ -21,6 +21,7 @@ from perch_planner import powerline_planner
 from perch_planner.powerline import problem
 from perch_planner.powerline.service import PowerlinePlanError
 from perch_planner.powerline_planner import PowerlinePlannerComponent, PowerlinePlannerParameters
+from unit.planner_asker import Asked
 
 LINES = problem.load("powerline_line_80").segments()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -42,31 +43,13 @@ def request(**changes: Any) -> PowerlinePlanRequest:
     return PowerlinePlanRequest(**fields | changes)
 
 
-class Asked:
-    """Asks a component; its jobs run at once or in a runner. `jobs` are those that it gave out."""
-
-    def __init__(self, parameters: PowerlinePlannerParameters, runner: IsolatedRunner | None = None) -> None:
-        self.component = PowerlinePlannerComponent(parameters)
-        self.jobs: list[Job] = []
-        self.runner = runner
-        if runner is not None:
-            self.component.work = self._isolated
-
-    def _isolated(self, job: Job) -> None:
-        self.jobs.append(job)
-        future = self.runner.submit(job)
-        job.then(future.exception(60.0) or future.result())
-
-    def __call__(self, asked: PowerlinePlanRequest) -> PowerlinePlan:
-        answers: list[PowerlinePlan] = []
-        self.component.on_plan_powerline(asked, answers.append)
-        answer, = answers
-        return answer
+def planner(parameters: PowerlinePlannerParameters, runner: IsolatedRunner | None = None) -> Asked:
+    return Asked(PowerlinePlannerComponent(parameters), "plan_powerline", runner)
 
 
 @pytest.fixture(scope="module")
 def ask() -> Asked:
-    return Asked(PowerlinePlannerParameters())
+    return planner(PowerlinePlannerParameters())
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +57,7 @@ def isolated() -> Iterator[Asked]:
     parameters = PowerlinePlannerParameters(deadline=10.0)
     runner = IsolatedRunner(PowerlinePlannerComponent(parameters).preload())
     assert runner.wait_ready()
-    yield Asked(parameters, runner)
+    yield planner(parameters, runner)
     runner.close()
 
 

@@ -50,13 +50,10 @@ class FirmwareLoop:
             try:
                 self._arm_once()
                 return
-            except FirmwareError:  # now and then it starts with a sensor that it does not believe
+            except BaseException as error:
                 self.sitl.close()
-                if start == STARTS:
+                if not isinstance(error, FirmwareError) or start == STARTS:  # now and then it starts with a sensor that it does not believe
                     raise
-            except BaseException:
-                self.sitl.close()
-                raise
 
     def _arm_once(self) -> None:
         for cycle in range(_LAST):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import socket
+import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
-from perch_core.errors import ConfigError
+from perch_core.errors import ConfigError, PerchError
 
 
 def count(text: str) -> int:
@@ -17,6 +19,23 @@ def count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not >= 1")
     return value
+
+
+def exit_code(work: Callable[[], int], *mistakes: type[Exception]) -> int:
+    """What a command ends with: what its work returns, 2 with one line where it is refused, 130 where it is interrupted.
+
+    Args:
+        work: of the command.
+        mistakes: what else the caller is to blame for, beside `PerchError` and `OSError`.
+    """
+    try:
+        return work()
+    except (PerchError, OSError, *mistakes) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
 
 
 def output_folder(path: Path, option: str = "--out") -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import fcntl
-import itertools
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -15,7 +14,8 @@ from perch_core.errors import PerchError
 
 USABLE = range(43, 102)
 """Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
-_reservations = itertools.count()
+_given: list[int] = []
+"""The domains that this process was given, in order."""
 
 
 @contextlib.contextmanager
@@ -39,6 +39,7 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
+            _given.append(candidate)
             yield candidate
             return
     raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")
@@ -52,7 +53,7 @@ def free_domain() -> int:
 
 
 def _spread() -> list[int]:
-    """The usable ids, from another one on in each process: people who choose by hand begin with the small ones. And from another
-    one on each time: nodes that have been destroyed are in the graph for a while."""
-    start = (os.getpid() + next(_reservations)) % len(USABLE)
+    """The usable ids, from another one on in each process (people who choose by hand begin with the small ones), and after the
+    one given last: nodes that have been destroyed stay in the graph for a while."""
+    start = USABLE.index(_given[-1]) + 1 if _given and _given[-1] in USABLE else os.getpid() % len(USABLE)
     return [*USABLE[start:], *USABLE[:start]]

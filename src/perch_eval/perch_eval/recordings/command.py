@@ -14,7 +14,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
-from perch_eval.arguments import output_folder
+from perch_eval.arguments import exit_code, output_folder
 from perch_eval.node_launch import parse_overrides
 from perch_eval.recordings import report
 from perch_eval.recordings.calibration import to_yaml
@@ -71,14 +71,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    try:
-        return _perceive(args)
-    except (PerchError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
-        return 130
+    return exit_code(lambda: _perceive(args))
 
 
 def _perceive(args: argparse.Namespace) -> int:

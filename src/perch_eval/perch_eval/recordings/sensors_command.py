@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import so3
-from perch_core.errors import ConfigError, PerchError
+from perch_core.errors import ConfigError
 from perch_core.sensors import load_sensors
+from perch_eval.arguments import exit_code
 from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_eval.recordings.check import check
@@ -63,14 +64,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    try:
-        return _import(args) if args.verb == "import" else _check(args)
-    except (PerchError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
-        return 130
+    return exit_code(lambda: _import(args) if args.verb == "import" else _check(args))
 
 
 def _import(args: argparse.Namespace) -> int:

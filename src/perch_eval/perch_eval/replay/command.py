@@ -12,6 +12,7 @@ import numpy as np
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
+from perch_eval.arguments import exit_code
 from perch_eval.flight import Flight
 from perch_eval.metrics import perch_window
 from perch_eval.replay.animation import write_animation
@@ -47,14 +48,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    try:
-        return _show(args)
-    except (PerchError, LookupError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
-        return 130
+    return exit_code(lambda: _show(args), LookupError)
 
 
 def _show(args: argparse.Namespace) -> int:

@@ -83,7 +83,7 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, shape, r, J, cosine, distance):
         for i in range(3):
             u[i] = X_C[i] / d
             cosine[n] += u[i] * b[i]
-        # the lens at the prediction: at the measurement its derivatives hang together with the residual's noise
+        # the lens at the prediction: at the measurement its derivatives are correlated with the residual's noise
         rho = math.sqrt(u[0] * u[0] + u[1] * u[1])
         theta = math.atan2(rho, u[2])
         cx, cy = (u[0] / rho, u[1] / rho) if rho > 1e-9 else (1.0, 0.0)

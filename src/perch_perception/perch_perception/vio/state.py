@@ -148,7 +148,7 @@ class State:
         direction after each step, and the filter would learn of it by its own corrections.
 
         A point is linearised where it is until its estimate has gone by more than 1 sigma from there; only then it is carried
-        along. Followed at each step, Jacobians hang together with the noise that has moved the point, and distances shrink.
+        along. Followed at each step, Jacobians are correlated with the noise that has moved the point, and distances shrink.
 
         The direction of a scale (`scale_error`) moves with the estimate as well, and is carried along.
         """
