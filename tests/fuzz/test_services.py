@@ -11,7 +11,8 @@ from perch_core.values import PerchPlan, PerchPlanRequest
 from perch_core.vehicle import load_vehicle
 from perch_core.trajectory import rest_to_rest
 from perch_eval.fuzz.messages import Nonsense
-from perch_eval.fuzz.services import ask, judge_plan, replay
+from perch_eval.fuzz.services import ask, good, judge_plan, replay
+from perch_eval.fuzz.spoiled import Way, in_effect, spoilt
 
 CASES = sorted((Path(__file__).parent / "cases" / "services").glob("*.json"))
 
@@ -36,3 +37,13 @@ def test_the_oracle_of_plans_knows_nonsense():
             judge_plan("plan_perch", request, plan, load_vehicle("snapdragon"))
     with pytest.raises(Nonsense, match="no typed refusal"):
         judge_plan("plan_perch", request, PerchPlan(success=False, message="planning failed: ValueError: x"), load_vehicle("snapdragon"))
+
+
+@pytest.mark.parametrize("ways, counts", [
+    ([Way(("start_jerk", "y"), "=", 1e308)], True),
+    ([Way(("start_jerk", "y"), "=", 1e308), Way(("start_jerk", "y"), "=", 0.1)], False),
+    ([Way(("start_jerk", "y"), "=", float("nan")), Way(("start_jerk", "x"), "=", 0.1)], True),
+    ([Way(("waypoints",), "count", 30_000)], False),  # there is none to repeat
+])
+def test_nonsense_that_is_not_in_the_request_any_more_is_not_asked_for(ways, counts):
+    assert in_effect(ways[0], good("plan_perch"), spoilt(good("plan_perch"), ways)) == counts

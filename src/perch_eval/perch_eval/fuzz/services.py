@@ -30,7 +30,7 @@ from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_eval.fuzz import messages, sense
 from perch_eval.fuzz.messages import Nonsense
 from perch_eval.fuzz.report import Report
-from perch_eval.fuzz.spoiled import Way, senseless, some_way, spoilt
+from perch_eval.fuzz.spoiled import Way, in_effect, senseless, some_way, spoilt
 from perch_eval.fuzz.streams import Event, component, recorded
 from perch_eval.in_process.parameters import nested
 
@@ -141,7 +141,8 @@ class Planners:
             self._of[task] = one, runner
         one, _ = self._of[task]
         message = spoilt(good(task), ways)
-        strict = any(senseless(way) and not ".".join(map(str, way.path)).startswith(FREE[task]) for way in ways) and _counts(message, ways)
+        strict = _counts(message, ways) and any(
+            senseless(way) and in_effect(way, good(task), message) and not ".".join(map(str, way.path)).startswith(FREE[task]) for way in ways)
         try:
             request = topics.service(task).request_value(message)
         except PerchError:

@@ -169,6 +169,16 @@ def senseless(way: Way) -> bool:
     return way.kind == "count" and way.value == ENORMOUS or way.kind == "bytes" and way.value == "empty"
 
 
+def in_effect(way: Way, original: Any, message: Any) -> bool:
+    """Whether what was done to a field is still there: nothing can be repeated in an empty sequence, and a later change counts."""
+    alone = spoilt(original, [way])
+    try:
+        before, after, now = (repr(_at(m, way.path)) for m in (original, alone, message))
+    except (IndexError, AttributeError):
+        return False
+    return before != after == now
+
+
 def kinds(message: Any) -> Iterator[tuple[str, Any]]:
     """(what is wrong, message) for each of the plainest ways in which a good message can be spoiled."""
     for path, kind, value in leaves(message):
