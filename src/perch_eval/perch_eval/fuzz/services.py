@@ -39,8 +39,8 @@ NO_CERTIFICATE = 1.02  # rotor thrusts of a flat trajectory are looked at as the
 TASKS = {"plan_perch": "perching_planner", "plan_powerline": "powerline_planner", "goal": "mission", "set_controller": "controller",
          "parameters": "controller", "abort": "controller", "depart": "mission"}
 SHARES = ("plan_perch",) * 12 + ("plan_powerline",) + ("goal",) * 6 + ("set_controller",) * 2 + ("parameters",) * 6 + ("abort", "depart")
-FREE = {"plan_perch": ("current",), "plan_powerline": ("lines.0.covariance", "lines.0.direction_sigma", "lines.0.observations", "perch_pose")}
-"""Task -> fields that mean nothing in the requests here."""
+FREE = {"plan_perch": ("current", "start_time"), "plan_powerline": ("start_time", "lines.0.covariance", "lines.0.direction_sigma", "lines.0.observations", "perch_pose")}
+"""Task -> fields that mean nothing in the requests here; a planner has no clock, so any time may be planned for."""
 
 
 @lru_cache(maxsize=None)
