@@ -27,7 +27,7 @@ from perch_core.isolated import IsolatedRunner
 from perch_core.ros import topics
 from perch_eval.fuzz import sense
 from perch_eval.fuzz.report import Report
-from perch_eval.fuzz.spoiled import Way, senseless, some_way, spoilt
+from perch_eval.fuzz.spoiled import Way, in_effect, senseless, some_way, spoilt
 from perch_eval.fuzz.streams import FLIGHTS, Event, component, is_rendered, recorded
 
 SLOW = 2.0        # of processor time [s]
@@ -257,7 +257,8 @@ def drawn(flight: str, name: str, seed: int) -> tuple[list[Spoilt], bool, int]:
         message = _message(flight, name, channel, of)
         for _ in range(200):
             ways = tuple(some_way(message, rng) for _ in range(1 if strict else rng.choice((1, 1, 1, 2, 4))))
-            if not strict or senseless(ways[0]) and not is_free(message, ways[0]):
+            if not strict or (senseless(ways[0]) and not is_free(message, ways[0])
+                              and in_effect(ways[0], message, spoilt(message, list(ways)))):
                 sent.append(Spoilt(at, of, ways))
                 break
     return sorted(sent), strict, last
