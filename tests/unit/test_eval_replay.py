@@ -17,6 +17,8 @@ from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
 from perch_eval.metrics import flight_metrics, perch_window, rates
 from perch_eval.replay.command import main
+from perch_eval.replay.scene import View
+from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.report import build_report
 from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_sim.scenario import load_scenario
@@ -118,6 +120,18 @@ def test_an_animation_has_a_frame_for_each_moment(recorded, tmp_path):
     assert main([str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(gif)]) == 0
     with Image.open(gif) as image:
         assert image.n_frames == 4
+
+
+def test_a_stroboscopic_picture_shows_each_instant_of_the_perch(recorded, tmp_path):
+    path, _ = recorded
+    view, vehicle = View.of(RecordedFlight(path)), load_vehicle("snapdragon")
+    figure = stroboscope(view, vehicle, 1.5, 3.4, 7)
+    discs = [c for c in figure.axes[0].collections if c.get_zorder() > 3.0]
+    assert len(discs) == 7 * 4
+    assert any(text.get_text() == "+0.00 s, 11°" for text in figure.axes[0].texts)
+    assert main([str(path), "--instants", "4", "--out", str(tmp_path / "f.png")]) == 0
+    with Image.open(tmp_path / "f.png") as image:
+        assert image.size == (1100, 616)
 
 
 def test_mp4_needs_no_other_program(recorded, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Shows a recorded flight: an animation, and plots."""
+"""Shows a recorded flight: an animation, a stroboscopic picture, and plots."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ import numpy as np
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import exit_code
+from perch_eval.arguments import count, exit_code
 from perch_eval.flight import Flight
 from perch_eval.metrics import perch_window
 from perch_eval.replay.animation import write_animation
 from perch_eval.replay.scene import Scene, View
+from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
 
 BEFORE, AFTER = 1.0, 1.0  # shown around the perch [s]
@@ -24,6 +25,7 @@ EXAMPLES = """examples:
   python3 scripts/replay.py out/flight.mcap                       animation of the perch, out/flight.gif
   python3 scripts/replay.py out/flight.mcap --speed 0.25          in slow motion
   python3 scripts/replay.py out/flight.mcap --from 1 --to 9 --out all.mp4
+  python3 scripts/replay.py out/flight.mcap --out perch.png       the vehicle at ten instants of the perch, in one picture
   python3 scripts/replay.py out/flight.mcap --plots plots         and the plots as PNG
 
 exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"""
@@ -34,12 +36,13 @@ def parser() -> argparse.ArgumentParser:
     out = argparse.ArgumentParser(prog="replay.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     out.add_argument("flight", type=Path, metavar="FLIGHT.mcap", help="recording (demo.py, recorder, a campaign's kept flight)")
-    out.add_argument("--out", type=Path, metavar="FILE", help="animation, .gif or .mp4 (default: FLIGHT.gif)")
+    out.add_argument("--out", type=Path, metavar="FILE", help="animation, .gif or .mp4, or a stroboscopic picture, .png (default: FLIGHT.gif)")
     out.add_argument("--plots", type=Path, metavar="DIR", help="also write the plots here, as PNG")
     out.add_argument("--from", dest="start", type=float, metavar="S", help=f"begin (default: {BEFORE:g} s before the perch)")
     out.add_argument("--to", dest="end", type=float, metavar="S", help=f"end (default: {AFTER:g} s after the contact)")
     out.add_argument("--fps", type=float, default=15.0, help="frames per second (default: %(default)s)")
     out.add_argument("--speed", type=float, default=1.0, help="1: real time, 0.25: slow motion (default: %(default)s)")
+    out.add_argument("--instants", type=count, default=10, help="of a stroboscopic picture (default: %(default)s)")
     out.add_argument("--vehicle", default="snapdragon", help="whose rotors are drawn (default: %(default)s)")
     out.add_argument("--namespace", default="", help="of the vehicle, where several were recorded")
     return out
@@ -64,30 +67,40 @@ def _show(args: argparse.Namespace) -> int:
         view = View.of(flight)
     except LookupError as error:
         raise PerchError(f"{args.flight}: {error}") from None
-    start, end = span(flight, view, args.start, args.end)
     path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
-    step = args.speed / args.fps
-    times = start + step * np.arange(max(1, round((end - start) / step)))
-    print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
-    write_animation(Scene(view, vehicle, start, end), times, args.fps, path, _progress)
-    print(f"animation: {path}")
+    if path.suffix == ".png":
+        start, end = span(flight, view, args.start, args.end, 0.0, 0.0)
+        stroboscope(view, vehicle, start, end, args.instants).savefig(path, dpi=110)
+        print(f"picture: {path}")
+    else:
+        start, end = span(flight, view, args.start, args.end)
+        _animate(args, Scene(view, vehicle, start, end), start, end, path)
     if args.plots:
         write_plots(flight, vehicle, args.plots)
         print(f"plots: {args.plots}")
     return 0
 
 
-def span(flight: Flight, view: View, start: float | None, end: float | None) -> tuple[float, float]:
-    """Time span to show [s]: what was asked for, or the perch with a second around it, or all.
+def _animate(args: argparse.Namespace, scene: Scene, start: float, end: float, path: Path) -> None:
+    step = args.speed / args.fps
+    times = start + step * np.arange(max(1, round((end - start) / step)))
+    print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
+    write_animation(scene, times, args.fps, path, _progress)
+    print(f"animation: {path}")
+
+
+def span(flight: Flight, view: View, start: float | None, end: float | None, before: float = BEFORE, after: float = AFTER
+         ) -> tuple[float, float]:
+    """Time span to show [s]: what was asked for, or the perch with some time before and after it, or all.
 
     Raises:
         PerchError: nothing of the flight lies in it.
     """
     window = perch_window(flight)
     first, last = float(view.truth.t[0]), float(view.truth.t[-1])
-    begin = start if start is not None else max(first, window[0] - BEFORE) if window else first
-    finish = end if end is not None else min(last, window[1] + AFTER) if window else last
+    begin = start if start is not None else max(first, window[0] - before) if window else first
+    finish = end if end is not None else min(last, window[1] + after) if window else last
     if not (begin < finish and begin < last and finish > first):
         raise PerchError(f"--from {begin:g} --to {finish:g}: the flight lasts from {first:.2f} to {last:.2f} s")
     return max(begin, first), min(finish, last)

@@ -1,0 +1,94 @@
+"""A stroboscopic picture of a flight: the vehicle at instants of equal spacing, in front of the pad or the cables."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from perch_core import so3
+from perch_core.vehicle import Vehicle
+from perch_eval.metrics import tilt_degrees
+from perch_eval.replay.scene import View
+
+AZIMUTH, ELEVATION = math.radians(-68.0), math.radians(12.0)  # of the observer, from the direction of flight
+PAD = 0.3              # half of the pad's side [m]
+LABEL = 0.12           # between instants that both have one [m]
+DISC = np.linspace(0.0, 2.0 * math.pi, 25)
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def stroboscope(view: View, vehicle: Vehicle, start: float, end: float, instants: int = 10) -> Figure:
+    """The figure.
+
+    Args:
+        view: what was recorded.
+        vehicle: its rotors.
+        start, end: time span [s].
+        instants: how often the vehicle is drawn.
+    """
+    times = np.linspace(start, end, instants)
+    flown = view.truth.at(np.linspace(start, end, 200))
+    right, up, towards = _observer(flown.p[-1] - flown.p[0])
+    project = lambda points: np.asarray(points) @ np.column_stack([right, up])
+    figure = Figure(figsize=(10.0, 5.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_aspect("equal")
+    axes.axis("off")
+    _draw_place(axes, view, project)
+    axes.plot(*project(flown.p).T, color="0.6", lw=1.0, zorder=2)
+    colors = colormaps["viridis"](np.linspace(0.0, 0.85, instants))
+    states = view.truth.at(times)
+    tilts = tilt_degrees(states.q)
+    for k, (p, q) in enumerate(zip(states.p, states.q)):
+        R = so3.quat_to_matrix(q)
+        _draw_vehicle(axes, vehicle, p, R, project, towards, colors[k], 3 + k)
+        if k == instants - 1 or np.linalg.norm(states.p[k + 1] - p) > LABEL:
+            axes.annotate(f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°", project(p + 0.5 * PAD * DOWN), ha="center", va="top",
+                          fontsize=7, color="0.25", zorder=50)
+    left, low = project(flown.p).min(axis=0) - [0.1, 0.3]
+    axes.plot([left, left + 0.5], [low, low], color="k", lw=2.0)
+    axes.annotate("0.5 m", (left + 0.25, low - 0.02), ha="center", va="top", fontsize=8)
+    axes.autoscale_view()
+    return figure
+
+
+def _observer(flight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axes of the picture, right and up, and the direction towards the observer, who sees the flight go to the right."""
+    heading = math.atan2(flight[1], flight[0])
+    a = heading + AZIMUTH
+    towards = np.array([math.cos(ELEVATION) * math.cos(a), math.cos(ELEVATION) * math.sin(a), math.sin(ELEVATION)])
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    return right, np.cross(towards, right), towards
+
+
+def _draw_place(axes: Any, view: View, project: Any) -> None:
+    if view.pad is not None:
+        p, R = view.pad
+        square = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+        surface = lambda centre, half: project(p + (np.asarray(centre) + half * square) @ R[:, :2].T)
+        axes.add_collection(PolyCollection([surface((0.0, 0.0), 2.2 * PAD)], facecolor="0.93", edgecolor="0.8", zorder=0))
+        axes.add_collection(PolyCollection([surface((0.0, 0.0), PAD)], facecolor="white", edgecolor="0.3", zorder=0.5))
+        tags = [surface(0.55 * PAD * corner, 0.3 * PAD) for corner in square]
+        axes.add_collection(PolyCollection(tags, facecolor="0.15", zorder=0.6))
+    for a, b in view.cables:
+        axes.plot(*project(np.array([a, b])).T, color="0.2", lw=2.5, solid_capstyle="round", zorder=1)
+
+
+def _draw_vehicle(axes: Any, vehicle: Vehicle, p: np.ndarray, R: np.ndarray, project: Any, towards: np.ndarray, color: Any, order: float) -> None:
+    """Arms and rotor discs, the ones behind first; front rotors are red."""
+    rotors = np.column_stack([vehicle.rotor_xy, np.zeros(len(vehicle.rotor_xy))])
+    radius = 0.42 * float(np.min([np.linalg.norm(a - b) for i, a in enumerate(rotors) for b in rotors[:i]]))
+    centres = p + (rotors + [0.0, 0.0, 0.02]) @ R.T
+    for arm in p + rotors @ R.T:
+        axes.plot(*project(np.array([p, arm])).T, color=color, lw=2.4, solid_capstyle="round", zorder=order)
+    ring = radius * (np.outer(np.cos(DISC), R[:, 0]) + np.outer(np.sin(DISC), R[:, 1]))
+    for k in np.argsort(centres @ towards):
+        edge = "#d62728" if rotors[k][0] > 0.0 else color
+        axes.add_collection(PolyCollection([project(centres[k] + ring)], facecolor=(*color[:3], 0.35), edgecolor=edge, lw=1.0, zorder=order + 0.1))
+    axes.plot(*project(np.array([p, p + 0.12 * R[:, 2]])).T, color="#d62728", lw=1.4, zorder=order + 0.2)
