@@ -369,6 +369,13 @@ def test_a_map_with_lines_that_are_none_is_ignored():
     assert "powerlines" in flight.said
 
 
+@pytest.mark.parametrize("ahead, said", [(2 * 10**9, True), (-(10**9) * 3600, False)])
+def test_a_map_of_the_future_is_ignored_with_a_word_and_an_old_one_is_taken(ahead, said):
+    flight = Flight().take_off()
+    flight.component.on_powerlines(PowerlineMap(flight.stamp + ahead, (), False, ""))
+    assert ("to come" in flight.said) == said
+
+
 # -- laws and parameters -----------------------------------------------------------------------------------------------
 
 

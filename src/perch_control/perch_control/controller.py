@@ -186,7 +186,11 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"command: {error}")
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
-        """Show the map to the laws that look at it."""
+        """Show the map to the laws that look at it. It is latched: an old one may be the newest there is, one of the future is nonsense."""
+        newest = self._stamps.newest
+        if newest is not None and lines.stamp > newest + STALE:
+            self.warn(f"powerlines: of {seconds(lines.stamp):.3f} s, which is to come ({seconds(newest):.3f} s): ignored", every=1.0)
+            return
         if not self.config.nmpc.lines.any:
             return
         try:

@@ -167,7 +167,11 @@ def values(channel: str, message: Any) -> Iterator[Any]:
     Raises:
         PerchError: it is refused as it comes in.
     """
-    value = topics.topic(channel).read(topics.serialize_message(message))
+    try:
+        data = topics.serialize_message(message)
+    except RuntimeError as error:  # there is no memory for it in the middleware: nobody could send it
+        raise PerchError(str(error)) from None
+    value = topics.topic(channel).read(data)
     yield from value if isinstance(value, list) else (value,)
 
 
