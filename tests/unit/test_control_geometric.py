@@ -234,6 +234,32 @@ def test_a_carried_attitude_is_flown_where_the_force_shows_none():
             np.testing.assert_allclose(got, plain, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("angle", [0.5, 1.6, 2.4])
+def test_rates_are_the_references_however_much_thrust_the_feedback_takes_away(angle):
+    """Too slow towards an overhanging surface: the feedback leaves a fifth of the thrust, and the turn goes on as planned."""
+    rate = 5.0
+    R = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+    b3, db3 = R[:, 2], rate * R[:, 0]
+    reference = Setpoint((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), tuple(3.3 * b3 - (0, 0, 9.81)), tuple(3.3 * db3), tuple(-3.3 * rate**2 * b3))
+    gains = (7.0,) * 3 + (4.5,) * 3 + GAINS[6:]  # equal on all axes: the feedback is along b3
+    for slow in (-0.4, 0.0, 0.5):
+        state = tuple(map(float, (0.0, 0.0, 0.0, *(slow * b3), *Rotation.from_matrix(R).as_quat(), 0.0, rate, 0.0)))
+        thrust, _, _, w_C, dw_C = geometric_step(state, reference.packed, 3.3, NONE, gains, (8.0, 0.84, 0.8, 18.0, 250.0, 0.0), J)
+        assert thrust == pytest.approx(3.3 - 4.5 * slow)
+        np.testing.assert_allclose(w_C, (0.0, rate, 0.0), atol=1e-6)
+        np.testing.assert_allclose(dw_C, 0.0, atol=1e-5)
+
+
+def test_a_small_thrust_is_not_turned_far_for_what_it_cannot_do():
+    """5 cm and 0.1 m/s beside an overhanging surface at 3.3 m/s^2: the plan's attitude is what must not be given up."""
+    R = Rotation.from_rotvec([0.0, 2.3, 0.0])
+    b3 = R.as_matrix()[:, 2]
+    reference = Setpoint((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), tuple(3.3 * b3 - (0, 0, 9.81)))
+    state = tuple(map(float, (0.0, 0.05, 0.0, 0.0, 0.1, 0.0, *R.as_quat(), 0.0, 0.0, 0.0)))
+    q_C = geometric_step(state, reference.packed, 3.3, NONE, GAINS, (8.0, float(np.tan(np.radians(10.0))), 0.8, 18.0, 250.0, 0.0), J)[2]
+    assert np.degrees((Rotation.from_quat(q_C).inv() * R).magnitude()) < 4.0
+
+
 def test_a_carried_attitude_changes_nothing_where_the_force_shows_it():
     rng = np.random.default_rng(3)
     for _ in range(20):

@@ -1,8 +1,9 @@
 """One step of geometric tracking control on SE(3), scalar by scalar. [M:eq2, M:eq12, M:eq13]
 
 The commanded attitude follows from the force f that position feedback and feed-forward demand; the commanded body rates
-and angular accelerations follow from f' and f'', which hold the flat outputs' jerk and snap *and* the derivatives of the
-feedback, so that the attitude loop is fed forward with what the position loop is about to demand.
+and angular accelerations are those with which the reference's force turns, or a share (1: all) of those that follow from
+f' and f'' with the derivatives of the feedback, so that the attitude loop is fed forward with what the position loop is
+about to demand.
 
 All arguments and results are tuples of floats (see `vector3`); accelerations and forces are per unit of mass.
 """
@@ -16,6 +17,7 @@ from perch_core.jit import compiled
 from perch_core.vector3 import axes_of, axpy, cross, dot, limited, norm, quaternion_of, quaternion_product, scale, times
 from perch_core.vehicle import GRAVITY
 
+
 @compiled
 def position_feedback(e_p, e_v, k_p, k_v, bound):
     """Acceleration demanded by the errors, bounded, and whether the bound acts. [M:eq2]"""
@@ -27,48 +29,32 @@ def position_feedback(e_p, e_v, k_p, k_v, bound):
 
 
 @compiled
-def specific_force(a_ref, feedback, b3_body, tilt_tangent, floor):
-    """Specific force f whose direction is the commanded b3, within a cone about the reference's thrust direction. [M:eq10]
+def force_about(a_ref, feedback, axis, tilt_tangent, floor):
+    """Specific force f within a cone about the reference's thrust direction. [M:eq10]
 
-    The feedback may turn the thrust away from the reference's direction only so far; so it can neither turn the vehicle
-    over nor choose a direction out of noise where the reference's thrust is low. Where the reference is in free fall
-    its direction is undefined: the cone then stands on the present b3, which asks for no rotation.
+    The feedback may turn the thrust away from the reference's direction only so far; so it can neither turn the vehicle over nor
+    choose a direction out of noise where the thrust is low. A small thrust cannot push sideways much, however far it is turned:
+    below the weight the cone narrows with it, so that near free fall the planned attitude is flown and nothing else.
+
+    Args:
+        a_ref: acceleration of the reference in W [m/s^2].
+        feedback: acceleration demanded on top [m/s^2].
+        axis: direction of the reference's thrust, or the vehicle's own b3 where that is in free fall, which asks for no rotation.
+        tilt_tangent: tangent of the cone's half angle.
+        floor: least part of f along the axis [m/s^2].
 
     Returns:
-        f (3), whether the cone was left and f' of the feedback no longer counts, whether the direction is defined.
+        f (3), its part along the axis [m/s^2], whether the cone acts.
     """
-    f_ref = (a_ref[0], a_ref[1], a_ref[2] + GRAVITY)
-    n = norm(f_ref)
-    defined = n > floor
-    axis = scale(1.0 / n, f_ref) if defined else b3_body
-    total = axpy(1.0, f_ref, feedback)
+    total = (a_ref[0] + feedback[0], a_ref[1] + feedback[1], a_ref[2] + feedback[2] + GRAVITY)
     along = dot(total, axis)
     across = axpy(-along, axis, total)
     along = max(along, floor)
-    width = norm(across)
-    limit = tilt_tangent * along
-    if width > limit:
-        return axpy(along, axis, scale(limit / width, across)), True, defined
-    return axpy(along, axis, across), False, defined
-
-
-@compiled
-def force_about(a_ref, feedback, b3_ref, tilt_tangent, floor):
-    """Specific force f within a cone about the reference's own b3, for references that carry an attitude.
-
-    A small thrust cannot push sideways much, however far it is turned: below the weight the cone narrows with it, so that
-    near free fall the planned attitude is flown and nothing else.
-
-    Returns:
-        Its part along the reference's b3 [m/s^2], and the direction it shall have, of any length (3).
-    """
-    total = (a_ref[0] + feedback[0], a_ref[1] + feedback[1], a_ref[2] + feedback[2] + GRAVITY)
-    along = dot(total, b3_ref)
-    across = axpy(-along, b3_ref, total)
-    along = max(along, floor)
     limit = tilt_tangent * min(along / GRAVITY, 1.0)
-    lean = norm(across) / along
-    return along, axpy(min(1.0, limit / lean) / along if lean > 1e-9 else 0.0, across, b3_ref)
+    width, limit = norm(across), limit * along
+    if width > limit:
+        return axpy(along, axis, scale(limit / width, across)), along, True
+    return axpy(along, axis, across), along, False
 
 
 @compiled
@@ -139,26 +125,26 @@ def geometric_step(state, reference, thrust, extra, gains, limits, J):
     k_p, k_v, k_R, k_w = gains[0:3], gains[3:6], gains[6:9], gains[9:12]
     B1, B2, B3 = axes_of(q)
 
+    axis, daxis, ddaxis, f_r = reference[24:27], reference[27:30], reference[30:33], (a_r[0], a_r[1], a_r[2] + GRAVITY)
+    specific, carried = norm(f_r), dot(axis, axis) > 0.5
+    if not carried and specific > limits[2]:
+        axis, daxis, ddaxis = scale(1.0 / specific, f_r), scale(1.0 / specific, jerk), scale(1.0 / specific, snap)
+    elif not carried:  # in free fall: no direction, and no rotation
+        axis = B3
     e_p, e_v = axpy(-1.0, p_r, p), axpy(-1.0, v_r, v)
     feedback, bounded = position_feedback(e_p, e_v, k_p, k_v, limits[0])
-    demand = axpy(1.0, feedback, extra[0:3])
-    f, cut, defined = specific_force(a_r, demand, B3, limits[1], limits[2])
+    f, along, cut = force_about(a_r, axpy(1.0, feedback, extra[0:3]), axis, limits[1], limits[2])
 
-    df, ddf = jerk, snap
-    if not (bounded or cut):
+    # f turns as the reference's does, however much thrust the feedback adds or takes away.
+    df, ddf = scale(along, daxis), scale(along, ddaxis)
+    if limits[5] > 0.0 and specific > limits[2] and not (carried or bounded or cut):
         # e_p' = e_v; e_v' = a - a_r with the thrust that acts; e_v'' along the same lines.
         e_a = axpy(thrust, B3, scale(-1.0, (a_r[0] + extra[0], a_r[1] + extra[1], a_r[2] + GRAVITY + extra[2])))
         db3 = axpy(w[1], B1, scale(-w[0], B2))
         e_j = axpy(thrust, db3, scale(-1.0, jerk))
-        rate = axpy(-1.0, times(k_p, e_v), scale(-1.0, times(k_v, e_a)))
-        rate2 = axpy(-1.0, times(k_p, e_a), scale(-1.0, times(k_v, e_j)))
-        df, ddf = axpy(limits[5], rate, df), axpy(limits[5], rate2, ddf)
-    if not defined:
-        df, ddf = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    b3_r = reference[24:27]
-    if dot(b3_r, b3_r) > 0.5:
-        along, direction = force_about(a_r, demand, b3_r, limits[1], limits[2])
-        f, df, ddf = scale(along, direction), scale(along, reference[27:30]), scale(along, reference[30:33])
+        whole = axpy(-1.0, times(k_p, e_v), axpy(-1.0, times(k_v, e_a), jerk))
+        whole2 = axpy(-1.0, times(k_p, e_a), axpy(-1.0, times(k_v, e_j), snap))
+        df, ddf = axpy(limits[5], axpy(-1.0, df, whole), df), axpy(limits[5], axpy(-1.0, ddf, whole2), ddf)
 
     n = cross(h, f)
     if dot(n, n) < 1e-4 * dot(f, f):  # b2_des within 0.6 degrees of the thrust: keep the present heading instead
