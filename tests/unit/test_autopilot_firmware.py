@@ -16,9 +16,11 @@ from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.namespace import IsolatedProgram, NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
 from perch_autopilot.watchdog import OFF, ON
+from perch_core import config
 from perch_core.component import Output, ports
 from perch_core.values import RatesThrust
 from perch_core.vehicle import load_vehicle
+from perch_eval.identification import command
 from perch_eval.in_process import fly
 from perch_sim.scenario import load_scenario
 
@@ -81,6 +83,23 @@ def test_two_runs_agree_to_the_last_bit_and_a_turn_drives_the_right_rotors():
 def test_a_wall_is_perched_on_through_the_firmware():
     trace = started(lambda: fly(replace(load_scenario("surface_90"), vehicle="betaflight"), 1))
     assert trace.outcome == "perched", trace.message
+
+
+@pytest.mark.parametrize("vehicle", ["betaflight", "rpg_betaflight"])
+def test_vehicle_files_are_what_identification_writes(vehicle, tmp_path, monkeypatch):
+    """To the last digit on the same machine; numerics of another one may differ, by less than the standard deviations."""
+    monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", f"{vehicle}_unidentified", "--name", vehicle, "--out", str(tmp_path)])
+    started(lambda: Sitl(load_configuration("betaflight"))).close()
+    assert command.main() in (0, 1)
+    written, shipped = load_vehicle(tmp_path / "vehicle.yaml"), load_vehicle(vehicle)
+    assert written.name == shipped.name == vehicle
+    for field, bound in (("rate_lag", 0.001), ("rate_gain", 0.01), ("delay", 0.001), ("thrust_lag", 0.002), ("thrust_gain", 0.01)):
+        assert getattr(written.actuation, field) == pytest.approx(getattr(shipped.actuation, field), abs=bound), field
+
+    def keys(file):
+        return {line.split(":")[0].strip() for line in file.read_text().splitlines() if not line.lstrip().startswith("#")}
+
+    assert keys(config.config_dir() / "vehicles" / f"{vehicle}.yaml") == keys(tmp_path / "vehicle.yaml")  # and nothing by hand
 
 
 def test_the_configuration_is_read_back_and_what_differs_is_named():

@@ -30,13 +30,12 @@ class ControllerParameters:
     """Parameters of the node `controller`: gain sets by vehicle, limits of the supervisor."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    gains: str = choice("vehicle", options=("vehicle", "snapdragon", "betaflight", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
+    gains: str = choice("vehicle", options=("vehicle", "snapdragon", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
     blind_after: float = quantity(0.08, unit="s", above=0.0, high=1.0,
                                   doc="without odometry for so long, descend on the IMU alone, by its stamps; without either, by the clock; "
                                       "motors stop after 0.1 s without commands")
     controller: ControllerChoice = part(ControllerChoice)
     snapdragon: GeometricGains = part(GeometricGains)
-    betaflight: GeometricGains = part(GeometricGains)
     rpg: GeometricGains = part(GeometricGains)
     nmpc: NmpcSettings = part(NmpcSettings)
     l1: L1Settings = part(L1Settings)
@@ -45,4 +44,4 @@ class ControllerParameters:
     def gain_set(self, vehicle_name: str) -> GeometricGains:
         """The gains to fly a vehicle with; they are per unit of mass and inertia, so an unknown vehicle takes snapdragon's."""
         name = self.gains if self.gains != "vehicle" else vehicle_name
-        return next((getattr(self, known) for known in ("rpg", "betaflight") if name.startswith(known)), self.snapdragon)
+        return self.rpg if name.startswith("rpg") else self.snapdragon

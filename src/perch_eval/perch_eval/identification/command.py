@@ -17,6 +17,7 @@ from perch_sim.scenario import load_scenario
 EXAMPLES = """examples:
   python3 scripts/identify.py --vehicle snapdragon_rates                    fly in the simulator, and identify
   python3 scripts/identify.py --vehicle snapdragon_rates --scenario x.yaml  the same on a vehicle that differs (disturbance:)
+  python3 scripts/identify.py --vehicle betaflight_unidentified --name betaflight   through Betaflight's firmware: config/vehicles/betaflight.yaml
   python3 scripts/identify.py --vehicle mine.yaml --recording flight.mcap   identify from a recorded flight: hover, short moves, turns
 
 files: vehicle.yaml (extends the vehicle, with standard deviations), identify.png
@@ -31,6 +32,7 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--recording", type=Path, help="MCAP file of a flight (default: fly in the simulator)")
     parser.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the simulated flight (default: %(default)s)")
+    parser.add_argument("--name", default="", help="of the identified vehicle (default: the vehicle's, _identified)")
     parser.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (default: %(default)s)")
     return parser
 
@@ -40,6 +42,7 @@ def main() -> int:
     arguments = command_line().parse_args()
     try:
         vehicle = load_vehicle(arguments.vehicle)
+        flown_as = str(arguments.recording or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}")
         if arguments.recording is None:
             flown = flight.fly(load_scenario(arguments.scenario), arguments.vehicle, arguments.seed)
         else:
@@ -52,8 +55,9 @@ def main() -> int:
         arguments.out.mkdir(parents=True, exist_ok=True)
         is_file = arguments.vehicle.endswith((".yaml", ".yml"))
         base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
-        (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base)))
-        page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {arguments.recording or 'simulated flight'}")
+        name = arguments.name or f"{vehicle.name}_identified"
+        (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base), name, flown_as))
+        page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

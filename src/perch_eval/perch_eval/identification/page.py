@@ -15,25 +15,35 @@ from perch_core.vehicle import Vehicle  # noqa: E402
 from perch_eval.identification.fit import Answer, Found  # noqa: E402
 
 
-def entries(found: Sequence[Found], vehicle: Vehicle, base: str) -> str:
-    """A vehicle file that extends `base` by what was told; what was not stays as it is there, with the reason in a comment."""
+def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str) -> str:
+    """A vehicle file that extends `base` by what was told; what was not stays as it is there, with the reason in a comment.
+
+    Args:
+        found: what was identified.
+        vehicle: as it was known so far.
+        base: its name, or its file.
+        name: of the identified vehicle.
+        flight: of which it was identified, in words.
+    """
     lines: list[str] = []
     for key in dict.fromkeys(one.key.split("[")[0] for one in found):
         group = [one for one in found if one.key.split("[")[0] == key]
         owner = vehicle.actuation if key.startswith("actuation.") else vehicle
-        name = key.split(".")[-1]
-        old = getattr(owner, name, None)
+        field = key.split(".")[-1]
+        old = getattr(owner, field, None)
         if old is None:
             continue
         new = [old[i] if one.refused else one.value for i, one in enumerate(group)] if isinstance(old, tuple) else group[0].value
         told = not all(one.refused for one in group)
-        said = [f"not told ({one.refused})" if one.refused else f"+- {one.sigma:.2g} {one.unit}".rstrip() for one in group]
-        remark = "; ".join(f"{'xyz'[i]} {text}" if len(group) > 1 else text for i, text in enumerate(said))
+        axes = [f"{'xyz'[i]} " if len(group) > 1 else "" for i in range(len(group))]
+        sigmas = "; ".join(f"{axis}+- {one.sigma:.2g} {one.unit}".rstrip() for axis, one in zip(axes, group) if not one.refused)
         text = f"[{', '.join(f'{x:.4g}' for x in new)}]" if isinstance(new, list) else f"{new:.5g}"
         indent = "  " if key.startswith("actuation.") else ""
-        lines.append(f"{indent}{'' if told else '# '}{name}: {text}".ljust(45) + f"# {remark}")
+        lines += [f"{indent}# {field}: {axis}not told: {one.refused}" for axis, one in zip(axes, group) if one.refused]
+        if told:
+            lines.append(f"{indent}{field}: {text}".ljust(45) + f"# {sigmas}")
     mine, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]
-    head = ["# Identified by scripts/identify.py, with standard deviations.", f"extends: {base}", f"name: {vehicle.name}_identified"]
+    head = [f"# Identified by scripts/identify.py, with standard deviations. Of: {flight}", f"extends: {base}", f"name: {name}"]
     return "\n".join([*head, *mine, *(["actuation:", f"  type: {vehicle.actuation.type}", *inner] if inner else [])]) + "\n"
 
 
