@@ -10,12 +10,13 @@ import pytest
 from perch_core.component import Component, Input
 from perch_core.errors import ConfigError
 from perch_core.ros import topics
-from perch_core.values import ImuSample, MappedPowerline, OdometryState, PerchGoal, PowerlineMap, limits
+from perch_core.values import ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, limits
 from perch_eval.limits_page import page
 
 ROOT = Path(__file__).resolve().parents[2]
 IMU = ImuSample(0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.81))
 ODOMETRY = OdometryState(0, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, np.eye(6), np.eye(6))
+MOTORS = MotorCommand(0, True, (900.0,) * 4)
 LINE = MappedPowerline(1, (0.0, 0.0, 3.0), (1.0, 0.0, 3.0), 0.01, np.eye(3), 0.1, 5)
 UNEVEN = np.eye(3) + np.triu(np.ones((3, 3)), 1)
 
@@ -30,6 +31,8 @@ UNEVEN = np.eye(3) + np.triu(np.ones((3, 3)), 1)
     (PowerlineMap(0, (LINE,) * 501, False, ""), "lines: 501 entries are more than 500"),
     (PowerlineMap(0, (LINE, LINE._replace(covariance=UNEVEN)), False, ""), "lines[1].covariance: is not symmetric"),
     (PerchGoal(takeoff_height=0.1), "takeoff_height: 0.1 is outside [0.3, 10] m"), (PerchGoal(attempts=10**6), "attempts: 1e+06 is outside"),
+    (MOTORS, ""), (MOTORS._replace(rotor_speed=(0.0, 0.0, 0.0, -1.0)), "rotor_speed: -1 is outside [0, 10000] rad/s"),
+    (MOTORS._replace(rotor_speed=(900.0,) * 3), "rotor_speed: shape (3,) is not 4"),
     ("a value without limits", "")])
 def test_a_value_is_refused_with_field_value_and_range(value, said):
     assert limits.problem(value).startswith(said) and bool(limits.problem(value)) == bool(said)
@@ -38,6 +41,23 @@ def test_a_value_is_refused_with_field_value_and_range(value, said):
 def test_a_request_is_refused_with_its_source():
     with pytest.raises(ConfigError, match=r"request: lines\[0\].radius: 3 is outside \[0.0001, 1\] m"):
         limits.check("request", PowerlineMap(0, (LINE._replace(radius=3.0),), False, ""))
+
+
+ODD = (0.0, -1.0, 1.0, 99.0, 101.0, 2001.0, -1.1e4, 1e9, nan, inf, -inf)
+
+
+@pytest.mark.parametrize("value", [IMU, ODOMETRY, MOTORS])
+def test_the_quick_answer_accepts_only_what_the_declarations_accept(value):
+    for name, limit in limits.LIMITS[type(value)].items():
+        whole = getattr(value, name)
+        if isinstance(whole, str):
+            continue
+        for place in np.ndindex(np.shape(whole)):
+            for odd in ODD:
+                entries = np.array(whole, float)
+                entries[place] = odd
+                entries = entries if isinstance(whole, np.ndarray) else tuple(entries.tolist())
+                assert bool(limits.problem(value._replace(**{name: entries}))) == bool(limit.problem(entries)), (name, place, odd)
 
 
 class Taker(Component[None]):

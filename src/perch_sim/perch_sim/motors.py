@@ -49,8 +49,8 @@ class Motors:
         values = [float(s) for s in speeds]
         if len(values) != 4:
             raise MotorCommandError(f"motor_command: rotor_speed has {len(values)} entries, needs 4")
-        if armed and (said := _SPEEDS.problem(np.abs(values))):
-            raise MotorCommandError(f"motor_command: rotor_speed: {said}")
+        if armed and not all(abs(s) <= _SPEEDS.high for s in values):
+            raise MotorCommandError(f"motor_command: rotor_speed: {_SPEEDS.problem(np.abs(values))}")
         self.starts += armed and not self._armed and not self.timed_out
         self._armed, self._received, self.timed_out = armed, now, False
         if armed:

@@ -53,8 +53,7 @@ class ArrivalNode(ComponentNode):
         handler = partial(self.guarded, port.name, port.handler(self.component))
 
         def wake() -> None:
-            self.wiring.enter(self._intake.take_lazy)
-            self.wiring.enter(handler, self.get_clock().now().nanoseconds)
+            self._intake.enter(handler, self.get_clock().now().nanoseconds)
 
         self.create_timer(port.period, wake, clock=self._steady)
 

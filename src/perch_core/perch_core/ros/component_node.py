@@ -7,9 +7,10 @@ import re
 import socket
 import time
 import traceback
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -58,7 +59,7 @@ class ComponentNode(Node):
         self._unwatched: set[Subscription] = set()
         super().__init__(name, **kwargs)
         self.wiring = wiring
-        self._durations: dict[str, deque[float]] = {}
+        self._durations: defaultdict[str, deque[float]] = defaultdict(partial(deque, maxlen=FEW))
         self._said: dict[str, float] = {}
         self._warned: set[str] = set()
         self._failures = 0
@@ -113,8 +114,7 @@ class ComponentNode(Node):
             emitter.asked = self._asked(emitter, publisher.topic_name, publication)
 
     def _emitted(self, topic: str, publication: Publication) -> Callable[[Any], None]:
-        wiring = self.wiring
-        return lambda value: wiring.emit(topic, publication, value)
+        return partial(self.wiring.emit, topic, publication)
 
     def _asked(self, emitter: Emitter, topic: str, publication: Publication) -> Callable[[], bool]:
         """Who takes values beside this host, a neighbour, or somebody outside."""
@@ -269,11 +269,13 @@ class ComponentNode(Node):
         return {}
 
     def guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
-        """Call the component; what it cannot take is said and dropped, and never ends the node."""
+        """Call the component, and keep how long it takes; what it cannot take is said and dropped, and never ends the node."""
+        begin = time.perf_counter()
         try:
-            self.timed(what, work, *arguments)
+            work(*arguments)
         except Exception as error:
             self.refused(what, error)
+        self._durations[what].append(time.perf_counter() - begin)
 
     def refused(self, what: str, error: Exception) -> None:
         """Say that something was refused; what nobody has foreseen is a defect. Called while the exception is handled."""
@@ -282,17 +284,6 @@ class ComponentNode(Node):
             return
         self._failures += 1
         self._log(LogLine("error", f"{what}: a defect of this node, its value is dropped:\n{traceback.format_exc()}", every=1.0))
-
-    def timed(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
-        """Do something, and keep how long it takes."""
-        begin = time.perf_counter()
-        try:
-            work(*arguments)
-        finally:
-            durations = self._durations.get(what)
-            if durations is None:
-                durations = self._durations[what] = deque(maxlen=FEW)
-            durations.append(time.perf_counter() - begin)
 
     def close(self) -> None:
         """Free what the component and its jobs hold."""

@@ -57,11 +57,11 @@ class Intake:
             subscription = node.create_unwatched(row.message, channel, profile)
             self._lazy.append((subscription, receive))
         else:
-            node.create_subscription(row.message, channel, partial(self._arrived, receive), profile, raw=True)
+            node.create_subscription(row.message, channel, partial(self.enter, receive), profile, raw=True)
         if port.value is CameraImage and channel.endswith("image_raw"):
             packed = topics.topic(channel + COMPRESSED)
             receive = _Reader(node, channel + COMPRESSED, packed, handler)
-            node.create_subscription(packed.message, channel + COMPRESSED, partial(self._arrived, receive), packed.qos.subscribe, raw=True)
+            node.create_subscription(packed.message, channel + COMPRESSED, partial(self.enter, receive), packed.qos.subscribe, raw=True)
 
     def take_lazy(self) -> None:
         """Take what waits in the middleware."""
@@ -76,10 +76,11 @@ class Intake:
             return handler
         return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))
 
-    def _arrived(self, receive: Callable[[bytes], None], data: bytes) -> None:
-        """A message that wakes the node: what waits goes first."""
-        self._wiring.enter(self.take_lazy)
-        self._wiring.enter(receive, data)
+    def enter(self, work: Callable[[Any], None], argument: Any) -> None:
+        """Do what woke the node; what waits goes first."""
+        if self._lazy:
+            self._wiring.enter(self.take_lazy)
+        self._wiring.enter(work, argument)
 
     @staticmethod
     def _receive_raw(row: topics.Topic, topic: str, handler: Callable[[Any], None], data: bytes) -> None:
