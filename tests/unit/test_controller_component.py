@@ -325,6 +325,13 @@ def test_nonsense_on_trajectory_is_refused_and_said(make, changes, word):
     np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
 
 
+def test_a_way_out_of_another_time_is_refused():
+    flight = Flight().take_off()
+    trajectory = replace(samples(flight), start_time=flight.stamp * 1e-9 + 3600.0)
+    flight.component.on_recovery(TrajectoryOrder(99, trajectory))
+    assert "way out of trajectory 99 refused: it starts at" in flight.said
+
+
 def test_samples_are_flown_by_their_normalised_quaternions():
     flight = Flight().take_off()
     q = np.tile([0.0, 0.0, 0.0, 1.0005], (40, 1))

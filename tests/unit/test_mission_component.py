@@ -268,6 +268,13 @@ def test_a_foreign_target_is_refused_and_does_not_stop_the_flight(changes, word)
     np.testing.assert_allclose(world.goal.result.final_position, SURFACE.p_WS, atol=1e-9)
 
 
+@pytest.mark.parametrize("frame, said", [("elsewhere", True), ("base_link", False), ("", False)])
+def test_imu_samples_in_other_axes_are_ignored_with_a_word(frame, said):
+    world = World().send().run(until=lambda w: w.phase == "searching")
+    world.mission.on_imu(ImuSample(world.stamp, (0.0,) * 3, (0.0, 0.0, 9.8), frame))
+    assert (f"imu/data_raw: frame {frame!r}" in world.said) == said
+
+
 def test_a_target_before_any_odometry_is_not_believed():
     world = World()
     world.mission.on_target(TargetPose(10**15, SURFACE.p_WS, Q_PERCH, 1e-4 * np.eye(6)))

@@ -21,7 +21,7 @@ from perch_control.stamp_guard import Stamp, StampGuard
 STATUS_PERIOD = 20_000_000        # of controller/status [ns]
 DIAGNOSTICS_PERIOD = NANOSECONDS
 DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
-FRAMES = ("imu_link", "base_link", "")  # whose axes are those of B
+LONGEST_PLAN = 60.0               # a way out that starts later is none out of what is flown [s]
 STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
 GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
 _WORDS = 200                      # characters of a reason that are passed on
@@ -95,7 +95,7 @@ class Controller(Component[ControllerParameters]):
 
     def on_imu(self, sample: ImuSample) -> None:
         """Known to the flight; answered where odometry has stopped."""
-        if sample.frame not in FRAMES:
+        if not sample.in_body_axes:
             self.warn(f"imu/data_raw: frame {sample.frame!r} is none of imu_link, base_link: ignored", every=1.0)
             return
         if not self._believed(sample.stamp, "imu/data_raw"):
@@ -168,6 +168,8 @@ class Controller(Component[ControllerParameters]):
         try:
             if isinstance(order.trajectory, FlatTrajectory):
                 raise PerchError("a way out must carry states")
+            if (start := order.trajectory.start_time) > seconds(self._stamps.newest or 0) + LONGEST_PLAN:
+                raise PerchError(f"it starts at {start:.1f} s, long after what is flown")
             way_out = order._replace(at_end=AtEnd.HOLD, contact_time=0.0, recovery_start=0.0)
             self.flight.keep_ready(self._assembly.order(way_out))
         except PerchError as error:

@@ -25,6 +25,11 @@ class ImuSample(NamedTuple):
     f_B: tuple[float, float, float]
     frame: str = "imu_link"
 
+    @property
+    def in_body_axes(self) -> bool:
+        """Whether its frame's axes are those of B."""
+        return self.frame in ("imu_link", "base_link", "")
+
 
 class CameraImage:
     """One image, drawn or decoded when it is looked at.
