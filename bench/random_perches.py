@@ -17,15 +17,13 @@ def shipped_settings() -> PerchSettings:
     return config.from_mapping(PerchSettings, content["/**"]["ros__parameters"], "perching_planner.yaml")
 
 
-def random_problem(rng: np.random.Generator, waypoints: int | None = None, moving_start: bool = True) -> PerchProblem:
+def random_problem(rng: np.random.Generator) -> PerchProblem:
     """A problem: any inclination and heading, 1-5 m away, a start in motion, 0-10 waypoints (a quarter has a moving pad).
 
     Args:
         rng: source of randomness.
-        waypoints: their number; None: random, 0 to 10.
-        moving_start: start with velocity, acceleration and jerk.
     """
-    count = int(rng.integers(0, 11)) if waypoints is None else waypoints
+    count = int(rng.integers(0, 11))
     heading, inclination = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, np.pi)
     distance = rng.uniform(1.0, 5.0)
     p_WS = np.array([0.0, 0.0, rng.uniform(1.5, 3.0)])
@@ -35,10 +33,7 @@ def random_problem(rng: np.random.Generator, waypoints: int | None = None, movin
     direction = surface.normal + 0.7 * back + 0.35 * rng.normal(size=3)
     p0 = p_WS + distance * direction / np.linalg.norm(direction)
     p0[2] = max(p0[2], 0.6)
-    motion = {}
-    if moving_start:
-        motion = {"v": rng.normal(0.0, 0.5, 3), "a": rng.normal(0.0, 0.7, 3), "j": rng.normal(0.0, 2.0, 3),
-                  "yaw_rate": rng.normal(0.0, 0.2)}
+    motion = {"v": rng.normal(0.0, 0.5, 3), "a": rng.normal(0.0, 0.7, 3), "j": rng.normal(0.0, 2.0, 3), "yaw_rate": rng.normal(0.0, 0.2)}
     start = StartState(p0, yaw=heading + rng.uniform(-1.0, 1.0), **motion)
     share = np.linspace(0.0, 1.0, count + 2)[1:-1]
     points = [p0 + s * (p_WS + 0.2 * surface.normal - p0) + rng.normal(0.0, 0.04 * distance / (1 + 0.3 * count), 3) for s in share]

@@ -1,21 +1,9 @@
 #!/usr/bin/env python3
 """Run perception on a recording of real sensors. `--help` shows the options."""
 
-from __future__ import annotations
-
 import sys
 
-from perch_setup import enter, quiet_on_interrupt
-
-
-def main() -> int:
-    """Set up, then work; the options are those of `perch_eval.recordings.command`."""
-    enter()
-    with quiet_on_interrupt():
-        from perch_eval.recordings.command import main as work
-
-    return work()
-
+from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("perch_eval.recordings.command"))

@@ -3,7 +3,7 @@
 Only the standard library is used here, because nothing else is installed when this code first runs.
 """
 
-from .enter import enter, leave_quietly_on_interrupt, quiet_on_interrupt
+from .enter import enter, leave_quietly_on_interrupt, quiet_on_interrupt, run
 from .errors import SetupError
 from .layout import ROOT
 from .machine import Platform, detect_platform
@@ -18,4 +18,5 @@ __all__ = [
     "leave_quietly_on_interrupt",
     "prepare",
     "quiet_on_interrupt",
+    "run",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
@@ -38,6 +39,14 @@ def enter() -> None:
     os.execve(VENV_PYTHON, [str(VENV_PYTHON), *sys.argv], environment)
 
 
+def run(module: str) -> int:
+    """Set up if necessary, then do what a module's `main` does, with its options and its exit code."""
+    enter()
+    with quiet_on_interrupt():
+        main = importlib.import_module(module).main
+    return main()
+
+
 def leave_quietly_on_interrupt() -> None:
     """Let Ctrl-C end a script without a traceback, also where it is not waiting in our code."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
@@ -58,4 +67,4 @@ def _say(error: SetupError) -> int:
     return error.exit_code
 
 
-__all__ = ["INTERRUPTED", "ROOT", "enter", "leave_quietly_on_interrupt", "quiet_on_interrupt"]
+__all__ = ["INTERRUPTED", "ROOT", "enter", "leave_quietly_on_interrupt", "quiet_on_interrupt", "run"]

@@ -133,13 +133,6 @@ def test_segment_distance_matches_sampling(seed: int) -> None:
     assert lines.segment_distance(a, b) == pytest.approx(lines.segment_distance(b, a), abs=1e-9)
 
 
-def test_pluecker_moment_does_not_depend_on_the_point() -> None:
-    segment = Segment([1, 2, 3], [0.3, 1, -0.2], 2.0, 0.03)
-    n, l = segment.pluecker
-    np.testing.assert_allclose(np.cross(segment.ends[1], l), n, atol=1e-12)
-    assert n @ l == pytest.approx(0, abs=1e-12)
-
-
 @pytest.mark.parametrize("bad", [
     dict(centre=[0, np.nan, 0]), dict(direction=[0, 0, 0]), dict(half_length=0.0), dict(radius=-0.1),
 ])

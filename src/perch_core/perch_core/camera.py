@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import ModuleType
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,7 +23,7 @@ Region = tuple[slice, slice]  # rows and columns of an image
 
 @dataclass(frozen=True)
 class _Camera:
-    """What both projections share: image size, focal lengths, principal point."""
+    """What all projections share: image size, focal lengths, principal point."""
 
     width: int
     height: int
@@ -102,8 +104,43 @@ class PinholeCamera(_Camera):
         return np.column_stack([np.cos(theta) ** 2, np.tan(theta) / theta])
 
 
+class _DistortedCamera(_Camera):
+    """A camera whose equations are in kernels, which take it as the tuple `lens`."""
+
+    _kernels: ClassVar[ModuleType]
+
+    def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of points in C.
+
+        Args:
+            points_C: shape (..., 3) [m].
+
+        Returns:
+            Pixels (..., 2), NaN where the lens does not see the point: behind the camera, in its optical centre, or beyond `max_angle`;
+            and a mask (...) that says so. A valid pixel may lie outside the image: see `contains`.
+        """
+        points, shape = _rows(points_C, 3)
+        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
+        self._kernels.project(self.lens, points, pixels, valid)
+        return pixels.reshape(*shape, 2), valid.reshape(shape)
+
+    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
+        rows, shape = _rows(pixels, 2)
+        rays_C = np.empty((len(rows), 3))
+        self._kernels.unproject(self.lens, rows, rays_C)
+        return rays_C.reshape(*shape, 3)
+
+    def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
+        """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
+        points, shape = _rows(points_C, 3)
+        jacobian = np.empty((len(points), 2, 3))
+        self._kernels.project_jacobian(self.lens, points, jacobian)
+        return jacobian.reshape(*shape, 2, 3)
+
+
 @dataclass(frozen=True)
-class RadialTangentialCamera(_Camera):
+class RadialTangentialCamera(_DistortedCamera):
     """Perspective camera with the distortion of Brown and Conrady: ROS's `plumb_bob` and `rational_polynomial`, OpenCV's default.
 
     The equations are in `perch_core.radtan`. Nothing is projected from where the polynomial would fold back into the image.
@@ -117,6 +154,7 @@ class RadialTangentialCamera(_Camera):
 
     coefficients: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     near: float = 1e-3
+    _kernels = radtan
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -155,35 +193,6 @@ class RadialTangentialCamera(_Camera):
         k = (*self.coefficients, 0.0, 0.0, 0.0)[:8]
         return tuple(float(x) for x in (self.fx, self.fy, self.cx, self.cy, *k, self.max_radius, self.near))
 
-    def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels of points in C.
-
-        Args:
-            points_C: shape (..., 3) [m].
-
-        Returns:
-            Pixels (..., 2), NaN where the point is not in front of the camera or beyond `max_radius`, and a mask (...) that
-            says so. A valid pixel may lie outside the image: see `contains`.
-        """
-        points, shape = _rows(points_C, 3)
-        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
-        radtan.project(self.lens, points, pixels, valid)
-        return pixels.reshape(*shape, 2), valid.reshape(shape)
-
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
-        rows, shape = _rows(pixels, 2)
-        rays_C = np.empty((len(rows), 3))
-        radtan.unproject(self.lens, rows, rays_C)
-        return rays_C.reshape(*shape, 3)
-
-    def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
-        """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
-        points, shape = _rows(points_C, 3)
-        jacobian = np.empty((len(points), 2, 3))
-        radtan.project_jacobian(self.lens, points, jacobian)
-        return jacobian.reshape(*shape, 2, 3)
-
     def shape_at(self, theta: np.ndarray) -> np.ndarray:
         """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2).
 
@@ -196,7 +205,7 @@ class RadialTangentialCamera(_Camera):
 
 
 @dataclass(frozen=True)
-class EquidistantCamera(_Camera):
+class EquidistantCamera(_DistortedCamera):
     """Fisheye camera of Kannala and Brandt with four coefficients: ROS's `equidistant`, OpenCV's `fisheye`.
 
     A ray at the angle theta from the optical axis is seen at the radius
@@ -215,6 +224,7 @@ class EquidistantCamera(_Camera):
     coefficients: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     angle_limit: float = math.pi / 2
     model = "equidistant"
+    _kernels = kernels
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -245,35 +255,6 @@ class EquidistantCamera(_Camera):
     def radius(self, theta: float) -> float:
         """theta_d, the radius in the normalised image plane of a ray at the angle theta [rad]."""
         return kernels.radius(self.lens, float(theta))
-
-    def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels of points in C.
-
-        Args:
-            points_C: shape (..., 3) [m].
-
-        Returns:
-            Pixels (..., 2), NaN where the point lies beyond `max_angle` (or in the optical centre), and a
-            mask (...) that says so. A valid pixel may lie outside the image: see `contains`.
-        """
-        points, shape = _rows(points_C, 3)
-        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
-        kernels.project(self.lens, points, pixels, valid)
-        return pixels.reshape(*shape, 2), valid.reshape(shape)
-
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
-        rows, shape = _rows(pixels, 2)
-        rays_C = np.empty((len(rows), 3))
-        kernels.unproject(self.lens, rows, rays_C)
-        return rays_C.reshape(*shape, 3)
-
-    def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
-        """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
-        points, shape = _rows(points_C, 3)
-        jacobian = np.empty((len(points), 2, 3))
-        kernels.project_jacobian(self.lens, points, jacobian)
-        return jacobian.reshape(*shape, 2, 3)
 
     def shape_at(self, theta: np.ndarray) -> np.ndarray:
         """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""

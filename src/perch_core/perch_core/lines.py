@@ -59,11 +59,6 @@ class Segment:
         """End points in W [m]."""
         return self.centre - self.half_length * self.direction, self.centre + self.half_length * self.direction
 
-    @property
-    def pluecker(self) -> tuple[np.ndarray, np.ndarray]:
-        """Moment n = o x l [m] and direction l of the infinite line, in W."""
-        return np.cross(self.centre, self.direction), self.direction
-
     def closest_point(self, point: np.ndarray) -> np.ndarray:
         """The point of the segment that is nearest to points in W, shapes (..., 3)."""
         along = (np.asarray(point, float) - self.centre) @ self.direction

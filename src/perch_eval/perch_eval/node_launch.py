@@ -100,8 +100,7 @@ def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence
 
 
 def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, scenario_source: str = "",
-                  lockstep: bool = True, overrides: Mapping[str, Mapping[str, Any]] | None = None,
-                  expected: Sequence[str] | None = None) -> tuple[NodeLaunch, ...]:
+                  lockstep: bool = True, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[NodeLaunch, ...]:
     """The nodes with their parameters.
 
     Args:
@@ -111,7 +110,6 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
         scenario_source: name or file of the scenario, for the nodes that read it themselves.
         lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
         overrides: node -> parameter -> value, over everything else.
-        expected: nodes that take part in the flight, if others than `nodes` do (started elsewhere).
 
     Raises:
         ConfigError: a parameter file is no parameter file.
@@ -121,7 +119,7 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
     for node in overrides:
         if node not in nodes:
             raise PerchError(f"parameter for node {node!r}, which is not started; started: {', '.join(nodes)}")
-    common = _scenario_parameters(scenario, expected or nodes, seed, scenario_source or scenario.name, lockstep)
+    common = _scenario_parameters(scenario, nodes, seed, scenario_source or scenario.name, lockstep)
     launches = []
     for node in nodes:
         parameters = flattened(read_parameters(node)) | common.get(node, {}) | _host_parameters(node, lockstep)

@@ -25,7 +25,7 @@ CLOCK_BEGINS = 1.0  # [s] the vehicle's
 PATIENCE = 600.0  # [s] wall clock
 
 
-def warm_up(scenario_name: str = "surface_90") -> bool:
+def warm_up() -> bool:
     """Run a scenario's nodes on the ground, then its flight in process; whether both got as far as they should.
 
     A kernel that is left to be compiled in flight keeps its node silent for so long that the vehicle may drop it.
@@ -33,7 +33,7 @@ def warm_up(scenario_name: str = "surface_90") -> bool:
     Raises:
         PerchError: a node ended, or did not come up.
     """
-    scenario = load_scenario(scenario_name)
+    scenario = load_scenario("surface_90")
     with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         folder = Path(name)

@@ -171,15 +171,14 @@ class Ending:
     search: Search | None = None
 
 
-def fly_fault(fault: Fault, seed: int, overrides: dict | None = None) -> Ending:
+def fly_fault(fault: Fault, seed: int) -> Ending:
     """One flight with one fault.
 
     Args:
         fault: what happens.
         seed: of the flight and of the fault's moment and size.
-        overrides: further changes to the scenario.
     """
-    scenario = scenario_of(SCENARIO, {**fault.scenario, **(overrides or {})}, {"flight.silence_time": SILENCE_TIME})
+    scenario = scenario_of(SCENARIO, fault.scenario, {"flight.silence_time": SILENCE_TIME})
     flight = ControlFlight(scenario, seed)
     rng = seeding.stream(seed, f"fault {fault.name}")
     flight.arm()
