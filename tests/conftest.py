@@ -1,9 +1,12 @@
-"""What all tests share: checked message fields, reproducible examples, ROS domains of their own."""
+"""What all tests share: checked message fields, reproducible examples, ROS domains of their own, and which of them are quick."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -15,6 +18,25 @@ os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
 settings.register_profile(
     "perch", deadline=None, derandomize=True, print_blob=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("perch")
+
+UNIT = Path(__file__).parent / "unit"
+TAKES_TIME = re.compile(
+    r"^\s*(?:from|import) (?:closed_loop|oracles|perch_eval\.(?:control_flights|in_process|program|ros|stack)|perch_core\.isolated|"
+    r"perch_sim\.(?:rendering|simulation)|psutil|rclpy|subprocess)\b", re.MULTILINE)
+"""Imports of test files that fly, draw or start something."""
+
+
+@cache
+def takes_time(file: Path) -> bool:
+    """Whether a test file flies, draws or starts something."""
+    return TAKES_TIME.search(file.read_text()) is not None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """`quick` are unit tests of files that neither fly, draw nor start anything, but those that are marked `slow`."""
+    for item in items:
+        if item.path.parent == UNIT and not takes_time(item.path) and item.get_closest_marker("slow") is None:
+            item.add_marker("quick")
 
 
 @pytest.fixture

@@ -8,21 +8,28 @@ import subprocess
 import sys
 
 import pytest
-from system.scripts import ROOT, run_script
+from system.scripts import ROOT, call_script, run_script
 
 SCRIPTS = sorted(path.name for path in (ROOT / "scripts").glob("*.py"))
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_help_has_examples(script):
-    result = run_script(script, "--help")
+    result = call_script(script, "--help")
     assert result.returncode == 0, result.stderr
     assert "example" in result.stdout and f"scripts/{script}" in result.stdout
 
 
 @pytest.mark.parametrize("script", [name for name in SCRIPTS if name != "test.py"])  # which hands them to pytest
 def test_unknown_options_are_refused(script):
-    assert run_script(script, "--no-such-option").returncode == 2
+    assert call_script(script, "--no-such-option").returncode == 2
+
+
+def test_a_script_enters_its_environment():
+    """All of them by one call, which is shown once; what they say is shown in this process."""
+    result = run_script("param.py", "--help", PERCH_ENTERED="")
+    assert result.returncode == 0 and result.stdout == call_script("param.py", "--help").stdout
+    assert run_script("limits.py", "--no-such-option", PERCH_ENTERED="").returncode == 2
 
 
 def test_another_ros_distribution_is_refused_in_one_line():

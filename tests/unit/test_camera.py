@@ -124,6 +124,7 @@ def test_unproject_inverts_project(camera):
 
 
 @CAMERAS
+@pytest.mark.slow
 def test_every_pixel_of_the_image_has_a_unit_ray(camera):
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     pixels = np.stack([u, v], axis=-1)

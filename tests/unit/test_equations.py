@@ -22,6 +22,7 @@ def test_tags_are_read(text, expected):
     assert equations_of(text) == expected
 
 
+@pytest.mark.slow
 def test_each_equation_has_one_definition_and_it_flies():
     assert problems(ROOT) == []
 

@@ -64,6 +64,7 @@ def test_commands_are_accepted(text):
 
 
 @pytest.mark.parametrize("text", blocks("python"))
+@pytest.mark.slow
 def test_python_runs(text, tmp_path, monkeypatch, capsys):
     guide = next(g for g in GUIDES if text in g.read_text())
     for yaml in re.findall(r"```yaml\n(.*?)```", guide.read_text(), re.S):

@@ -34,6 +34,7 @@ def test_the_estimated_body_is_the_truth_less_the_error(hover):
     np.testing.assert_allclose(flight.motion.sample(np.array([3.5])).p_WB[0] - body.p_WB, OFF, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_of_the_body_are_errors_of_the_target(hover):
     scenario, flight = hover
     exact = see_target(scenario, flight, track_of(flight), 3, 3.5, 3.8)

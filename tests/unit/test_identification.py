@@ -72,6 +72,7 @@ def test_a_hover_tells_nothing_and_says_so():
     assert "neither roll nor pitch" in next(one.refused for one in found if one.key == "actuation.delay")
 
 
+@pytest.mark.slow
 def test_a_loop_that_rings_is_none_of_first_order():
     found, answers = identify(record(oscillation=15.0, seconds=10.0), VEHICLE)
     assert "explains" in found[0].refused and answers[0].explained < 0.9
@@ -100,6 +101,7 @@ def test_a_flight_without_commands_is_refused():
         record_of(Flight({}))
 
 
+@pytest.mark.slow
 def test_the_program_flies_and_writes_a_vehicle_file(tmp_path, monkeypatch, capsys):
     """On a vehicle whose loop is 1.3 times as slow as its file says, and 4 % heavier."""
     (tmp_path / "slow.yaml").write_text("name: slow\nextends: surface_90\ndisturbance: {loop_lag_factor: 1.3, mass_factor: 1.04}\n")

@@ -28,6 +28,7 @@ CASES = [problem(60.0), problem(90.0), problem(60.0, ((0.6, 0.1, 1.2), (1.1, 0.0
 
 
 @pytest.mark.parametrize("asked", CASES)
+@pytest.mark.slow
 def test_plans_keep_the_thrust_and_end_on_the_surface_as_those_that_fly_do(asked):
     printed, flies = paper_m.plan(asked, SETTINGS, VEHICLE), planner.plan(asked, SETTINGS, VEHICLE)
     assert printed.solved

@@ -40,6 +40,7 @@ def test_published_starts_within_our_limits(name: str) -> None:
     np.testing.assert_allclose(perch.states[-1, :13], recovery.states[0, :13], rtol=0.0, atol=1e-15)  # appended without a jump
 
 
+@pytest.mark.slow
 def test_perception_keeps_the_line_in_front() -> None:
     with_it, without = (problem.plan(problem.load("powerline_deg90_perception"), perception=on, with_recovery=False)
                         for on in (True, False))

@@ -107,6 +107,7 @@ def test_history_interpolates_a_turning_climb():
         history.at(38_000_001)
 
 
+@pytest.mark.slow
 def test_gusts_have_the_strength_asked_for_and_drydens_memory():
     step, sigma = 0.05, 1.5
     field = WindField(Wind(steady=(0.0, 4.0, 0.0), gust_sigma=sigma), step, seeding.stream(1, "wind"))

@@ -101,6 +101,7 @@ def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_lo
     assert all(0 < flown.time - a.middle for a in front) and all(abs(a.stamp - a.middle) < 20 * MS for a in front)
 
 
+@pytest.mark.slow
 def test_images_that_processes_draw_are_waited_for_and_a_camera_whose_process_ends_goes_on_without():
     expected, on_demand = vehicle("front")
     for _ in range(60):

@@ -70,6 +70,7 @@ def test_covariance_of_one_image_covers_calibration_and_odometry():
     assert low < np.mean(values) < high
 
 
+@pytest.mark.slow
 def test_fusion_stays_consistent_over_a_whole_approach():
     """NEES of the fused target over 120 flights: shared errors must not be averaged away."""
     rng = np.random.default_rng(1)

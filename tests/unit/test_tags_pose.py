@@ -57,6 +57,7 @@ def test_exact_corners_give_the_exact_pose():
         assert pose.rms < 1e-4
 
 
+@pytest.mark.slow
 def test_no_flip_survives_in_a_thousand_frames():
     rng = np.random.default_rng(1)
     turns = []
