@@ -8,7 +8,9 @@ from perch_core import so3
 from perch_core.camera import PinholeCamera, RadialTangentialCamera
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion
-from perch_perception.vio import bearing, ekf, lens
+from perch_core.values import ImuSample
+from perch_perception.ukf.imu_buffer import ImuBuffer
+from perch_perception.vio import VioConfig, bearing, ekf, lens
 from perch_perception.vio.bearing import observe, residuals
 from perch_perception.vio.gyro_bias import RayPair, solve_gyro_bias
 from perch_perception.vio.landmark_choice import Spread, cell
@@ -143,6 +145,26 @@ def test_preintegration_noise_is_the_spread_of_noisy_readings():
 
 
 # -- triangulation and updates -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cut", [1, 3_000_000, 4_999_999])
+def test_parts_of_a_sample_gather_the_noise_of_the_whole(cut):
+    """A sample that a frame cuts in two has one error: what both runs gather is what one run over it does."""
+    config = VioConfig()
+    buffer = ImuBuffer(config.imu, config.faults, 1.0)
+    for k in range(11):
+        buffer.add(ImuSample(10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+    def gathered(begin, end):
+        Q = preintegrate(buffer.run(begin, end), np.zeros(3), np.zeros(3)).Q
+        return np.diag(Q)[[0, 6]]
+
+    density2 = np.array([config.imu.gyro_noise_density, config.imu.accel_noise_density]) ** 2
+    middle = 50_000_000 + cut
+    first, second = gathered(0, middle), gathered(middle, 100_000_000)
+    np.testing.assert_allclose(first, density2 * middle * 1e-9, rtol=1e-6)
+    np.testing.assert_allclose(first + second, gathered(0, 100_000_000), rtol=1e-6)
+    np.testing.assert_allclose(gathered(52_000_000, 55_000_000), density2 * 0.003, rtol=1e-6)
 
 
 def test_triangulation_finds_the_point_and_refuses_what_tells_nothing():

@@ -49,7 +49,7 @@ class Flown:
         gyro, accel = read.gyro + GYRO_BIAS, read.accel + ACCEL_BIAS
         self.samples = [ImuSample(round(t * 1e9), tuple(w), tuple(f)) for t, w, f in zip(times, gyro.tolist(), accel.tolist())]
         config = VioConfig()
-        config = replace(config, imu=replace(config.imu, accel_bias_init=0.6, gyro_bias_init=0.1), filter=replace(config.filter, pixel_noise=0.2))
+        config = replace(config, imu=replace(config.imu, accel_bias_init=0.6), filter=replace(config.filter, pixel_noise=0.2))
         start = self.motion.sample(np.array([begin])).p_WB[0]
         self.vio = VisualInertialOdometry(config, MOUNT, start)
         self.vio.tracker = GivenTracks(self.see)

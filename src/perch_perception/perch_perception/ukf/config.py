@@ -16,7 +16,7 @@ class ImuNoise:
     accel_bias_walk: float = quantity(0.002, unit="m/s^2/sqrt(s)", above=0.0)
     gyro_bias_walk: float = quantity(0.0002, unit="rad/s/sqrt(s)", above=0.0)
     accel_bias_init: float = quantity(0.05, unit="m/s^2", above=0.0, doc="1 sigma of the turn-on bias")
-    gyro_bias_init: float = quantity(0.005, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias; at rest it is measured")
+    gyro_bias_init: float = quantity(0.1, unit="rad/s", above=0.0, doc="1 sigma of the turn-on bias (data sheets: up to 5 deg/s)")
     accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, doc="saturation of one axis")
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, doc="saturation of one axis")
     integration: str = choice("mean", options=("mean", "instant"), doc=(

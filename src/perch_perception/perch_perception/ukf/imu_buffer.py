@@ -112,7 +112,11 @@ class ImuBuffer:
         return float(np.sqrt(self._rows[-1][7])) if self._rows else 0.0
 
     def run(self, start: int, end: int) -> np.ndarray:
-        """The steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9)."""
+        """The steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9).
+
+        The error of a sample is one number. What its parts gather in two runs has to make up the variance of the whole step: a
+        part's variance is larger by the ratio of the durations.
+        """
         if end <= start or not self._ends:
             return np.empty((0, 9))
         first = bisect_right(self._ends, start)
@@ -121,8 +125,13 @@ class ImuBuffer:
         if len(rows) == 0:
             return rows
         begins = self._ends[first] - round(rows[0, 0] * 1e9)
+        whole = rows[[0, -1], 0]
         rows[0, 0] -= max(0, start - begins) * 1e-9
         rows[-1, 0] -= max(0, self._ends[last] - end) * 1e-9
+        if len(rows) == 1:
+            rows[0, 7:] *= whole[0] / rows[0, 0]
+        else:
+            rows[[0, -1], 7:] *= (whole / rows[[0, -1], 0])[:, None]
         return rows
 
     def recent(self, duration: float) -> np.ndarray:
