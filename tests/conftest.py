@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,10 @@ from hypothesis import HealthCheck, settings
 
 # Before the first message class is imported: by default a wrong type becomes silent garbage on the wire.
 os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
+
+# Started in the background of a shell, this process and all that it starts would ignore Ctrl-C.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No luck and no stop-watch: the same examples in each run, on slow machines too.
 settings.register_profile(

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -49,9 +50,8 @@ def test_json_and_table_name_every_figure():
 
 def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
     stat, clock = tmp_path / "stat", iter((10.0, 20.0))
-    monkeypatch.setattr(machine.time, "monotonic", lambda: next(clock))
-    monkeypatch.setattr(machine.os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(machine.os, "sysconf", lambda name: 100)
+    monkeypatch.setattr(machine, "time", SimpleNamespace(monotonic=lambda: next(clock)))  # of this module alone: others read it, too
+    monkeypatch.setattr(machine, "os", SimpleNamespace(cpu_count=lambda: 2, sysconf=lambda name: 100))
     stat.write_text("cpu  1 2 3 4 5 6 7 500 0 0\ncpu0 1 2 3 4 5 6 7 250 0 0\n")
     stolen = machine.Stolen(stat)
     stat.write_text("cpu  9 9 9 9 9 9 9 520 0 0\ncpu0 1 2 3 4 5 6 7 270 0 0\n")

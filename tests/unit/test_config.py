@@ -86,11 +86,11 @@ LADDER = "\n".join(f"a{k}: &a{k} [{f'*a{k - 1}' if k else 'x'}]" for k in range(
 def test_what_must_not_be_built_is_refused_while_it_is_read(tmp_path, content, words):
     path = tmp_path / "x.yaml"
     path.write_text(content)
-    began = time.monotonic()
+    began = time.process_time()
     with pytest.raises(ConfigError) as error:
         config.read_yaml(path)
     assert words in str(error.value) and str(path) in str(error.value) and len(str(error.value).splitlines()) == 1
-    assert time.monotonic() - began < 2.0
+    assert time.process_time() - began < 2.0
 
 
 def test_words_are_those_of_json():

@@ -37,7 +37,7 @@ def test_a_goal_sent_again_in_the_air_does_not_climb():
     assert heights == pytest.approx([1.2] * 4, abs=0.12)
 
 
-@pytest.mark.parametrize("name, times", [("surface_90", 10), ("line_80", 2)])
+@pytest.mark.parametrize("name, times", [("surface_90", 3), ("line_80", 2)])
 def test_perch_depart_and_perch_again(name, times):
     """In one run of the stack; a goal while perched is answered with its reason."""
     scenario = load_scenario(name)

@@ -160,9 +160,8 @@ NONSENSE = [
 @pytest.mark.parametrize(("changes", "code", "words"), NONSENSE)
 def test_nonsense_is_answered_with_a_typed_error_in_time_and_the_next_request_is_planned(isolated: Asked, changes: dict, code: int | None,
                                                                                          words: str) -> None:
-    begin = time.monotonic()
     plan = isolated(request(**changes))
-    assert time.monotonic() - begin < isolated.component.config.time_limit + 5.0
+    assert all(job.limit is not None and job.limit <= isolated.component.config.time_limit for job in isolated.jobs)  # the runner ends them then
     if code is None:
         assert plan.success or plan.error_code != PerchPlanError.OK
     else:
