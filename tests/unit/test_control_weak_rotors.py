@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
-from perch_control.admission import AtEnd, TrajectoryRefused
+from perch_control.admission import AtEnd, Order, TrajectoryRefused
 from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
+from perch_control.reference import FlatReference
 from perch_control.rotor_health import RotorHealth, RotorHealthSettings
 from perch_control.weak_landing import WeakLanding
-from perch_core.trajectory import rest_to_rest
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
 
@@ -62,6 +65,34 @@ def test_disturbances_are_not_taken_for_weak_rotors(disturbances):
     loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
     loop.run(plan.trajectory.duration + 2.0)  # the contact, and a recovery where it is missed
     assert not loop.controller.health.weak and not any("weak" in text for _, _, text in loop.events)
+
+
+@pytest.mark.parametrize("kept_ready", [False, True], ids=["appended recovery", "kept recovery"])
+def test_what_a_wire_does_is_not_taken_for_weak_rotors(kept_ready):
+    """A gripper that closes pulls along -b3 with several g, on a trajectory that goes on into its recovery [P:V-B]; away from there
+    the rotors are judged again."""
+    loop = make_loop()
+    loop.take_off(1.2)
+    p, flight, imu = loop.plant.p.copy(), loop.controller, loop.controller.imu
+    wire = p + [1.0, 0.0, 0.0]
+    first, second = rest_to_rest(p, wire, 0, 0, 2.0), rest_to_rest(wire, wire - [2.0, 0.0, 0.0], 0, 0, 2.0)
+    there = FlatTrajectory(np.array([2.0, 2.0]), np.concatenate([first.coefficients, second.coefficients]), loop.time + 0.1)
+    order = Order(3, FlatReference(there), there.start_time, AtEnd.RECOVER, recovery_start=2.0)
+    flight.follow(order)
+    if kept_ready:
+        way = replace(second, start_time=there.start_time + 2.0)
+        flight.keep_ready(Order(3, FlatReference(way), way.start_time, AtEnd.HOLD, recovery_start=0.0))
+
+    def pulled(t, w, f):
+        imu(t, w, (f[0], f[1], f[2] - (50.0 if 2.0 < t - there.start_time < 2.3 else 0.0)))
+
+    loop.controller.imu = pulled
+    loop.run(2.5)
+    assert not flight.health.weak and flight.state is State.TRACKING, loop.events
+    loop.run(1.0)
+    loop.plant.disturbances = Disturbances(rotor_factor=(0.6,) * 4)
+    loop.run(0.3)
+    assert flight.health.weak
 
 
 @pytest.mark.parametrize("share", [0.53, 0.6, 0.7])

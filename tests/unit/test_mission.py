@@ -55,8 +55,9 @@ class World:
                               1.2 if self.query.duration is None else self.query.duration + self.detour)
             self.query = None
         target = Target(self.time, SURFACE.p_WS, Q_PERCH, 0.01, 0.01) if self.sees and self.time > 2.0 else None
+        falling = 0.0 if self.off_at is None or self.stays else max(self.time - self.off_at - 0.1, 0.0)
         out = self.machine.tick(Inputs(
-            self.time, State(self.p, self.q, np.zeros(3), np.zeros(3)), self.ready, self.controller, "says so",
+            self.time, State(self.p, self.q, np.array([0.0, 0.0, -GRAVITY * falling]), np.zeros(3)), self.ready, self.controller, "says so",
             self.trajectory_id, 0.0, target, np.tile(self.force(), (10, 1)), plan, cancel))
         for command, _ in out.commands:
             self.commands.append(command)
@@ -194,4 +195,7 @@ def test_adhesion_needs_place_attitude_speed_and_force():
     monitor.add(np.tile([0.0, 0.0, 3.3], (30, 1)))  # thrust alone: falling along the wall
     assert not monitor.attached(at_rest, target)
     monitor.add(np.zeros((30, 3)))
-    assert monitor.free_fall()
+    assert monitor.fallen_off(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))
+    assert not monitor.fallen_off(at_rest)  # rocking in what holds it: no force for a moment, and no speed gathered
+    monitor.add(np.tile(g_B, (30, 1)))
+    assert not monitor.fallen_off(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))

@@ -286,7 +286,7 @@ class FlightController:
         if m.belief[2] - m.ground < AIRBORNE:
             self.compensator.reset()
             return NO_COMPENSATION
-        if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0:
+        if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0 or m.may_touch(0.0):
             return self.compensator.hold()
         return self.compensator.update(m.belief, m.rotors, m.now)
 

@@ -24,6 +24,7 @@ _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from th
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
 _LEVEL = 0.8          # cosine of the tilt up to which a brake starts from the attitude as it is
 _TURNING = 4.0        # the same for the body rate [rad/s]
+_AWAY = 2.0           # radii of the body from the place of a contact at which nothing there holds the vehicle
 _UPRIGHT = 0.7        # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -64,6 +65,7 @@ class Maneuvers:
         self.blind: BlindDescent | None = None
         self.events: list[str] = []
         self.weak, self.ground = False, -inf
+        self._meeting: tuple[float, tuple[float, ...]] | None = None  # when and where a surface or a wire is met [s, m]
         self._judged: tuple[Any, Vehicle, bool] | None = None  # whether this reference is too much for this vehicle
 
     @property
@@ -95,6 +97,8 @@ class Maneuvers:
         self.events.append(message)
         if state is not State.TRACKING:
             self.order = None
+        if state not in (State.TRACKING, State.RECOVERING):
+            self._meeting = None
 
     def run(self, source: Any) -> None:
         """Follow a reference from now on."""
@@ -105,6 +109,9 @@ class Maneuvers:
         self.enter(State.TRACKING, f"tracking trajectory {order.id}")
         self.attached_to = None
         self.order, self.source, self.start, self.trajectory_id = order, source, order.start, order.id
+        met = {AtEnd.CONTACT: order.source.duration, AtEnd.RECOVER: order.recovery_start}.get(order.at_end, -1.0)
+        if met >= 0.0:  # a way out that begins there meets nothing else
+            self._meeting = order.start + met, order.source.setpoint(met).p
 
     def motors_off(self, state: State, message: str) -> None:
         """Stop the motors."""
@@ -208,6 +215,13 @@ class Maneuvers:
         if self.state is not State.TRACKING or self.order.at_end is not AtEnd.CONTACT:
             return inf
         return max(self.order.source.duration - self.elapsed, 0.0)
+
+    def may_touch(self, before: float) -> bool:
+        """Something else than air may act: a surface or a wire, from `before` seconds ahead of the planned meeting until the vehicle
+        is away from that place; also on the recovery from there, when what was given up holds all the same."""
+        if self._meeting is None or self.now < self._meeting[0] - before:
+            return False
+        return norm(axpy(-1.0, self._meeting[1], self.belief[0:3])) < _AWAY * max(self.vehicle.body_radii)
 
     @property
     def committed(self) -> bool:

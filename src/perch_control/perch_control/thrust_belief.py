@@ -12,7 +12,7 @@ from perch_core.vector3 import axes_of, norm, scale
 from perch_core.vehicle import Vehicle
 
 AIRBORNE = 0.1    # so far above where it was armed, the ground no longer carries the vehicle [m]
-_TOUCHING = 0.1   # from so long before a planned contact on, a surface may act on the vehicle [s]
+_TOUCHING = 0.1   # from so long before a planned contact on, a surface or a wire may act on the vehicle [s]
 
 
 class ThrustBelief:
@@ -37,7 +37,7 @@ class ThrustBelief:
     def judge(self, law: Any, compensator: Any) -> None:
         """Compare felt and promised thrust in free air; weak rotors are a weaker vehicle from now on."""
         m = self._maneuvers
-        if m.belief[2] - m.ground < AIRBORNE or m.time_to_contact < _TOUCHING or norm(m.belief[10:13]) > self.health.settings.rate_most:
+        if m.belief[2] - m.ground < AIRBORNE or m.may_touch(_TOUCHING) or norm(m.belief[10:13]) > self.health.settings.rate_most:
             self.health.pause(m.now)
         elif self.health.update(self.felt, self._promised(), m.now):
             if not m.weak:

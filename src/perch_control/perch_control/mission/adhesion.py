@@ -67,9 +67,13 @@ class AdhesionMonitor:
         g_B = so3.quat_rotate(so3.quat_conjugate(q_WB), np.array([0.0, 0.0, GRAVITY]))
         return float(np.linalg.norm(np.mean(self._samples, axis=0) - g_B))
 
-    def free_fall(self) -> bool:
-        """Nothing carries the vehicle: with motors off, it has come off."""
-        return self.filled and float(np.linalg.norm(np.mean(self._samples, axis=0))) < 0.4 * GRAVITY
+    def fallen_off(self, state: State) -> bool:
+        """Nothing carries the vehicle, and it moves: with motors off, it has come off.
+
+        One that rocks in what holds it feels as little for a moment; but it does not gather speed.
+        """
+        return (self.filled and float(np.linalg.norm(np.mean(self._samples, axis=0))) < 0.4 * GRAVITY
+                and float(np.linalg.norm(state.v_WB)) > self.limits.speed)
 
     def attached(self, state: State, target: Target) -> bool:
         """The vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""

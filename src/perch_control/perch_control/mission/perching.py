@@ -100,7 +100,7 @@ class PerchingMission(MissionMachine):
             self._missed(inputs, "no adhesion")
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._adhesion.free_fall():
+        if self._adhesion.fallen_off(inputs.state):
             outputs.commands.append((Command.ARM, "came off the surface"))
             outputs.commands.append((Command.HOVER, "came off the surface"))
             self._missed(inputs, "came off the surface after the motors stopped")
