@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import threading
 import time
@@ -113,6 +114,23 @@ def test_the_configuration_is_read_back_and_what_differs_is_named():
             cli.check(wrong)
         with pytest.raises(CliError, match="mine.txt: set no_such = 1: the firmware refuses it"):
             cli.apply(Configuration("mine.txt", ("set no_such = 1",)))
+    finally:
+        running.close()
+
+
+def test_its_time_is_that_of_the_packets_and_no_pause_counts():
+    running = started(lambda: Sitl(load_configuration("betaflight")))
+
+    def receive(_: float) -> bytes:
+        running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
+        return running.receive(0.001)
+
+    try:
+        for _ in range(500):
+            receive(0.0)
+        time.sleep(1.5)
+        uptime = re.search(r"System Uptime: (\d+) seconds", Cli(running.send, receive).ask("status"))
+        assert int(uptime[1]) == pytest.approx(60.0 + running.time, abs=1.0)  # it begins with 60
     finally:
         running.close()
 

@@ -44,6 +44,16 @@ EDITS = (  # file, what stands there (a regular expression), what shall stand th
     return 0;
 """),
     (_SITL, r"while \(workerRunning\) \{(?=\n        n = udpRecv\(&rcLink)", "while (workerRunning && !rc_received) {"),
+    # its time is that of the packets from the first one on; as published it is the computer's, stretched by the rate at which packets
+    # came last, which is 1e-7 after the first two: a firmware that was not through with its start then waited for ever
+    (_SITL, r"static double simRate = 1.0;", "static double simRate = 1.0;\nstatic volatile uint64_t packetTime = 0; // [us]"),
+    (_SITL, r"microsleep\(us / simRate\)", "microsleep(us)"),
+    (_SITL, r"    last_timestamp = pkt->timestamp;\n    last_realtime = micros64_real\(\);",
+     "    last_timestamp = pkt->timestamp;\n    last_realtime = micros64_real();\n    packetTime = 60e6 + 1e6 * pkt->timestamp;"),
+    (_SITL, r"(?<=uint64_t micros64\(void\)\n\{).*?(?=\n\})", "\n    return packetTime ? packetTime : micros64_real();"),
+    (_SITL, r"(?<=uint64_t millis64\(void\)\n\{).*?(?=\n\})", "\n    return packetTime ? packetTime / 1000 : millis64_real();"),
+    (_SITL, r"(?<=void delay\(uint32_t ms\)\n\{).*?(?=\n\})", """
+    for (uint64_t start = millis64_real(); millis64_real() - start < ms;) microsleep(1000);"""),
     # a pause of the simulator is none in the flight
     (_SITL, r"realtime_now > last_realtime \+ 500\*1e3", "last_realtime == 0"),
     ("main/fc/core.c", r"if \(lockMainPID\(\) != 0\) return;", ""),
@@ -64,6 +74,8 @@ EDITS = (  # file, what stands there (a regular expression), what shall stand th
             failsafeUpdateState();
             lastFailsafeCheckMs = millis();
         }
+    } else if (gyroEnabled) {
+        schedulerExecuteTask(getTask(TASK_SERIAL), micros()); // is answered between packets, too
     }
     nextTargetCycles = getCycleCounter() + clockMicrosToCycles(1000); // until then: what is not of the cycle
 """),

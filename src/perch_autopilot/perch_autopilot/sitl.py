@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import select
 import shutil
 import struct
 import tempfile
@@ -61,6 +62,7 @@ class Sitl:
         self._folder = tempfile.TemporaryDirectory(prefix="perch-betaflight-")
         self._running: IsolatedProgram | None = None
         self.time, self.starts = 0.0, 0
+        self._late = False
         try:
             shutil.copy2(self._configured(), Path(self._folder.name, _EEPROM))
             self._start()
@@ -141,6 +143,8 @@ class Sitl:
         running = self._running
         p, q, r = gyro
         x, y, z = force
+        if self._late:  # a packet that was repeated may have been answered twice
+            self._late = bool(select.select([running.received], [], [], 0.01)[0] and running.received.recv(64))
         sticks = _STICKS.pack(self.time, *channels, *(1000,) * (CHANNELS - len(channels)))
         for attempt in range(_TRIES):
             stamp = self.time + attempt * 1e-5
@@ -150,6 +154,7 @@ class Sitl:
                 motors = _MOTORS.unpack_from(running.received.recv(64))
             except TimeoutError:
                 continue
+            self._late = self._late or attempt > 0
             return tuple(min(max(motors[k], 0.0), 1.0) for k in _FROM_PACKET)
         raise Frozen(f"Betaflight's firmware has not answered {_TRIES} packets at {self.time:.3f} s")
 
