@@ -43,7 +43,7 @@ class Controller(Component[ControllerParameters]):
     imu = Input(ImuSample, "imu/data_raw")
     odometry = Input(OdometryState, "odometry", answered=True)
     trajectory = Input(TrajectoryOrder, "trajectory", answered=True)
-    recovery = Input(TrajectoryOrder, "recovery", answered=True)
+    recovery = Input(TrajectoryOrder, "recovery")
     command = Input(ControllerCommand, "controller/command", answered=True)
     powerlines = Input(PowerlineMap, "powerlines")
     estimator = Input(EstimatorHealth, "estimator/status")

@@ -220,7 +220,7 @@ LIMITS: dict[type, dict[str, Any]] = {
     SampledTrajectory: {
         "start_time": Limit(0.0, 2.0**31, "s"), "times": Limit(0.0, 3600.0, "s", (-1,), SAMPLES_MAX),
         "p": _rows(1e4, "m", 3, SAMPLES_MAX), "v": _rows(100.0, "m/s", 3, SAMPLES_MAX), "a": _rows(1e3, "m/s^2", 3, SAMPLES_MAX),
-        "w": _rows(100.0, "rad/s", 3, SAMPLES_MAX), "dw": _rows(1e5, "rad/s^2", 3, SAMPLES_MAX),
+        "q": _rows(1.1, "", 4, SAMPLES_MAX), "w": _rows(100.0, "rad/s", 3, SAMPLES_MAX), "dw": _rows(1e5, "rad/s^2", 3, SAMPLES_MAX),
         "rotor_thrust": _rows(1e3, "N", 4, SAMPLES_MAX)},
     ChooseLaw: {"type": Text(100)},
     PerchGoal: {
@@ -232,7 +232,7 @@ LIMITS: dict[type, dict[str, Any]] = {
         "yaw_rate": Limit(-100.0, 100.0, "rad/s"), "p_WS": POSITION, "q_WS": Unit(), "target_velocity": VELOCITY,
         "waypoints": Limit(-1e4, 1e4, "m", (-1, 3), 50), "segment_times": Limit(0.01, PLAN_LONGEST, "s", (-1,), 51),
         "impact_acceleration": Limit(0.0, 100.0, "m/s^2"), "impact_speed_min": Limit(0.0, 20.0, "m/s"),
-        "impact_speed_max": Limit(0.0, 20.0, "m/s"), "thrust_max": Limit(0.0, 1e3, "N"), "thrust_min": Limit(0.0, 1e3, "N"),
+        "impact_speed_max": Limit(0.0, 20.0, "m/s"), "thrust_max": Limit(0.01, 1e3, "N"), "thrust_min": Limit(0.0, 1e3, "N"),
         "objective": Limit(0, 4)},
     PowerlinePlanRequest: {
         "start": STAMP, "p": POSITION, "q": Unit(1e-2), "v": VELOCITY, "w": TURN_RATE, "rotor_thrust": Limit(0.0, 1e3, "N", (-1,), 4),

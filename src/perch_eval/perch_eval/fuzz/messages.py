@@ -161,18 +161,12 @@ def _message(flight: str, name: str, channel: str, k: int) -> Any:
     return topics.topic(channel).to_message(recorded(flight)[name][k].arguments[0])
 
 
-def values(channel: str, message: Any) -> Iterator[Any]:
-    """What a message is to a component.
-
-    Raises:
-        PerchError: it is refused as it comes in.
-    """
+def _on_the_wire(message: Any) -> bytes:
+    """A message as it is sent; empty: the middleware has no memory for it, and nobody could send it."""
     try:
-        data = topics.serialize_message(message)
-    except RuntimeError as error:  # there is no memory for it in the middleware: nobody could send it
-        raise PerchError(str(error)) from None
-    value = topics.topic(channel).read(data)
-    yield from value if isinstance(value, list) else (value,)
+        return topics.serialize_message(message)
+    except RuntimeError:
+        return b""
 
 
 def is_free(message: Any, way: Way) -> bool:
@@ -208,10 +202,13 @@ def play(flight: str, name: str, sent: Sequence[Spoilt], strict: bool, last: int
             spoil = queue.pop()
             method = events[spoil.of].method
             channel = channels[method][0]
-            message = spoilt(_message(flight, name, channel, spoil.of), list(spoil.ways))
+            data = _on_the_wire(spoilt(_message(flight, name, channel, spoil.of), list(spoil.ways)))
+            if not data:
+                continue
             outcome, began = "refused", time.process_time()
             try:
-                received = list(values(channel, message))
+                value = topics.topic(channel).read(data)
+                received = value if isinstance(value, list) else [value]
             except PerchError:
                 received = []
             except Exception:
