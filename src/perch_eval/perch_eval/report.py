@@ -14,6 +14,7 @@ from perch_eval.flight import Flight
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected
 from perch_eval.inspection.recorded import recorded
+from perch_eval.loop_plots import inner_loop_figure
 from perch_eval.metrics import contact_report, diagnostics, flight_metrics, missed_deadlines, node_durations, perch_window, rates
 from perch_eval.goal import SUCCESSES
 from perch_eval.ros.recorded_flight import RecordedFlight
@@ -152,6 +153,7 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
               ("Path, seen from the side", plots.path_figure(flight)),
               ("Body rates and tilt", plots.rates_figure(flight)),
               ("Thrust against its bounds", plots.thrust_figure(flight, vehicle)),
+              ("The inner loop: commanded, measured, and by the vehicle file's model", inner_loop_figure(flight, vehicle)),
               ("Estimation error over the flight", plots.error_figure(flight))] if flight.states("ground_truth/odometry") else []
     if inspection is not None:
         images = [("Reference and flown path", plots.encode(paths_figure(inspection))),
