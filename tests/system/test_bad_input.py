@@ -41,7 +41,7 @@ SCENARIOS = {
     "too far above": ("target: {height: 3.9, distance: 3.3}", "outside [0.8, 3.6] m that the camera reads"),
     "above the image": ("target: {height: 3.9, distance: 0.8}", "deg that the front camera sees"),
     "seen from behind": ("target: {height: 3.0, inclination_deg: 0.0}", "in which its tags can be read"),
-    "unknown vehicle": ("vehicle: snapdragn", "vehicle: 'snapdragn': unknown; there are: betaflight, rpg, rpg_published, "),
+    "unknown vehicle": ("vehicle: snapdragn", "vehicle: 'snapdragn': unknown; there are: betaflight, "),
     "unknown board": ("target: {board: no_pad}", "target.board: 'no_pad': unknown; there are: pad_four_tags"),
     "unknown node": ("nodes: [vehicle, pilot]", "nodes: 'pilot' is not one of vehicle"),
     "no mission": ("nodes: [vehicle, estimator, controller]", "nodes: 'mission' is missing; a flight needs it"),
