@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from perch_autopilot import firmware, msp, sitl
+from perch_autopilot import configuration, firmware, msp, sitl
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, Configuration, load_configuration
 from perch_autopilot.loop import FirmwareLoop
@@ -32,6 +32,12 @@ except firmware.FirmwareError as missing:
 
 VEHICLE = load_vehicle("betaflight")
 STILL = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(autouse=True)
+def _any_machine(monkeypatch):
+    """A machine that is busy takes its time for a dump of all settings."""
+    monkeypatch.setattr(configuration, "_ANSWER_TIME", 60.0)
 
 
 def started(make):
@@ -103,11 +109,20 @@ def test_vehicle_files_are_what_identification_writes(vehicle, tmp_path, monkeyp
     assert keys(config.config_dir() / "vehicles" / f"{vehicle}.yaml") == keys(tmp_path / "vehicle.yaml")  # and nothing by hand
 
 
+def command_line(running) -> Cli:
+    """Of a firmware in the loop: its time is that of the packets, and it waits for a pause before it takes a line."""
+    def receive(_: float) -> bytes:
+        running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
+        return running.receive(0.001)
+
+    return Cli(running.send, receive)
+
+
 def test_the_configuration_is_read_back_and_what_differs_is_named():
     loaded = load_configuration("betaflight")
     running = started(lambda: Sitl(loaded))
     try:
-        cli = Cli(running.send, running.receive)
+        cli = command_line(running)
         cli.check(loaded)
         wrong = Configuration("mine.txt", (*loaded.lines, "set p_roll = 1"))
         with pytest.raises(CliError, match="p_roll is 180, not 1"):
@@ -120,16 +135,11 @@ def test_the_configuration_is_read_back_and_what_differs_is_named():
 
 def test_its_time_is_that_of_the_packets_and_no_pause_counts():
     running = started(lambda: Sitl(load_configuration("betaflight")))
-
-    def receive(_: float) -> bytes:
-        running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
-        return running.receive(0.001)
-
     try:
         for _ in range(500):
-            receive(0.0)
+            running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
         time.sleep(1.5)
-        uptime = re.search(r"System Uptime: (\d+) seconds", Cli(running.send, receive).ask("status"))
+        uptime = re.search(r"System Uptime: (\d+) seconds", command_line(running).ask("status"))
         assert int(uptime[1]) == pytest.approx(60.0 + running.time, abs=1.0)  # it begins with 60
     finally:
         running.close()
