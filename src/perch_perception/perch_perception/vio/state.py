@@ -9,6 +9,7 @@ position in W stay unobservable for the filter, as they are (docs/estimation.md)
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,7 @@ GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, LENS = slice(15, 18), slice(18, 21), 21, slice(22, 26)
 INERTIAL_SIZE, CORE_SIZE, CLONE_SIZE = 15, 26, 6
 _POSE = np.arange(CLONE_SIZE)
+_FORCES = 5  # propagations whose mean force tells the scale by the next one
 
 
 @compiled
@@ -33,7 +35,7 @@ def _less_cross(out, a, s, w):
 
 
 @compiled
-def _carried(P, thetas, R, E, steps, v, first, onward):
+def _carried(P, thetas, R, E, steps, v, points, onward):
     """M P M^T for the M of `State.inject`.
 
     Args:
@@ -41,7 +43,7 @@ def _carried(P, thetas, R, E, steps, v, first, onward):
         thetas: where the poses' errors (theta, p) begin in it, the present one's first, shape (k,).
         R: their attitudes before the step, shape (k, 3, 3); E: what these are turned by, R' = R E, shape (k, 3, 3).
         steps: of their positions, shape (k, 3); v: of the velocity, shape (3,).
-        first: where the errors of points begin; onward: their steps, shape (m, 3).
+        points: where errors of points begin, shape (m,); onward: their steps, shape (m, 3).
     """
     n = len(P)
     out, other = P.copy(), np.empty((n, n))
@@ -55,8 +57,8 @@ def _carried(P, thetas, R, E, steps, v, first, onward):
             _less_cross(out, a + 3, steps[k], w)
             if k == 0:
                 _less_cross(out, 6, v, w)
-                for m in range(len(onward)):
-                    _less_cross(out, first + 3 * m, onward[m], w)
+                for m in range(len(points)):
+                    _less_cross(out, points[m], onward[m], w)
             for c in range(n):
                 x, y, z = out[a, c], out[a + 1, c], out[a + 2, c]
                 for i in range(3):
@@ -95,9 +97,10 @@ class Clone:
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), refused observations in a row."""
+    """A point in the state: position in W (3,), that at which it is linearised, refused observations in a row."""
 
     X_W: np.ndarray
+    X_linear: np.ndarray
     strikes: int = 0
 
 
@@ -117,6 +120,7 @@ class State:
     P: np.ndarray
     clones: list[Clone] = field(default_factory=list)
     landmarks: dict[int, Landmark] = field(default_factory=dict)
+    forces: deque[tuple[float, np.ndarray]] = field(default_factory=lambda: deque(maxlen=_FORCES))  # (T, mean of f_B), the last ones
 
     @property
     def size(self) -> int:
@@ -143,6 +147,9 @@ class State:
         likewise v and the points with the present theta, each clone with its own. Otherwise what nothing can see would be another
         direction after each step, and the filter would learn of it by its own corrections.
 
+        A point is linearised where it is until its estimate has gone by more than 1 sigma from there; only then it is carried
+        along. Followed at each step, Jacobians are correlated with the noise that has moved the point, and distances shrink.
+
         The direction of a scale (`scale_error`) moves with the estimate as well, and is carried along.
         """
         before = self._metric()
@@ -151,10 +158,8 @@ class State:
         R = np.array([self.R_WB, *(c.R_WB for c in self.clones)])
         poses = dx[thetas[:, None] + _POSE]
         E, steps = so3.exp(poses[:, :3]), poses[:, 3:]
-        onward = dx[self.landmark_start :].reshape(-1, 3)
-        self.P = _carried(self.P, thetas, R, E, steps, dx[VELOCITY], self.landmark_start, onward)
-        for landmark, step in zip(self.landmarks.values(), onward):
-            landmark.X_W = landmark.X_W + step
+        points, onward = self._move_points(dx)
+        self.P = _carried(self.P, thetas, R, E, steps, dx[VELOCITY], points, onward)
         R = R @ E
         self.R_WB, self.p_WB, self.v_WB = R[0], self.p_WB + dx[POSITION], self.v_WB + dx[VELOCITY]
         for clone, R_WB, step in zip(self.clones, R[1:], steps[1:]):
@@ -178,7 +183,7 @@ class State:
         """
         if len(self.landmarks) < 3:
             return None
-        rays = np.array([m.X_W for m in self.landmarks.values()]) - self.p_WB
+        rays = np.array([m.X_linear for m in self.landmarks.values()]) - self.p_WB
         part = rays / (rays**2).sum(axis=1, keepdims=True) / len(rays)
         out = np.zeros(self.size)
         out[self.landmark_start :], out[POSITION] = part.ravel(), -part.sum(axis=0)
@@ -189,15 +194,29 @@ class State:
         self.P = _gone_along(self.P, direction, scale)
 
     def _metric(self) -> np.ndarray:
-        """All that a scale stretches: positions, velocity and points, shape (size,)."""
+        """All that a scale stretches: positions, velocity and the points where they are linearised, shape (size,)."""
         out = np.zeros(self.size)
         out[POSITION], out[VELOCITY] = self.p_WB, self.v_WB
         poses = out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE)
         for pose, clone in zip(poses, self.clones):
             pose[3:] = clone.p_WB
         if self.landmarks:
-            out[self.landmark_start :] = np.concatenate([m.X_W for m in self.landmarks.values()])
+            out[self.landmark_start :] = np.concatenate([m.X_linear for m in self.landmarks.values()])
         return out
+
+    def _move_points(self, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Move the points; where those that have left their linearisation begin in the error, (m,), and by how much, (m, 3)."""
+        start, marks = self.landmark_start, list(self.landmarks.values())
+        if not marks:
+            return np.zeros(0, int), np.zeros((0, 3))
+        X = np.array([m.X_W for m in marks]) + dx[start:].reshape(-1, 3)
+        gone = X - np.array([m.X_linear for m in marks])
+        left = np.flatnonzero((gone**2).sum(axis=1) > np.diag(self.P)[start:].reshape(-1, 3).sum(axis=1))
+        for m, X_W in zip(marks, X):
+            m.X_W = X_W
+        for k in left.tolist():
+            marks[k].X_linear = marks[k].X_W
+        return start + 3 * left, gone[left]
 
     def add_landmark(self, number: int, X_W: np.ndarray, step: np.ndarray, cross: np.ndarray, own: np.ndarray) -> None:
         """Take a point into the state.
@@ -215,7 +234,7 @@ class State:
         cross = cross - turned @ self.P[THETA]
         own = own - turned @ before.T - cross[:, THETA] @ turned.T
         self.P = np.block([[self.P, cross.T], [cross, own]])
-        self.landmarks[number] = Landmark(X_W + step)
+        self.landmarks[number] = Landmark(X_W + step, X_W + step)
         if scale is not None:
             self.carry_scale(np.concatenate([np.zeros(len(scale)), step]), np.concatenate([scale, np.zeros(3)]))
 
@@ -278,5 +297,5 @@ class State:
             N[k + 3 : k + 6, :3] = np.eye(3)
         for i, m in enumerate(self.landmarks.values()):
             k = self.landmark_start + 3 * i
-            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_W)
+            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_linear)
         return N
