@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import subprocess
 import sys
@@ -52,3 +53,22 @@ with quiet_on_interrupt():
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60.0)
     assert (process.returncode, error) == (130, "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_c_code_calls_python_is_kept_without_a_traceback(monkeypatch, capfd, number):
+    """As while numba loads what is compiled."""
+    from perch_core.ros.node import StopSignal
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
+    former = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        stop = StopSignal()
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
+        assert stop
+        with pytest.raises(SystemExit):
+            signal.raise_signal(number)
+    finally:
+        for each, handler in former.items():
+            signal.signal(each, handler)
+    assert capfd.readouterr().err == ""

@@ -89,11 +89,13 @@ class StopSignal:
     """Becomes true with SIGINT or SIGTERM.
 
     rclpy's own handlers end a wait by an exception out of whatever callback runs, which EventsExecutor cannot pass on;
-    a flag lets the callback finish. Until `patient` is set there is no callback: then it ends the process at once.
+    a flag lets the callback finish. Until `patient` is set there is no callback of ROS: then it ends the process at once. Where
+    C code has called Python (numba loads its cache so) it would be printed and lost: it is not printed, and the flag ends the process.
     """
 
     def __init__(self) -> None:
         self._set = self.patient = False
+        others, sys.unraisablehook = sys.unraisablehook, lambda lost: None if lost.exc_type is SystemExit else others(lost)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
