@@ -17,7 +17,8 @@ from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.namespace import IsolatedProgram, NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
 from perch_autopilot.watchdog import OFF, ON
-from perch_core import config
+from closed_loop.plant import Plant
+from perch_core import config, so3
 from perch_core.component import Output, ports
 from perch_core.values import RatesThrust
 from perch_core.vehicle import load_vehicle
@@ -270,3 +271,25 @@ def test_an_autopilot_that_does_not_answer_is_refused():
         Betaflight(BetaflightParameters(wire=f"fd:{ours.fileno()}"))
     ours.close()
     theirs.close()
+
+
+@pytest.mark.parametrize("turned", [(0.6, 0.0, 0.0), (-0.6, 0.0, 0.0), (0.0, 0.6, 0.0), (0.0, -0.6, 0.0), (0.4, -0.4, 1.0)])
+def test_self_level_levels(turned):
+    """As the watchdog asks for it when commands stop: about every axis, in simulated time."""
+    loop = started(lambda: FirmwareLoop(VEHICLE))
+    try:
+        plant = Plant(VEHICLE, p=np.array([0.0, 0.0, 50.0]))
+        hover, idle = loop._sticks.channels(STILL, 9.81)[2], loop._idle
+        force = np.array(GRAVITY)
+        for k in range(700):
+            if k == 200:  # it hovers; then it is found tilted
+                plant.R = so3.exp(np.array(turned))
+            q = so3.quat_from_matrix(plant.R)
+            sticks = (1500, 1500, hover if k >= 50 else 1000, 1500)  # it arms with the throttle down only
+            motors = np.array(loop.sitl.step(plant.w, force, (q[3], *q[:3]), (*sticks, ON, ON)))
+            if k >= 50:
+                plant.advance(VEHICLE.speed_min + (VEHICLE.speed_max - VEHICLE.speed_min) * np.clip((motors - idle) / (1.0 - idle), 0.0, 1.0))
+                force = plant.R.T @ (plant.acceleration + np.array(GRAVITY))
+        assert np.degrees(np.arccos(plant.R[2, 2])) < 3.0 and np.abs(plant.w).max() < 0.3
+    finally:
+        loop.close()

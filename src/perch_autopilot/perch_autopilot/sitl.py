@@ -130,7 +130,7 @@ class Sitl:
         Args:
             gyro: angular velocity in FLU [rad/s].
             force: specific force in FLU [m/s^2].
-            q_wxyz: orientation, which only self-levelling modes look at.
+            q_wxyz: orientation of B (FLU) in W (z up), which only self-levelling modes look at; sent turned about x, as the rates.
             channels: pulse widths [us]; the rest of 16 are low.
 
         Returns:
@@ -143,19 +143,20 @@ class Sitl:
         running = self._running
         p, q, r = gyro
         x, y, z = force
+        w, i, j, k = q_wxyz
         if self._late:  # a packet that was repeated may have been answered twice
             self._late = bool(select.select([running.received], [], [], 0.01)[0] and running.received.recv(64))
         sticks = _STICKS.pack(self.time, *channels, *(1000,) * (CHANNELS - len(channels)))
         for attempt in range(_TRIES):
             stamp = self.time + attempt * 1e-5
             running.sent.sendto(sticks, ("127.0.0.1", STICKS))
-            running.sent.sendto(_STATE.pack(stamp, p, -q, -r, -x, -y, -z, *q_wxyz, 0, 0, 0, 0, 0, 0, 101325.0), ("127.0.0.1", STATE))
+            running.sent.sendto(_STATE.pack(stamp, p, -q, -r, -x, -y, -z, w, i, -j, -k, 0, 0, 0, 0, 0, 0, 101325.0), ("127.0.0.1", STATE))
             try:
                 motors = _MOTORS.unpack_from(running.received.recv(64))
             except TimeoutError:
                 continue
             self._late = self._late or attempt > 0
-            return tuple(min(max(motors[k], 0.0), 1.0) for k in _FROM_PACKET)
+            return tuple(min(max(motors[n], 0.0), 1.0) for n in _FROM_PACKET)
         raise Frozen(f"Betaflight's firmware has not answered {_TRIES} packets at {self.time:.3f} s")
 
     # -- CLI and MSP -------------------------------------------------------------------------------------------------
