@@ -49,7 +49,8 @@ def stroboscope(view: View, vehicle: Vehicle, start: float, end: float, instants
         _draw_vehicle(axes, vehicle, p, R, project, towards, colors[k], 3 + k)
         if k == instants - 1 or np.linalg.norm(states.p[k + 1] - p) > LABEL:
             axes.annotate(f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°", project(p + 0.5 * PAD * DOWN), ha="center", va="top",
-                          fontsize=7, color="0.25", zorder=50)
+                          fontsize=7, color="0.25", zorder=50,
+                          bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0.0, "pad": 0.5})
     left, low = project(flown.p).min(axis=0) - [0.1, 0.3]
     axes.plot([left, left + 0.5], [low, low], color="k", lw=2.0)
     axes.annotate("0.5 m", (left + 0.25, low - 0.02), ha="center", va="top", fontsize=8)
