@@ -20,9 +20,9 @@ from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.domain import reserved_domain
 from perch_eval.evaluation.document import machine
-from perch_eval.graph_faults.campaign import commit
 from perch_eval.modelled_sight_node import blind_launches, blind_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
+from perch_eval.revision import banner, commit
 from perch_eval.ros.pilot import Pilot
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import load_scenario
@@ -197,11 +197,11 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
 
 def page(folder: Path) -> str:
     """The page of all soaks whose figures lie in a folder."""
-    text = ["# Soak", "", "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
+    runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
+    text = ["# Soak", "", banner(", ".join(sorted({run["commit"] for run in runs.values()}))), "", "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
             f"perch again. Growth of memory by least squares over the flights after the first {SETTLED}; bar: {BAR:g} MB per 100 flights,",
             "descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
-    for file in sorted(folder.glob("*.json")):
-        run = json.loads(file.read_text())
+    for file, run in runs.items():
         good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
         sight = "with cameras" if run["cameras"] else "without cameras (error models in their place)"
         minutes = run["flights"][-1]["time"] / 60.0

@@ -18,6 +18,7 @@ from perch_eval.control_flights.faults import END_STATES, FAULTS, Fault, fly_fau
 from perch_eval.evaluation.document import finite
 from perch_eval.evaluation.perching import source_digest
 from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.revision import banner, commit
 
 MOMENTS = 20                         # of each fault
 QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
@@ -153,5 +154,5 @@ def _kept(effort: Effort, name: str, jobs: list[tuple], carry_out: Callable[[tup
 
 def _write(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
     made = "\n\nMade by `python3 scripts/evaluate.py --only c_faults --only c_comparison --out docs/results/control`; edit nothing here.\n"
-    (effort.out / f"{name}.md").write_text("\n".join(lines) + made)
+    (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", banner(commit()), *lines[1:]]) + made)
     (effort.out / f"{name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, Section
+from perch_eval.revision import banner, commit
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", MISSING: "*not available*"}
 
@@ -50,7 +51,7 @@ def machine() -> str:
 
 def _page(sections: Sequence[Section], mode: str, duration: float) -> str:
     found = counts(sections)
-    lines = ["# Results", "",
+    lines = ["# Results", "", banner(commit()), "",
              f"Made by `python3 scripts/evaluate.py --{mode}` in {duration / 60:.0f} min on {machine()}; this page is generated, edit nothing here.", "",
              f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail; {found.get('better', 0)} further values are better than the paper's, "
              f"{found.get('worse', 0)} worse; {found.get(MISSING, 0)} rows are not available.", "",

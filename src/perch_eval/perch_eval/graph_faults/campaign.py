@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.evaluation.document import machine
 from perch_eval.graph_faults.cases import FAULTS, MODES, NAMED, PHASES, SAFE, TRAFFIC, Case, cases
+from perch_eval.revision import banner, commit
 
 EXAMPLES = """examples:
   python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on
@@ -110,14 +110,6 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
         nursery.close()
 
 
-def commit() -> str:
-    """Of the code, with a plus sign where the sources have changed since."""
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], capture_output=True, text=True, check=False).stdout.strip()
-
-    return git("rev-parse", "--short", "HEAD") + "+" * bool(git("status", "--porcelain", "--untracked-files=no", "src", "config"))
-
-
 def problems(row: dict[str, Any]) -> list[str]:
     """What is not as it should be in a flight."""
     if row["struck"] is None:
@@ -148,7 +140,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     told = [row for row in struck if row["named"] is not None and row["named"] <= NAMED]
     clean = [row for row in rows if not row["left"]]
     commits = Counter(row["commit"] for row in rows)
-    text = ["# Faults on the real graph", "",
+    text = ["# Faults on the real graph", "", banner(", ".join(commits)), "",
             "Made by `python3 scripts/faults.py`; edit nothing here. Rows: [rows.jsonl](rows.jsonl).", "",
             f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
             + f" on {machine()}.", "",
