@@ -27,6 +27,7 @@ def test_each_equation_has_one_definition_and_it_flies():
     assert problems(ROOT) == []
 
 
+@pytest.mark.slow
 def test_the_page_is_that_of_the_code():
     assert (ROOT / "docs" / "equations.md").read_bytes() == page(ROOT).encode(), "run python3 scripts/equations.py"
 

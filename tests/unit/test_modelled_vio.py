@@ -71,6 +71,7 @@ def test_in_real_time_answers_come_after_their_latency_by_the_stamps_of_the_trut
     assert len(came) == 1 and 0 <= came[0] - (states[0].stamp + 40 * MS) < 2 * MS
 
 
+@pytest.mark.slow
 def test_its_whole_state_is_as_wrong_as_its_covariance_says():
     """Over seeds, 15 errors whitened by the covariance have unit variance; so have those that the drift of yaw correlates."""
     nees, pairs = [], []

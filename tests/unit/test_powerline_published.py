@@ -15,6 +15,7 @@ PUBLISHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_costs_give_the_published_trajectories(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PERCH_COMPILE", "0")  # a vehicle that nobody flies; and this is the path without a compiler
@@ -27,6 +28,7 @@ def test_published_costs_give_the_published_trajectories(name: str, monkeypatch:
     assert bounds["end_speed"].maximum == pytest.approx(speed, abs=0.006)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["powerline_deg90", "powerline_upside_down", "powerline_deg90_perception"])
 def test_published_starts_within_our_limits(name: str) -> None:
     planned = problem.plan(problem.load(name))

@@ -86,6 +86,7 @@ def test_commands_that_no_motor_follows_are_refused_and_the_last_good_one_counts
     assert seen["diagnostics"][-1].message == "motors stopped: no motor_command"
 
 
+@pytest.mark.slow
 def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_looked_at():
     flown, seen = vehicle("front")
     arrivals = [arrival for _ in range(100) for arrival in flown.advance()]

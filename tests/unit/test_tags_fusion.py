@@ -91,6 +91,7 @@ def test_fusion_stays_consistent_over_a_whole_approach():
     assert np.mean(fused_errors) < 0.8 * np.mean(single_errors), "fusion must help"
 
 
+@pytest.mark.slow
 def test_naive_averaging_would_be_overconfident():
     """The information filter without shared errors, as a contrast: its covariance is far too small."""
     rng = np.random.default_rng(2)

@@ -67,6 +67,7 @@ def test_no_flip_survives_in_a_thousand_frames():
     assert np.degrees(max(turns)) < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tags", [(0, 1, 2, 3), (0, 1), (2,)])
 def test_covariance_matches_the_errors_it_predicts(tags):
     """Mean NEES over 150 trials inside its 99.9 % bounds, for the full board and for parts of it."""

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from perch_core import so3
 from perch_eval import consistency
 from perch_perception.ukf import Health
@@ -84,11 +85,13 @@ def test_a_velocity_counts_as_much_as_its_covariance_says():
     assert errors[0.003] < 0.01 < 0.015 < errors[3.0]
 
 
+@pytest.mark.slow
 def test_forty_milliseconds_of_delay_cost_less_than_a_fifth():
     prompt, late = relative_rmse(0.0), relative_rmse(0.040)
     assert late < 1.2 * prompt
 
 
+@pytest.mark.slow
 def test_nees_lies_within_its_bounds_where_vios_errors_are_white():
     """14 runs with errors that are new in every pose, as the filter assumes: averages inside 95 % bounds for most of the time."""
     samples, times = [], None

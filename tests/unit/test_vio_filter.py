@@ -102,6 +102,7 @@ class Run:
             yield report, error
 
 
+@pytest.mark.slow
 def test_the_filter_follows_a_perch_and_finds_the_calibration():
     run = Run(1)
     errors = np.array([error for _, error in run.frames()])
@@ -315,6 +316,7 @@ def test_a_landmark_that_starts_to_jump_is_dropped():
     assert chosen[0] not in run.filter.state.landmarks
 
 
+@pytest.mark.slow
 def test_what_a_landmark_has_told_is_not_used_again_when_its_track_ends():
     run = Run(9)
     filter_, again, marks = run.filter, set(), set()

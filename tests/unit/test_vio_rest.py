@@ -80,6 +80,7 @@ def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
     return vio, seen, [fly(time) for time in times], fly
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attitude", ATTITUDES)
 @pytest.mark.parametrize("dark", [False, True])
 def test_rest_in_any_attitude_is_known_for_long_and_honestly(attitude, dark):
@@ -91,6 +92,7 @@ def test_rest_in_any_attitude_is_known_for_long_and_honestly(attitude, dark):
     assert np.abs(error[9:12]).max() < 0.002  # the gyro's bias walked by 0.002
 
 
+@pytest.mark.slow
 def test_errors_at_rest_are_as_large_as_the_covariance_says():
     ends = [rest(seed, "wall", (10.0,), True)[2][-1] for seed in range(12)]
     assert 10.0 < np.mean([e @ np.linalg.solve(P, e) for e, P in ends]) < 21.0  # chi2, 15 x 12, 99.9 %, about
