@@ -69,12 +69,13 @@ class Hover:
 def test_odometry_at_every_rate_of_the_imu(rate, vio):
     hover = Hover(rate, vio=vio).fly(2.0)
     stamps = [o.stamp for o in hover.out["odometry"]]
-    assert stamps == [hover.period * (k + 1) for k in range(len(stamps))] and len(stamps) == pytest.approx(2.0 * rate, abs=2)
+    samples = range(hover.period, hover.now + 1, hover.period)
+    assert stamps == [t for t in samples if t >= 100 * MS]  # VIO's first pose
     hover.assert_running()
     assert hover.out.warnings() == []
     assert "gap" not in hover.health.message
     statuses = [s.stamp for s in hover.out["status"]]
-    assert statuses[0] == stamps[0]
+    assert statuses[0] == samples[0] and hover.out["status"][0].state == 0
     np.testing.assert_allclose(np.diff(statuses), 100 * MS, atol=hover.period)
     assert np.abs(hover.last.v_WB).max() < 0.05
     assert [len(x) for x in (hover.last.p_WB, hover.last.q_WB, hover.last.v_B, hover.last.w_B)] == [3, 4, 3, 3]
@@ -188,8 +189,10 @@ def test_axes_of_another_frame_are_turned_or_refused():
     assert any("'my_imu'" in text and "/tf_static" in text for text in hover.out.warnings())
     hover.estimator.on_transform(Transform("base_link", "plate", (0.0, 0.0, 0.1), LEVEL))
     hover.estimator.on_transform(Transform("plate", "my_imu", (0.0, 0.0, 0.0), tuple(turn)))
-    for _ in range(100):
+    for k in range(10):
         hover.now += hover.period
+        if k == 5:
+            hover.tell(state(hover.now))
         hover.estimator.on_imu(hover.sample(w_B=(0.1, 0.0, 0.0), f_B=(1.0, 0.0, 9.81)))
     np.testing.assert_allclose(hover.last.w_B, (0.0, 0.1, 0.0), atol=1e-12)
 

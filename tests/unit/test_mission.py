@@ -101,6 +101,20 @@ def test_a_perch_passes_through_every_phase():
     assert world.outcome.contact_time == pytest.approx(world.off_at)
 
 
+def test_a_goal_in_the_air_waits_for_the_estimator():
+    """One that was just restarted may not know where the vehicle is."""
+    world = World(ready=False)
+    world.controller, world.p = ControllerState.HOVERING, np.array([0.0, 0.0, 1.2])
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    for _ in range(50):
+        world.tick()
+    assert world.machine.phase is Phase.ARMING and world.reference is None
+    world.ready = True
+    world.tick()
+    assert world.machine.phase is Phase.TAKE_OFF and world.commands == []
+    np.testing.assert_allclose(world.reference.sample(0.0).p, world.p)
+
+
 def test_motors_stay_on_until_adhesion_is_felt():
     world = World(sticks=False)
     world.run()

@@ -29,7 +29,7 @@ V = TypeVar("V", InertialState, OdometryState)
 
 
 class StateEstimator(Component[EstimatorConfig]):
-    """Emits `odometry` with the stamp of each IMU sample, with what VIO said before it.
+    """Emits `odometry` with the stamp of each IMU sample, with what VIO said before it; none before VIO's first pose: nobody knows then.
 
     VIO's odometry is ignored while VIO's whole state is available: nothing made of both can be better.
     """
@@ -55,7 +55,7 @@ class StateEstimator(Component[EstimatorConfig]):
         self._newest_state = _NEVER
         self._covariances = (np.zeros((6, 6)), np.zeros((6, 6)))
         self._covariance_age = self.config.covariance_stride  # IMU samples since they were computed
-        self._first: int | None = None  # stamp of the first estimate
+        self._first: int | None = None  # stamp of the first IMU sample
         self._statuses = self._diagnoses = 0
 
     def on_transform(self, transform: Transform) -> None:
@@ -83,10 +83,11 @@ class StateEstimator(Component[EstimatorConfig]):
         if not outcome.used:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
         estimate = self._estimator.estimate
-        if estimate is None:
-            return
-        self._emit(sample.stamp, estimate)
+        if estimate is not None:
+            self._emit(sample.stamp, estimate)
         if self._first is None:
+            if not outcome.used:
+                return
             self._first = sample.stamp
         since = sample.stamp - self._first
         if since >= self._statuses * STATUS_PERIOD:
@@ -133,10 +134,11 @@ class StateEstimator(Component[EstimatorConfig]):
         self.odometry(OdometryState(stamp, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(e.w_WB_B.tolist()),
                                     *self._covariances, MAP))
 
-    def _emit_status(self, stamp: int, e: Estimate) -> None:
+    def _emit_status(self, stamp: int, e: Estimate | None) -> None:
         s = self._estimator.status
-        self.status(EstimatorHealth(stamp, s.health.value, s.vio_age, s.accepted, s.rejected, s.nis, tuple(e.gyro_bias.tolist()),
-                                    tuple(e.accel_bias.tolist()), s.position_sigma, s.attitude_sigma, s.message))
+        biases = ((0.0, 0.0, 0.0),) * 2 if e is None else (tuple(e.gyro_bias.tolist()), tuple(e.accel_bias.tolist()))
+        self.status(EstimatorHealth(stamp, s.health.value, s.vio_age, s.accepted, s.rejected, s.nis, *biases,
+                                    s.position_sigma, s.attitude_sigma, s.message))
 
     def _diagnose(self, stamp: int) -> None:
         s = self._estimator.status

@@ -127,7 +127,7 @@ class MissionMachine(ABC):
     def _arming(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.controller is ControllerState.ATTACHED:
             self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; the service `depart` comes first")
-        elif inputs.controller in _FLYING:
+        elif inputs.controller in _FLYING and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "already flying: going to the search place")
         elif inputs.controller is ControllerState.ARMED:
             self._go_to_search(inputs, outputs, "taking off", on_ground=True)

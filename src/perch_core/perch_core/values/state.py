@@ -77,7 +77,7 @@ class EstimatorHealth(NamedTuple):
         accepted, rejected: measurements so far.
         nis: normalised innovation squared of the last one that reached the gate.
         gyro_bias, accel_bias: 3 floats each [rad/s], [m/s^2].
-        position_sigma, attitude_sigma: largest 1 sigma [m], [rad].
+        position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf where nothing is known.
         message: the last event, for people.
     """
 

@@ -14,7 +14,7 @@ from perch_core.values.planning import Certificate
 
 LARGEST = 1e9
 LONGEST_TEXT = 5000
-MAY_BE_ABSENT = {PerchFeedback: {"time_to_contact"}, PerchResult: {"contact_time"}, EstimatorHealth: {"vio_age", "nis"},
+MAY_BE_ABSENT = {PerchFeedback: {"time_to_contact"}, PerchResult: {"contact_time"}, EstimatorHealth: {"vio_age", "nis", "position_sigma", "attitude_sigma"},
                  Certificate: {"lower_limit", "upper_limit", "minimum", "maximum", "time_of_minimum", "time_of_maximum"}}
 """Fields that are NaN or infinite where there is nothing to tell."""
 

@@ -8,6 +8,7 @@ takes the belief's place. The equations are in docs/estimation.md.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -91,24 +92,14 @@ class Estimator:
 
     @property
     def estimate(self) -> Estimate | None:
-        """State at the newest IMU stamp; None before the first sample.
-
-        Before the first VIO pose it is level by gravity, with a position that is unknown and says so (1 sigma of 1 km).
-        """
-        last = self._imu.last
-        if last is None:
-            return None
+        """State at the newest IMU stamp; None before VIO's first pose, or its first after a divergence."""
         if self._base is None:
-            steps = self._imu.recent(0.1)
-            accel = steps[:, 4:7].mean(axis=0) if len(steps) else np.array(last.f_B)
-            belief = start.before_vio(last.stamp, accel)
-            x, P = belief.x, belief.P
-        else:
-            x, P = self._x.copy(), self._live.P
+            return None
+        last, x = self._imu.last, self._x.copy()
         return Estimate(
             stamp=last.stamp, p_WB=x[at.POSITION], v_WB=x[at.VELOCITY], q_WB=x[at.QUATERNION],
             w_WB_B=np.array(last.w_B) - x[at.GYRO_BIAS], gyro_bias=x[at.GYRO_BIAS], accel_bias=x[at.ACCEL_BIAS],
-            P=P)
+            P=self._live.P)
 
     @property
     def gyro_sigma(self) -> float:
@@ -118,7 +109,7 @@ class Estimator:
     @property
     def status(self) -> Status:
         """Health and figures for people and for the mission."""
-        age, position, attitude = float("inf"), start.UNKNOWN_POSITION, start.UNKNOWN_YAW
+        age, position, attitude = math.inf, math.inf, math.inf
         health = Health.DIVERGED if self._broken else Health.INITIALISING
         if self._base is not None:
             age = (self._imu.last.stamp - self._applied) * 1e-9
@@ -131,11 +122,11 @@ class Estimator:
 
     def _compile(self) -> None:
         """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
-        belief = start.before_vio(0, np.array([0.0, 0.0, 9.81]))
-        row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
-        prior = self._transform.predict(belief, row, 2_000_000)
         pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), np.zeros(3), np.eye(3))
         pose.problem()
+        row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
+        belief = start.from_pose(self.config, pose, row)
+        prior = self._transform.predict(belief, row, 2_000_000)
         self._transform.correct(prior, self._innovate(prior, pose))
         kernels.advance(belief.x.copy(), *map(float, row[0, 1:7]), 0.002)
 

@@ -136,7 +136,7 @@ class Status:
         accepted, rejected: VIO poses applied and gated so far.
         broken: covariances that lost their positive definiteness, each of which was a start anew.
         nis: normalised innovation squared of the last pose that reached the gate.
-        position_sigma, attitude_sigma: largest 1 sigma [m], [rad].
+        position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf where nothing is known.
         message: the last event, for people.
     """
 

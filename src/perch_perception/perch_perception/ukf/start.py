@@ -1,4 +1,4 @@
-"""The filter's first belief: attitude from gravity before VIO speaks, then VIO's first pose, or its whole state."""
+"""The filter's first belief: VIO's first pose, or its whole state."""
 
 from __future__ import annotations
 
@@ -14,31 +14,6 @@ from perch_perception.ukf.unscented import Belief
 
 _REGULAR = 1e-12  # variance that a state has at least, in each direction: a covariance may be singular, a factor's may not
 _STANDS = 0.02  # speed that may be rest [m/s]
-UNKNOWN_POSITION, UNKNOWN_VELOCITY, UNKNOWN_YAW = 1e3, 1e2, np.pi  # 1 sigma before the first VIO pose [m, m/s, rad]
-
-
-def level(accel: np.ndarray) -> np.ndarray:
-    """Quaternion xyzw with yaw 0 whose z axis lies along the specific force (3,), shape (4,)."""
-    norm = np.linalg.norm(accel)
-    if norm < 1e-6:
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    z_W_B = accel / norm  # W's z axis in B
-    q = np.array([z_W_B[1], -z_W_B[0], 0.0, 1.0 + z_W_B[2]])
-    if np.linalg.norm(q) < 1e-6:  # upside down
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    return q / np.linalg.norm(q)
-
-
-def before_vio(stamp: int, accel: np.ndarray) -> Belief:
-    """Belief without any VIO pose: level by gravity, everything else unknown."""
-    x = np.zeros(at.NOMINAL_SIZE)
-    x[at.QUATERNION] = level(accel)
-    tilt = 0.1
-    sigma = np.repeat([UNKNOWN_POSITION, UNKNOWN_VELOCITY, tilt, 0.1, 0.5], 3)
-    P = np.diag(sigma**2)
-    R_BW = so3.quat_to_matrix(x[at.QUATERNION]).T
-    P[at.D_ATTITUDE, at.D_ATTITUDE] += UNKNOWN_YAW**2 * np.outer(R_BW[:, 2], R_BW[:, 2])
-    return Belief(stamp, x, P)
 
 
 def white(noise: VioNoise) -> np.ndarray:
