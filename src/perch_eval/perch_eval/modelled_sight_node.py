@@ -115,15 +115,17 @@ NODES = {one.name: one for one in (TARGET_LOCALIZER, POWERLINE_MAPPER)}
 MODULE = "perch_eval.modelled_sight_node"
 
 
-def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, **options: Any) -> tuple[NodeLaunch, ...]:
+def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, extra: Sequence[str] = (), **options: Any
+                   ) -> tuple[NodeLaunch, ...]:
     """The nodes that fly a scenario without images, with their parameters.
 
     Args:
         scenario, seed, source: what is flown, its random numbers, its name or file.
         lockstep: as in `node_launch.node_launches`.
+        extra: nodes beside those of the scenario.
         options: further ones of `node_launch.node_launches`.
     """
-    nodes = ["vio_model" if name == "vio" else name for name in choose_nodes(scenario)]
+    nodes = ["vio_model" if name == "vio" else name for name in choose_nodes(scenario, extra=extra)]
     own: dict[str, Any] = {"scenario": source, "seed": seed}
     changed = {"vehicle": lambda p: {**p, "cameras": "none"}, "target_localizer": lambda p: {**p, **own}, "powerline_mapper": lambda p: own}
     launches = node_launches(scenario, nodes, seed=seed, scenario_source=source, lockstep=lockstep, **options)

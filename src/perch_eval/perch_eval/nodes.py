@@ -21,6 +21,8 @@ CHAIN_NODES = ("vehicle", "estimator", "controller", "description")
 """Nodes that every step waits for, and one that says where the vehicle is: in real time they share a process, and nobody else does."""
 FAST_NODES = (*CHAIN_NODES, "mission", "recorder")
 """Nodes with a little to do at many steps: between processes their messages cost more than their work."""
+PER_VEHICLE = ("/clock", "/tf", "/tf_static")
+"""Topics with absolute names of which each vehicle in a namespace has its own: simulated vehicles have times of their own, and the same frames."""
 
 
 def sharing(names: Collection[str] | None, otherwise: Collection[str] = ()) -> Collection[str]:
@@ -107,8 +109,14 @@ def executable(package: str, name: str) -> str:
 
 def ros_arguments(launch: NodeLaunch, folder: Path, namespace: str = "") -> list[str]:
     """The ROS arguments of a node; its parameter file is written into `folder`."""
-    remap = ["-r", f"__ns:={namespace}"] if namespace else []
-    return ["--ros-args", *remap, "--params-file", str(launch.write(folder))]
+    return ["--ros-args", *in_namespace(namespace), "--params-file", str(launch.write(folder))]
+
+
+def in_namespace(namespace: str) -> list[str]:
+    """The remappings of a node in a namespace; none where it is empty."""
+    if not namespace.strip("/"):
+        return []
+    return ["-r", f"__ns:={namespace}", *(word for topic in PER_VEHICLE for word in ("-r", f"{topic}:={topic.lstrip('/')}"))]
 
 
 def qualified_name(node: str, namespace: str = "") -> str:

@@ -23,6 +23,7 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.messages.mission import goal_message
 from perch_eval.goal import goal_of, outcome_of
+from perch_eval.nodes import in_namespace
 from perch_sim.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
@@ -78,12 +79,16 @@ class _Progress:
 
 
 class Pilot:
-    """An action client in a ROS context of its own. Time is that of `/clock`."""
+    """An action client in a ROS context of its own. Time is that of `/clock`, in a namespace that of its `clock`."""
 
     def __init__(self, namespace: str = "") -> None:
+        """
+        Args:
+            namespace: of the vehicle's nodes, as in `/quad1`.
+        """
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node("pilot", namespace=namespace or None, context=self._context, start_parameter_services=False)
+        self._node = Node("pilot", context=self._context, cli_args=["--ros-args", *in_namespace(namespace)], start_parameter_services=False)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._client = ActionClient(self._node, Perch, "perch")

@@ -17,6 +17,7 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.values import ControllerCommand, RotorState
 from perch_core.vehicle import Vehicle
+from perch_eval.nodes import in_namespace
 from perch_eval.preflight.camera_turns import CameraTurns
 from perch_eval.preflight.checks import ANSWER, Order
 
@@ -41,7 +42,7 @@ class Visitor:
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node("preflight", namespace=namespace or None, context=self._context, start_parameter_services=False)
+        self._node = Node("preflight", context=self._context, cli_args=["--ros-args", *in_namespace(namespace)], start_parameter_services=False)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
