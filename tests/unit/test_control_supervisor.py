@@ -8,7 +8,7 @@ import pytest
 from closed_loop.loop import make_loop, perch
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints
 from perch_control.flight_settings import FlightSettings
-from perch_control.guidance import Hold, blended, brake
+from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
 from perch_control.modes import Command, CommandRefused, State
 from perch_control.odometry_gate import OdometryGate, OdometryLimits
 from perch_control.reference import FlatReference, SampledReference
@@ -173,6 +173,15 @@ def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
     mixed = blended(old, new, 0.0, new.duration)
     np.testing.assert_allclose(mixed.setpoint(0.0).p, old.p, atol=1e-12)
     np.testing.assert_allclose(mixed.setpoint(1.0).p, new.setpoint(1.0).p, atol=1e-12)
+
+
+@pytest.mark.parametrize("lasting", [False, True])
+def test_a_blend_at_one_time_is_the_blend_at_many_to_the_last_bit(lasting):
+    """The controller asks for one time, the rehearsal for all."""
+    source = FlatReference(rest_to_rest(np.zeros(3), np.array([1, 0, 0]), 0, 0, 2.0))
+    offset = Polynomial(quintic((0.1, 0.2, 0.3), (1, 0, 0), (0, 2, 0), *np.zeros((3, 3)), 0.7), 0.7, (0.0, 0.0, 0.0))
+    mixed, times = Blend(source, 0.4, offset, lasting), np.array([0.0, 0.4, 0.73, 1.1, 1.9, 2.5])
+    assert [mixed.setpoint(float(t)).packed for t in times] == [tuple(row.tolist()) for row in mixed.many(times)]
 
 
 @pytest.mark.parametrize("left, taken", [(0.2, 0.2), (0.4, 0.3), (0.8, 0.4), (3.0, 0.5)])

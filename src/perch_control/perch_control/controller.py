@@ -76,6 +76,7 @@ class Controller(Component[ControllerParameters]):
         self._answered: int | None = None  # newest stamp when odometry was last answered [ns]
         self._first: int | None = None     # stamp of the first answer [ns]
         self._statuses = self._references = self._diagnoses = self._steps = 0
+        self._due = 0                      # time since then at which something is to be said at the earliest [ns]
         self._silent = False               # a silence is being answered
 
     def warm_up(self) -> None:
@@ -100,11 +101,11 @@ class Controller(Component[ControllerParameters]):
             return
         if not self._believed(sample.stamp, "imu/data_raw"):
             return
-        flight, stamp = self.flight, sample.stamp
-        flight.imu(seconds(stamp), sample.w_B, sample.f_B)
-        if self._answered is None or flight.state in (State.DISARMED, State.FAILED, State.ATTACHED):
+        stamp, answered = sample.stamp, self._answered
+        self.flight.imu(seconds(stamp), sample.w_B, sample.f_B)
+        if answered is None or stamp <= answered or not (self._silent or stamp - answered >= nanoseconds(self.config.blind_after)):
             return
-        if stamp > self._answered and (self._silent or stamp - self._answered >= nanoseconds(self.config.blind_after)):
+        if self.flight.state not in (State.DISARMED, State.FAILED, State.ATTACHED):
             self._answer_silence(stamp, "odometry has stopped: the IMU is answered")
 
     def on_odometry(self, state: OdometryState) -> None:
@@ -119,8 +120,10 @@ class Controller(Component[ControllerParameters]):
 
     def _believed(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is of the present; a time that has evidently begun anew is a new flight."""
-        flying = self.flight.maneuvers.flying
-        verdict = self._stamps.judge(stamp, may_restart=not flying or self._gone)
+        verdict = self._stamps.judge(stamp, may_restart=not self.flight.maneuvers.flying or self._gone)
+        if verdict is Stamp.PRESENT:
+            self._spoke = True
+            return True
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
             self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not of the present ({newest:.3f} s): ignored", every=1.0)
@@ -129,7 +132,7 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s: starting anew, disarmed")
             self._assembly.restart()
             self._begin()
-        elif verdict is Stamp.AHEAD:
+        else:
             self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s")
             self.flight.maneuvers.descend("time has jumped ahead")
         self._spoke = True
@@ -242,11 +245,15 @@ class Controller(Component[ControllerParameters]):
         now = max(stamp, self._stamps.newest)  # stamps of odometry may stand still
         if self._first is None:
             self._first = now
-        since = now - self._first
+        if now - self._first >= self._due:
+            self._say(now, stamp, result)
+
+    def _say(self, now: int, stamp: int, result: StepResult) -> None:
+        """What is due by now."""
+        since, period = now - self._first, nanoseconds(self.config.controller.reference_period)
         if since >= self._statuses * STATUS_PERIOD:
             self._statuses = since // STATUS_PERIOD + 1
             self._emit_status(now)
-        period = nanoseconds(self.config.controller.reference_period)
         if since >= self._references * period:
             self._references = since // period + 1
             if result.setpoint is not None and self.reference.wanted:
@@ -254,6 +261,7 @@ class Controller(Component[ControllerParameters]):
         if since >= self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE:
             self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
             self._diagnose(now)
+        self._due = min(self._statuses * STATUS_PERIOD, self._references * period, self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE)
 
     def _emit_status(self, stamp: int) -> None:
         flight, maneuvers = self.flight, self.flight.maneuvers

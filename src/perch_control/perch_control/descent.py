@@ -19,6 +19,7 @@ from perch_control.geometric.step import rotors_for
 from perch_control.debounce import Debounce
 from perch_control.settings import GeometricGains
 
+_LEVELLING = 0.3    # rate at which the accelerometer corrects the attitude [1/s]
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]
 _SETTLE_TIME = 0.3  # the change of thrust at the beginning is over [s]
 _MEAN_TIME = 0.1    # of the specific force [s]
@@ -40,21 +41,20 @@ class AttitudeByImu:
     q: tuple[float, ...]
     w: tuple[float, ...] = (0.0, 0.0, 0.0)
 
-    def after(self, gyro: tuple[float, ...], accel: tuple[float, ...], dt: float, gain: float = 0.3) -> AttitudeByImu:
+    def after(self, gyro: tuple[float, ...], accel: tuple[float, ...], dt: float) -> AttitudeByImu:
         """The attitude after one IMU sample.
 
         Args:
             gyro: angular velocity in B [rad/s].
             accel: specific force in B [m/s^2]; its direction counts as vertical while its length is near 1 g.
             dt: time since the last sample [s].
-            gain: rate of the correction [1/s].
         """
         n = sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
         correction = (0.0, 0.0, 0.0)
         if 0.8 * GRAVITY < n < 1.2 * GRAVITY:
             b1, b2, b3 = axes_of(self.q)
             correction = cross((accel[0] / n, accel[1] / n, accel[2] / n), (b1[2], b2[2], b3[2]))
-        phi = tuple(dt * (gyro[i] + gain * correction[i]) for i in range(3))
+        phi = tuple(dt * (gyro[i] + _LEVELLING * correction[i]) for i in range(3))
         return AttitudeByImu(turned(self.q, phi), tuple(gyro))
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import dist, inf
 
-from perch_core.vector3 import axes_of, axpy, norm
+from perch_core.vector3 import axes_of
 from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.flight_settings import FlightSettings
@@ -263,7 +263,7 @@ class FlightController:
     def _fly(self) -> StepResult:
         m = self.maneuvers
         setpoint = m.setpoint()
-        self.position_error = norm(axpy(-1.0, setpoint.p, m.belief[0:3]))
+        self.position_error = dist(setpoint.p, m.belief[0:3])
         contact = m.time_to_contact
         state, delay = m.rotors.ahead(m.belief, self.vehicle), m.rotors.delay
         reference = Later(m, delay) if delay > 0.0 else m
@@ -271,7 +271,8 @@ class FlightController:
         m.rotors = m.rotors.following(out.rotor_speed, state, self.vehicle, out.w_C)
         top = self.vehicle.thrust_max
         self.margin = (top - max(out.rotor_thrust)) / top
-        self._spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (self.margin - self._spare) if m.state is State.HOVERING else 0.0
+        if m.state is State.HOVERING:
+            self._spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (self.margin - self._spare)
         if self.supervisor.landed(setpoint):
             m.motors_off(self._lying, "landed, motors off")
             return self._idle()
@@ -316,6 +317,9 @@ class FlightController:
         return StepResult(armed, speed, event=self._event(), loop=m.rotors.sent)
 
     def _event(self) -> str:
-        text = "; ".join(self.maneuvers.events)
-        self.maneuvers.events.clear()
+        events = self.maneuvers.events
+        if not events:
+            return ""
+        text = "; ".join(events)
+        events.clear()
         return text

@@ -6,13 +6,15 @@ Each has `duration` [s] and `setpoint(t)`; past their duration they hold their e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import add
 
 import numpy as np
 
-from perch_control.reference import Setpoint, fields, flat_setpoints, packed_many, unpacked
+from perch_control.reference import Setpoint, fields, flat_setpoints, packed_many
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory
 
+LONG = 0.5   # a takeover takes so long, where there is twice as much time [s]
 SHORT = 0.3  # a takeover shorter than this asks for more than the vehicle can follow: it uses what time there is [s]
 BRAKE_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
 
@@ -146,8 +148,12 @@ class Blend:
         return out
 
     def setpoint(self, t: float) -> Setpoint:
-        """Setpoint at a time [s] of the reference."""
-        return unpacked(self.many(np.array([t]))[0])
+        """Setpoint at a time [s] of the reference, as `many` has it."""
+        x, since = self.source.setpoint(t), t - self.start
+        if since < 0.0 or not (self.lasting or since < self.offset.duration):
+            return x
+        moved = (tuple(map(add, *pair)) for pair in zip(x[:5], self.offset.setpoint(since)))
+        return Setpoint(*moved, *x[5:])
 
 
 @dataclass(frozen=True)
@@ -174,15 +180,15 @@ class Running:
         return np.zeros((2, 3))
 
 
-def blended(old: Setpoint, source, start: float, end: float, duration: float = 0.5):
+def blended(old: Setpoint, source, start: float, end: float):
     """`source` from its time `start` on, taken over from the old setpoint without a jump in position, velocity or
-    acceleration, within half of the time to `end`, but no faster than within `SHORT` where there is so much; the source itself
-    where it continues the old one exactly."""
+    acceleration, within `LONG` or half of the time to `end`, but no faster than within `SHORT` where there is so much; the source
+    itself where it continues the old one exactly."""
     new = source.setpoint(start)
     gap = [np.subtract(getattr(old, k), getattr(new, k)) for k in ("p", "v", "a")]
     if max(float(np.abs(g).max()) for g in gap) < 1e-6:
         return source
     zero = np.zeros(3)
     left = end - start
-    duration = min(duration, max(0.5 * left, min(left, SHORT), 0.1))
+    duration = min(LONG, max(0.5 * left, min(left, SHORT), 0.1))
     return Blend(source, start, Polynomial(quintic(*gap, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))

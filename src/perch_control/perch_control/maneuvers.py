@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import inf
+from math import dist, inf
 from typing import Any
 
 from perch_core.vector3 import axes_of, axpy, dot, norm, scale
@@ -33,7 +33,7 @@ class Maneuvers:
     """Owns state, running reference, belief and rotor estimate of a flight.
 
     Attributes:
-        state, message: as published.
+        state, message: as published; `flying`: the motors carry the vehicle.
         now: time of the step [s].
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
         seen: stamp [s] and state of the last odometry sample that was accepted.
@@ -50,7 +50,7 @@ class Maneuvers:
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings) -> None:
         self.vehicle, self.gains, self.settings = vehicle, gains, settings
-        self.state, self.message = State.DISARMED, "disarmed"
+        self.state, self.message, self.flying = State.DISARMED, "disarmed", False
         self.now = 0.0
         self.belief: tuple[float, ...] = ()
         self.seen: tuple[float, tuple[float, ...]] = (0.0, ())
@@ -67,11 +67,6 @@ class Maneuvers:
         self.weak, self.ground = False, -inf
         self._meeting: tuple[float, tuple[float, ...]] | None = None  # when and where a surface or a wire is met [s, m]
         self._judged: tuple[Any, Vehicle, bool] | None = None  # whether this reference is too much for this vehicle
-
-    @property
-    def flying(self) -> bool:
-        """The motors carry the vehicle."""
-        return self.state in FLYING
 
     @property
     def elapsed(self) -> float:
@@ -93,7 +88,7 @@ class Maneuvers:
 
     def enter(self, state: State, message: str) -> None:
         """Change the state, and say why."""
-        self.state, self.message = state, message
+        self.state, self.message, self.flying = state, message, state in FLYING
         self.events.append(message)
         if state is not State.TRACKING:
             self.order = None
@@ -204,7 +199,7 @@ class Maneuvers:
     def _point_of_departure(self, setpoint: Setpoint) -> tuple:
         """Position, velocity and acceleration from which a manoeuvre goes on: without a jump of the reference where the
         vehicle follows it, from the state where it does not."""
-        near = norm(axpy(-1.0, setpoint.p, self.belief[0:3])) < _FOLLOWED
+        near = dist(setpoint.p, self.belief[0:3]) < _FOLLOWED
         if near and self.state in (State.TRACKING, State.HOVERING):
             return setpoint.p, setpoint.v, setpoint.a
         return self.belief[0:3], self.belief[3:6], _ZERO
@@ -221,7 +216,7 @@ class Maneuvers:
         is away from that place; also on the recovery from there, when what was given up holds all the same."""
         if self._meeting is None or self.now < self._meeting[0] - before:
             return False
-        return norm(axpy(-1.0, self._meeting[1], self.belief[0:3])) < _AWAY * max(self.vehicle.body_radii)
+        return dist(self._meeting[1], self.belief[0:3]) < _AWAY * max(self.vehicle.body_radii)
 
     @property
     def committed(self) -> bool:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import acos, degrees
+from math import acos, degrees, dist, hypot
 
-from perch_core.vector3 import axes_of, axpy, dot, norm
 from perch_core.vehicle import GRAVITY
 from perch_control.flight_settings import FlightSettings
 from perch_control.debounce import Debounce
@@ -19,12 +18,13 @@ _QUIET = 0.5       # rates of what is carried [rad/s]
 
 def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:
     """Angle between b3 and the thrust direction of the reference [deg]; 0 where the reference is in free fall."""
-    f = (setpoint.a[0], setpoint.a[1], setpoint.a[2] + GRAVITY)
-    n = norm(f)
+    fx, fy, fz = setpoint.a[0], setpoint.a[1], setpoint.a[2] + GRAVITY
+    n = hypot(fx, fy, fz)
     if n < 0.5:
         return 0.0
-    _, _, b3 = axes_of(state[6:10])
-    return degrees(acos(min(max(dot(b3, f) / n, -1.0), 1.0)))
+    x, y, z, w = state[6:10]
+    along = 2.0 * (x * z + y * w) * fx + 2.0 * (y * z - x * w) * fy + (1.0 - 2.0 * (x * x + y * y)) * fz  # b3 . f
+    return degrees(acos(min(max(along / n, -1.0), 1.0)))
 
 
 @dataclass
@@ -47,8 +47,8 @@ class TrackingMonitor:
         """What the vehicle does that was not planned; empty: nothing."""
         s = self.settings
         tilt = reference_tilt_deg(state, setpoint)
-        rate = norm(state[10:13])
-        error = norm(axpy(-1.0, setpoint.p, state[0:3]))
+        rate = hypot(*state[10:13])
+        error = dist(setpoint.p, state[0:3])
         tilted = self._tilt.update(tilt > s.tilt_margin_deg, now)
         spinning = self._rate.update(rate > s.rate_factor * self.rate_max, now)
         away = self._position.update(error > s.position_error_max, now)
@@ -75,23 +75,29 @@ class CarriedTilted:
     What the rotors do to the specific force points along b3. Where it has the length of gravity for long and does not point along
     b3, a wall or the ground does it, whatever odometry says. The attitude need not be known, so that it holds in a descent without
     position as well, and upside down after a fall.
+
+    Attributes:
+        tilted: what carries the vehicle does not push along b3.
+        lasts: it has done so for long.
     """
 
     def __init__(self, settings: FlightSettings) -> None:
         self._settings, self._held = settings, Debounce(settings.down_time)
         self._force, self._rate, self._stamp = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
-        self.lasts = False
+        self.tilted = self.lasts = False
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample: time [s], angular velocity [rad/s] and specific force [m/s^2] in B."""
         share = min(max(stamp - self._stamp, 0.0) / _MEAN_TIME, 1.0)
         self._stamp = stamp
-        self._force = axpy(share, axpy(-1.0, self._force, accel), self._force)
-        self._rate = axpy(share, axpy(-1.0, self._rate, gyro), self._rate)
-        carried = self.tilted and abs(norm(self._force) - GRAVITY) < _BALANCED * GRAVITY and norm(self._rate) < _QUIET
+        self._force, self._rate = _nearer(self._force, accel, share), _nearer(self._rate, gyro, share)
+        length = hypot(*self._force)
+        self.tilted = self._force[2] < _TILTED * length
+        carried = self.tilted and abs(length - GRAVITY) < _BALANCED * GRAVITY and hypot(*self._rate) < _QUIET
         self.lasts = self._held.update(carried, stamp)
 
-    @property
-    def tilted(self) -> bool:
-        """What carries the vehicle does not push along b3."""
-        return self._force[2] < _TILTED * norm(self._force)
+
+def _nearer(a: tuple[float, ...], b: tuple[float, ...], share: float) -> tuple[float, float, float]:
+    """A share of the way from one vector to another."""
+    x, y, z = a
+    return x + share * (b[0] - x), y + share * (b[1] - y), z + share * (b[2] - z)

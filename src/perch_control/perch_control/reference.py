@@ -49,12 +49,6 @@ class Setpoint(NamedTuple):
         return (*self.p, *self.v, *self.a, *self.j, *self.s, *self.h, *self.dh, *self.ddh, *self.b3, *self.db3, *self.ddb3)
 
 
-def unpacked(row: np.ndarray) -> Setpoint:
-    """The setpoint of which `row` has the fields, shape (33,)."""
-    x = iter(row.tolist())
-    return Setpoint._make(zip(x, x, x))
-
-
 @compiled
 def fields(row):
     """The fields of a `Setpoint`, 11 vectors, of its packed form (33,)."""

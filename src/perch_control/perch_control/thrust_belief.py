@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import hypot
 from typing import Any
 
 from perch_control.maneuvers import Maneuvers
 from perch_control.rotor_health import RotorHealth, RotorHealthSettings
 from perch_control.rotor_lag import thrusts
-from perch_core.vector3 import axes_of, norm, scale
+from perch_core.vector3 import axes_of, scale
 from perch_core.vehicle import Vehicle
 
 AIRBORNE = 0.1    # so far above where it was armed, the ground no longer carries the vehicle [m]
@@ -37,7 +38,7 @@ class ThrustBelief:
     def judge(self, law: Any, compensator: Any) -> None:
         """Compare felt and promised thrust in free air; weak rotors are a weaker vehicle from now on."""
         m = self._maneuvers
-        if m.belief[2] - m.ground < AIRBORNE or m.may_touch(_TOUCHING) or norm(m.belief[10:13]) > self.health.settings.rate_most:
+        if m.belief[2] - m.ground < AIRBORNE or m.may_touch(_TOUCHING) or hypot(*m.belief[10:13]) > self.health.settings.rate_most:
             self.health.pause(m.now)
         elif self.health.update(self.felt, self._promised(), m.now):
             if not m.weak:
