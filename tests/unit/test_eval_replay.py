@@ -1,7 +1,9 @@
-"""Flights that were recorded: figures, animation, plots and report of a file are those of the values that were flown; refusals."""
+"""Flights that were recorded: figures, animation, plots, report and comparison of a file are those of the values that were flown; refusals."""
 
 import json
 import math
+import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +15,9 @@ from perch_core.values import (
     AtEnd, CompressedPixels, Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorHealth, MotorCommand, OdometryState,
     PoseStamped, RotorState, TargetPose, TrajectoryOrder, rotated)
 from perch_core.vehicle import load_vehicle
+from perch_eval import comparison, report
 from perch_eval.flight import Flight, timed
+from perch_eval.margins import limits, margins
 from perch_eval.mcap_log import read
 from perch_eval.metrics import flight_metrics, perch_window, rates
 from perch_eval.replay.command import main
@@ -106,12 +110,18 @@ def test_any_change_of_a_hashed_value_changes_the_hash_and_what_comes_later_does
 
 def test_a_report_is_written(recorded, tmp_path):
     record(tmp_path / "flight.mcap", flown())
-    report = build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
-    assert json.loads((tmp_path / "report.json").read_text())["flight_hash"] == report["flight_hash"] == recorded[1].digest(4.0)
+    written = build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
+    assert json.loads((tmp_path / "report.json").read_text())["flight_hash"] == written["flight_hash"] == recorded[1].digest(4.0)
     page = (tmp_path / "report.html").read_text()
     for words in ("mission orders arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad", "front camera, t = 1.40 s"):
         assert words in page
-    assert report["real_time_factor"] == pytest.approx(1.5)
+    assert written["real_time_factor"] == pytest.approx(1.5)
+    assert "1.50: 3.00 s of simulated time in 2.00 s" in page
+
+
+@pytest.mark.parametrize("key, words", [("odometry_us_p99", "odometry p99 12.5 us"), ("clock_offset_s", "clock offset 12.5 s"), ("updates_rejected", "updates rejected 12.5")])
+def test_diagnostics_are_words_with_units(key, words):
+    assert report._with_unit(key, 12.5) == words
 
 
 def test_an_animation_has_a_frame_for_each_moment(recorded, tmp_path):
@@ -199,3 +209,86 @@ def test_no_recording_is_the_callers_mistake(tmp_path, capsys):
     (tmp_path / "empty.mcap").write_bytes(b"")
     assert main([str(tmp_path / "empty.mcap")]) == 2
     assert "ground_truth/odometry" in capsys.readouterr().err
+
+
+# -- margins, and two flights side by side ---------------------------------------------------------------------------
+
+def test_margins_are_distances_to_the_limits_of_vehicle_and_material(recorded):
+    _, flight = recorded
+    vehicle, scenario = load_vehicle("snapdragon"), load_scenario("surface_90")
+    found = {one.name: one for one in margins(flight, vehicle, scenario)}
+    assert found["greatest collective thrust"].left == pytest.approx(4 * vehicle.thrust_max - 2.4)
+    assert found["least collective thrust"].left == pytest.approx(2.4 - 4 * vehicle.thrust_min)
+    assert found["greatest body rate (limit of the plan)"].left == pytest.approx(math.degrees(vehicle.body_rate_max - 0.5))
+    low, high = scenario.adhesion.normal_speed
+    assert found["normal speed at contact"].left == pytest.approx(min(0.7 - low, high - 0.7))
+    assert found["tilt error at contact"].left == pytest.approx(scenario.adhesion.tilt_error_max_deg - math.degrees(0.02))
+    strict = replace(scenario, adhesion=replace(scenario.adhesion, tangential_speed_max=0.08))
+    assert [one.name for one in margins(flight, vehicle, strict) if one.left < 0.0] == ["tangential speed at contact"]
+    assert "contact" not in "".join(one.name for one in margins(flight, vehicle))
+
+
+def test_limits_are_words_also_after_json():
+    assert [limits({"low": low, "high": high}) for low, high in ((0.2, 1.0), (-math.inf, 4.5), (None, 4.5), (0.5, None))] == [
+        "0.2 to 1", "at most 4.5", "at most 4.5", "at least 0.5"]
+
+
+def compared(page):
+    """(figure) -> cells of its row, and the verdict, of a page."""
+    rows = re.findall(r"<tr><th>([^<]*)</th>((?:<td>[^<]*</td>)+)</tr>", page)
+    return {name: re.findall("<td>([^<]*)</td>", cells) for name, cells in rows}, re.search(r"<p>(The two are [^.,]*)", page)[1]
+
+
+def test_two_flights_are_on_one_page(recorded, tmp_path):
+    """The second flight is off by 5 cm of estimate more in y, and was reported."""
+    a, b = tmp_path / "a", tmp_path / "b"
+    for folder in (a, b):
+        folder.mkdir()
+    record(a / "flight.mcap", flown())
+    channels = flown()
+    channels["odometry"] = [(t, state._replace(p_WB=tuple(np.add(state.p_WB, (0.0, 0.05, 0.0))))) for t, state in channels["odometry"]]
+    record(b / "flight.mcap", channels)
+    build_report(b, load_scenario("surface_90"), 7, "perched", "held <by velcro>", 2.0, 4.0)
+    page = tmp_path / "pages" / "ab.html"
+    assert comparison.main([str(a), str(b / "flight.mcap"), "--names", "<one>", "other", "--out", str(page)]) == 0
+    text = page.read_text()
+    rows, verdict = compared(text)
+    assert verdict == "The two are different flights"
+    assert rows["estimation RMSE y [cm]"] == ["0.00", "5.00", "+5.00"] and rows["tracking RMSE x [cm]"] == ["0.00", "0.00", "+0.00"]
+    assert rows["outcome"] == ["-", "perched", ""] and rows["seed"] == ["-", "7", ""] and rows["message"][1] == "held &lt;by velcro&gt;"
+    assert rows["tilt error at contact [deg]"][:2] == ["at most 15", "-"], "limits of the material are those of the report"
+    assert text.count("data:image/png;base64,") == 5 and "<one>" not in text
+    assert comparison.main([str(a), str(a), "--out", str(page)]) == 0
+    assert compared(page.read_text())[1] == "The two are the same flight"
+
+
+@pytest.mark.parametrize("page", ["report", "comparison"])
+def test_a_flight_can_be_turned_on_a_page_that_needs_no_network(page, recorded, tmp_path):
+    record(tmp_path / "flight.mcap", flown())
+    file = tmp_path / f"{page}.html"
+    if page == "report":
+        build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
+    else:
+        assert comparison.main([str(tmp_path), str(tmp_path), "--out", str(file)]) == 0
+    text = file.read_text()
+    assert not re.search(r"""(?:src|href)=["'](?!data:)|https?://|@import|fetch\(""", text)
+    found = json.loads(re.search(r'<script type="application/json">(.*?)</script>', text)[1])["flights"]
+    assert len(found) == (1 if page == "report" else 2)
+    for one in found:
+        assert len(one["t"]) == len(one["p"]) == len(one["q"]) > 100 and len(one["pad"]) == 4 and len(one["rotors"]) == 4
+        assert np.ptp([p[0] for p in one["p"]]) == pytest.approx(2.0, abs=0.02)
+
+
+@pytest.mark.parametrize("content, words", [
+    (None, "flight.mcap: no such recording"), (b"", "holds no ground_truth/odometry"), ("report", "report.json: cannot be read")])
+def test_what_cannot_be_compared_is_one_line(content, words, recorded, tmp_path, capsys):
+    path, _ = recorded
+    if content == "report":
+        record(tmp_path / "flight.mcap", flown())
+        (tmp_path / "report.json").write_text("{")
+    elif content is not None:
+        (tmp_path / "flight.mcap").write_bytes(content)
+    assert comparison.main([str(path), str(tmp_path), "--out", str(tmp_path / "page.html")]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.startswith("error: ") and said.count("\n") == 1
+    assert not (tmp_path / "page.html").exists()

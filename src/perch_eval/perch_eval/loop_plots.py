@@ -44,5 +44,4 @@ def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> str:
         for axis in (left, right):
             axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel("time [s]")
-    figure.tight_layout()
     return encode(figure)

@@ -23,9 +23,11 @@ RUNNING = 1  # state in perch_msgs/EstimatorStatus
 
 
 def encode(figure: Any) -> str:
-    """A figure as PNG in base64, for a page."""
+    """A figure as PNG in base64, for a page; it fills its size."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=95, bbox_inches="tight")
+    if figure.get_layout_engine() is None:
+        figure.set_layout_engine("constrained")
+    figure.savefig(buffer, format="png", dpi=95)
     plt.close(figure)
     return base64.b64encode(buffer.getvalue()).decode()
 
@@ -77,7 +79,7 @@ def path_figure(flight: Flight) -> str:
     truth, reference = flight.states("ground_truth/odometry"), flight.reference()
     keep = (truth.t >= t0) & (truth.t <= t1 - 0.4)
     p, q = truth.p[keep], truth.q[keep]
-    figure, axis = plt.subplots(figsize=(6.5, 5))
+    figure, axis = plt.subplots(figsize=(12, 5))
     target = flight.values("ground_truth/target")
     direction = np.array([1.0, 0.0])
     if target:
@@ -165,7 +167,8 @@ def error_figure(flight: Flight) -> str:
         axis.plot(estimate.t[keep], 100 * error[keep, i], color=TRUTH, lw=1.0)
         for sign in (-3, 3):
             axis.plot(ts, sign * 100 * sigma[:, i], color=LIMIT, lw=0.7, ls="--")
-        axis.set_title(f"estimate - truth, {name} [cm], with 3 sigma", fontsize=9)
+        axis.set_ylabel(f"estimate - truth, {name}, with 3 sigma [cm]", fontsize=8)
+        axis.set_xlabel("time [s]")
         axis.grid(alpha=0.3)
         _mark(axis, flight)
     return encode(figure)

@@ -5,22 +5,26 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.flight import Flight
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected
 from perch_eval.inspection.recorded import recorded
 from perch_eval.loop_plots import inner_loop_figure
+from perch_eval.margins import limits, margins
 from perch_eval.metrics import contact_report, diagnostics, flight_metrics, missed_deadlines, node_durations, perch_window, rates
 from perch_eval.goal import SUCCESSES
+from perch_eval.replay.scene import View
 from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.turnable import AFTER, BEFORE, Shown, turnable
 from perch_sim.scenario import Scenario
 
-_STYLE = """
+STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; } td, th { padding: 3px 12px 3px 0; text-align: left; vertical-align: top; }
@@ -54,11 +58,11 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         first = flight.values("ground_truth/odometry")
         start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
-        "outcome": outcome, "message": message, "scenario": scenario.name, "seed": seed,
-        "simulated_time_s": end_time, "wall_time_s": wall_time,
+        "outcome": outcome, "message": message, "scenario": scenario.name, "vehicle": scenario.vehicle, "seed": seed,
+        "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, vehicle, end_time),
-        "flight_hash": flight.digest(end_time),
+        "flight_hash": flight.digest(end_time), "margins": [one.mapping() for one in margins(flight, vehicle, scenario)],
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
         "missed_deadlines": missed_deadlines(flight), "recording_damage": flight.damage,
     }
@@ -88,6 +92,8 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+UNITS = {"us": "us", "ms": "ms", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
+_UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/ControllerCommand
 
 
@@ -111,6 +117,12 @@ def _row(name: str, value: Any) -> str:
     return f"<tr><th>{html.escape(name)}</th><td>{html.escape(str(value))}</td></tr>"
 
 
+def _with_unit(key: str, value: float) -> str:
+    """A figure of a node's diagnostics, whose unit is a part of its name, in words."""
+    unit = _UNIT.search(key)
+    return f"{_UNIT.sub('', key).replace('_', ' ')} {value:.4g}{f' {UNITS[unit[1]]}' if unit else ''}"
+
+
 def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
     if values is None:
         return "not measured"
@@ -124,7 +136,19 @@ def inspection_words(figures: dict[str, Any]) -> str:
             f"least scaled clearance {figures['least_clearance']:.2f}")
 
 
-def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Any, inspection: Inspected | None) -> str:
+def _turnable(flight: Flight, vehicle: Vehicle, name: str) -> str:
+    """The flight in 3-D, around the perch if there is one."""
+    try:
+        view = View.of(flight)
+    except LookupError:
+        return "not recorded"
+    first, last = float(view.truth.t[0]), float(view.truth.t[-1])
+    window = perch_window(flight)
+    start, end = (max(first, window[0] - BEFORE), min(last, window[1] + AFTER)) if window else (first, last)
+    return turnable([Shown(name, plots.TRUTH, view, vehicle, start, end, 0.0)])
+
+
+def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Vehicle, inspection: Inspected | None) -> str:
     good = report["outcome"] in SUCCESSES
     contact = contact_report(flight)
     rows = [
@@ -134,8 +158,9 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
         _row("estimation RMSE x, y, z", _vector(report.get("estimation_rmse_m"), 100, "cm")),
         _row("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
         _row("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
-        _row("ended at / wall time", f"{report['simulated_time_s']:.2f} s simulated time / {report['wall_time_s']:.2f} s"
-                                      f" (real-time factor {report['real_time_factor']:.2f})"),
+        _row("real-time factor", f"{report['real_time_factor']:.2f}: {report['simulated_duration_s']:.2f} s of simulated time "
+                                 f"in {report['wall_time_s']:.2f} s"),
+        _row("ended at", f"{report['simulated_time_s']:.2f} s of simulated time"),
         _row("flight hash", report["flight_hash"][:16]),
     ]
     if flight.damage:
@@ -163,15 +188,17 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: A
     frames = "".join(f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{caption}</figcaption></figure>'
                      for caption, data in plots.camera_frames(flight, moments))
     timeline = "".join(f"<tr><td>{t:.3f} s</td><td>{html.escape(text)}</td></tr>" for t, text in _timeline(flight))
-    nodes = "".join(_row(node, ", ".join(f"{k} {v:g}" for k, v in reports[-1].items()))
+    nodes = "".join(_row(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items()))
                     for node, reports in diagnostics(flight).items())
     timings = "".join(_row(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                       for node, values in report["timings_ms"].items())
     hz = "".join(_row(topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())
-    figures = "".join(f'<h2>{title}</h2><img src="data:image/png;base64,{data}">' for title, data in images if data)
-    return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{scenario.name}, seed {report["seed"]}</title><style>{_STYLE}</style>'
+    kept = "".join(_row(m["name"], f"{m['value']:.2f} {m['unit']} ({limits(m)}): {m['left']:+.2f} left") for m in report["margins"])
+    figures = "".join(f'<h2>{title}</h2><img alt="{title}" src="data:image/png;base64,{data}">' for title, data in images if data)
+    return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{scenario.name}, seed {report["seed"]}</title><style>{STYLE}</style>'
             f'<h1>{html.escape(scenario.name)}, seed {report["seed"]}: <span class="{"good" if good else "bad"}">{report["outcome"]}</span></h1>'
-            f'<table>{"".join(rows)}</table><h2>Timeline</h2><table>{timeline}</table>{figures}'
+            f'<table>{"".join(rows)}</table><h2>Margins</h2><table>{kept or "no perch was planned"}</table>'
+            f'<h2>Timeline</h2><table>{timeline}</table><h2>Flight in 3-D</h2>{_turnable(flight, vehicle, scenario.name)}{figures}'
             f'<h2>What the cameras saw</h2><div class="frames">{frames or "no images recorded"}</div>'
             f"<h2>Rates</h2><table>{hz}</table><h2>Durations that the nodes measured</h2>"
             f"<table>{timings}</table><h2>Last diagnostics</h2><table>{nodes}</table></html>\n")

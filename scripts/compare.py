@@ -1,0 +1,9 @@
+#!/usr/bin/env python3
+"""Compare two recorded flights on one page. `--help` shows the options."""
+
+import sys
+
+from perch_setup import run
+
+if __name__ == "__main__":
+    sys.exit(run("perch_eval.comparison"))

@@ -1,0 +1,95 @@
+"""How much was missing until a flight would have failed: each figure with the limits that it has to keep."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from perch_core.vehicle import Vehicle
+from perch_eval.flight import Flight
+from perch_eval.metrics import perch_window, thrust_history, touch_of
+from perch_sim.contact_event import ContactState
+from perch_sim.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Margin:
+    """A figure of a flight and its limits.
+
+    Attributes:
+        name: what it is.
+        value: in `unit`.
+        low, high: limits; infinite where there is none.
+        unit: of all three.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def left(self) -> float:
+        """Distance to the nearer limit, in `unit`; negative where it is not kept."""
+        return min(self.value - self.low, self.high - self.value)
+
+    def mapping(self) -> dict[str, Any]:
+        """For `report.json`."""
+        return {"name": self.name, "value": self.value, "low": self.low, "high": self.high, "unit": self.unit, "left": self.left}
+
+
+def limits(margin: dict[str, Any]) -> str:
+    """The limits of a mapped margin in words; null, as JSON has it, is no limit."""
+    low, high = (None if limit is None or math.isinf(limit) else limit for limit in (margin["low"], margin["high"]))
+    return f"at least {low:.3g}" if high is None else f"at most {high:.3g}" if low is None else f"{low:.3g} to {high:.3g}"
+
+
+def margins(flight: Flight, vehicle: Vehicle, scenario: Scenario | None = None) -> list[Margin]:
+    """The margins of a perch, from the truth.
+
+    Args:
+        flight: what was recorded.
+        vehicle: its rotors, and the body rate that a plan may ask for.
+        scenario: what adhesion or gripper hold; without it nothing is said of the contact.
+    """
+    return [*_in_flight(flight, vehicle), *(_at_contact(flight, scenario) if scenario is not None else ())]
+
+
+def _in_flight(flight: Flight, vehicle: Vehicle) -> list[Margin]:
+    window, truth = perch_window(flight), flight.states("ground_truth/odometry")
+    if window is None or truth is None:
+        return []
+    found = []
+    t, thrust, _ = thrust_history(flight, vehicle)
+    inside = (t >= window[0]) & (t < window[1])
+    if inside.any():
+        low, high = 4 * vehicle.thrust_min, 4 * vehicle.thrust_max
+        found = [Margin("greatest collective thrust", float(thrust[inside].max()), -math.inf, high, "N"),
+                 Margin("least collective thrust", float(thrust[inside].min()), low, math.inf, "N")]
+    rates = np.linalg.norm(truth.w[(truth.t >= window[0]) & (truth.t < window[1])], axis=1)
+    if len(rates):
+        limit = math.degrees(vehicle.body_rate_max)
+        greatest = math.degrees(float(rates.max()))
+        found.append(Margin("greatest body rate (limit of the plan)", greatest, -math.inf, limit, "deg/s"))
+    return found
+
+
+def _at_contact(flight: Flight, scenario: Scenario) -> list[Margin]:
+    touch = touch_of(flight)
+    if touch is None or touch[1].state not in (ContactState.ATTACHED, ContactState.BOUNCED):
+        return []
+    contact, tilt = touch[1], math.degrees(touch[1].tilt_error)
+    if scenario.mode == "powerline":
+        grip = scenario.grip
+        speed = math.hypot(contact.normal_speed, contact.tangential_speed)
+        return [Margin("distance of the cable at contact", contact.offset, -math.inf, grip.position, "m"),
+                Margin("tilt error at contact", tilt, -math.inf, grip.tilt_deg, "deg"),
+                Margin("speed at contact", speed, -math.inf, grip.speed, "m/s")]
+    adhesion = scenario.adhesion
+    return [Margin("normal speed at contact", contact.normal_speed, *adhesion.normal_speed, "m/s"),
+            Margin("tangential speed at contact", contact.tangential_speed, -math.inf, adhesion.tangential_speed_max, "m/s"),
+            Margin("tilt error at contact", tilt, -math.inf, adhesion.tilt_error_max_deg, "deg")]
