@@ -446,5 +446,4 @@ def test_pacing_keeps_up_with_the_clock_or_says_what_it_gave_up(waits):
         assert 0 <= due <= LONGEST_CATCH_UP
         done += due
         assert done + pacing.skipped == (now - 1000) // period  # every period is done or owned up to
-        assert now < pacing.next_due <= now + period
     assert pacing.misses >= pacing.skipped

@@ -93,7 +93,7 @@ def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_lo
     front = [arrival for arrival in arrivals if arrival.camera == "front"]
     stamps = [arrival.stamp for arrival in front]
     assert 4 <= len(front) <= 7 and stamps == [i.stamp for i in seen["info_front"]] == [i.stamp for i in seen["image_front"]]
-    assert all(a.has_image for a in front) and not any(a.has_image for a in arrivals if a.camera == "down")
+    assert all(a.image is not None for a in front) and all(a.image is None for a in arrivals if a.camera == "down")
     assert len(seen["info_down"]) == len(arrivals) - len(front) and not seen["image_down"]
     image, model = seen["image_front"][-1], seen["info_front"][-1]
     assert image.ready is None and model.frame == image.frame == "camera_front_optical_frame"

@@ -96,8 +96,8 @@ class Controller(Component[ControllerParameters]):
 
     def on_imu(self, sample: ImuSample) -> None:
         """Known to the flight; answered where odometry has stopped."""
-        if not sample.in_body_axes:
-            self.warn(f"imu/data_raw: frame {sample.frame!r} is none of imu_link, base_link: ignored", every=1.0)
+        if why := sample.axes_problem:
+            self.warn(f"imu/data_raw: {why}: ignored", every=1.0)
             return
         if not self._believed(sample.stamp, "imu/data_raw"):
             return

@@ -120,8 +120,8 @@ class Mission(Component[MissionParameters]):
 
     def on_imu(self, sample: ImuSample) -> None:
         """Keep the specific force for the next tick."""
-        if not sample.in_body_axes:
-            self.warn(f"imu/data_raw: frame {sample.frame!r} is none of imu_link, base_link: ignored", every=1.0)
+        if why := sample.axes_problem:
+            self.warn(f"imu/data_raw: {why}: ignored", every=1.0)
         elif self._believed(sample.stamp, "imu/data_raw"):
             self._imu_period.update(seconds(sample.stamp))
             self._forces.append(sample.f_B)

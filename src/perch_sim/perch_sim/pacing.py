@@ -13,11 +13,6 @@ class Pacing:
         self.misses = 0   # steps that began more than a period late
         self.skipped = 0  # periods of wall-clock time given up
 
-    @property
-    def next_due(self) -> int:
-        """When the step after those that are done is due."""
-        return self._epoch + (self._done + 1) * self._period
-
     def due(self, now: int) -> int:
         """How many steps to do at the time `now`; the caller does them."""
         behind = (now - self._epoch) // self._period - self._done

@@ -50,10 +50,12 @@ class ArrivalNode(ComponentNode):
             self.create_timer(LOOK, self._look_for_strangers, clock=self._steady)
 
     def _wake(self, port: Wake) -> None:
-        handler = partial(self.guarded, port.name, port.handler(self.component))
+        handler, clock = partial(self.guarded, port.name, port.handler(self.component)), self.get_clock().handle
 
         def wake() -> None:
-            self._intake.enter(handler, self.get_clock().now().nanoseconds)
+            with clock:
+                now = clock.get_now().nanoseconds  # as `Clock.now` has it, without an object of the time: this runs at 500 Hz
+            self._intake.enter(handler, now)
 
         self.create_timer(port.period, wake, clock=self._steady)
 

@@ -51,27 +51,33 @@ class Deadlines:
             stamp: of the step that it answers [ns].
             now: a monotonic clock [ns].
         """
-        offset = now - stamp
+        offset, last = now - stamp, self._last
+        self._last = stamp
         if self._fresh == 0:
-            self._least, self._coming = (offset if self._last is None else self._coming), offset
+            self._least, self._coming = (offset if last is None else self._coming), offset
             self._period, self._coming_period = self._coming_period, NEVER
         self._fresh = (self._fresh + 1) % WINDOW
-        self._coming = min(self._coming, offset)
-        interval = 0 if self._last is None else stamp - self._last
-        if interval > 0:
-            self._coming_period = min(self._coming_period, interval)
+        if offset < self._coming:
+            self._coming = offset
+        interval = 0 if last is None else stamp - last
+        if 0 < interval < self._coming_period:
+            self._coming_period = interval
         period = min(self._period, self._coming_period)
         lateness = offset - min(self._least, self._coming)
         self._lateness.append(lateness)
-        late = lateness > period
-        self._on_end = self._on_end + 1 if late else 0
-        self._on_end_least = offset if self._on_end <= 1 else min(self._on_end_least, offset)
+        self.answers += 1
+        if 2 * interval >= 3 * period:
+            skipped = round(interval / period) - 1
+            self.answers += skipped
+            self.missed += skipped
+        if lateness <= period:
+            self._on_end = 0
+            return
+        self.missed += 1
+        self._on_end += 1
+        self._on_end_least = offset if self._on_end == 1 else min(self._on_end_least, offset)
         if self._on_end == MOVED:
             self._least = self._coming = self._on_end_least
-        skipped = max(0, round(interval / period) - 1)
-        self.missed += skipped + late
-        self.answers += 1 + skipped
-        self._last = stamp
 
     def report(self) -> dict[str, int | float]:
         """Figures for /diagnostics: counts since the start, and the delay of the last second's answers."""

@@ -26,9 +26,9 @@ class ImuSample(NamedTuple):
     frame: str = "imu_link"
 
     @property
-    def in_body_axes(self) -> bool:
-        """Whether its frame's axes are those of B."""
-        return self.frame in ("imu_link", "base_link", "")
+    def axes_problem(self) -> str:
+        """Why it is of no use where nobody turns it; empty: its frame's axes are those of B."""
+        return "" if self.frame in ("imu_link", "base_link", "") else f"frame {self.frame!r} is none of imu_link, base_link"
 
 
 class CameraImage:

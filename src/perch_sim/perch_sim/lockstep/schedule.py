@@ -48,11 +48,6 @@ class Arrival(NamedTuple):
     middle: int
     image: CameraImage | None
 
-    @property
-    def has_image(self) -> bool:
-        """Whether an image came with the frame's `camera_info`."""
-        return self.image is not None
-
 
 class Owed(NamedTuple):
     """What the flight waits for: of whom, what, and for which stamp [ns]."""
