@@ -26,7 +26,8 @@ def main() -> int:
     parser.add_argument("kind", choices=kinds, help="of inputs")
     parser.add_argument("--minutes", type=float, default=1.0, help="of hunting (default: %(default)g)")
     parser.add_argument("--seed", type=int, default=1, help="of the changes (default: %(default)s)")
-    parser.add_argument("--cases", type=Path, default=ROOT / "tests" / "fuzz" / "cases", metavar="DIR", help="where inputs that are found are kept (default: tests/fuzz/cases)")
+    parser.add_argument("--cases", type=Path, default=ROOT / "tests" / "fuzz" / "cases", metavar="DIR",
+                        help="where inputs that are found are kept (default: tests/fuzz/cases)")
     arguments = parser.parse_args()
     if not 0.0 < arguments.minutes <= 1e5:
         parser.error(f"--minutes {arguments.minutes} is outside (0, 100000]")

@@ -406,7 +406,8 @@ def test_laws_are_chosen_in_flight_when_they_are_built():
     job, = jobs
     built = job.function(*job.arguments)
     # Gains that change while it is being built are not lost.
-    config = replace(component.config, nmpc=replace(component.config.nmpc, thrust=2.5), snapdragon=replace(component.config.snapdragon, position=(5.0, 5.0, 6.0)))
+    config = replace(component.config, nmpc=replace(component.config.nmpc, thrust=2.5),
+                     snapdragon=replace(component.config.snapdragon, position=(5.0, 5.0, 6.0)))
     component.reconfigure(config)
     job.then(built)
     before = np.array(flight.motors[-1].rotor_speed)

@@ -34,7 +34,8 @@ def start_stack_parser():
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
 PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
-           "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser, "soak.py": soak.parser}
+           "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser,
+           "soak.py": soak.parser}
 
 
 def blocks(language):

@@ -148,7 +148,8 @@ class Disk:
 
 def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path, monkeypatch):
     path, opened = tmp_path / "f.mcap", open
-    monkeypatch.setattr("builtins.open", lambda file, mode="r", *a, **k: Disk(opened(file, mode, *a, **k), 200_000) if file == path else opened(file, mode, *a, **k))
+    monkeypatch.setattr("builtins.open", lambda file, mode="r", *a, **k: (
+        Disk(opened(file, mode, *a, **k), 200_000) if file == path else opened(file, mode, *a, **k)))
     recording = Recording(path)
     monkeypatch.setattr("builtins.open", opened)
     said = []

@@ -48,7 +48,8 @@ def flown():
         if k % 5 == 0:
             out["rotor_state"].append(RotorState(stamp, (1200.0,) * 4, (0.6,) * 4))
         if k >= 750:
-            out["controller/reference"].append(ControlReference(stamp, 1, tuple(sample.p), q, tuple(sample.v), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, 2.4, (0.0,) * 3))
+            zero = (0.0,) * 3
+            out["controller/reference"].append(ControlReference(stamp, 1, tuple(sample.p), q, tuple(sample.v), zero, zero, zero, 2.4, zero))
     image = np.full((48, 64), 120, np.uint8)
     packed = cv2.imencode(".jpg", image)[1].tobytes()
     out |= {
@@ -119,7 +120,8 @@ def test_a_report_is_written(recorded, tmp_path):
     assert "1.50: 3.00 s of simulated time in 2.00 s" in page
 
 
-@pytest.mark.parametrize("key, words", [("odometry_us_p99", "odometry p99 12.5 us"), ("clock_offset_s", "clock offset 12.5 s"), ("updates_rejected", "updates rejected 12.5")])
+@pytest.mark.parametrize("key, words", [
+    ("odometry_us_p99", "odometry p99 12.5 us"), ("clock_offset_s", "clock offset 12.5 s"), ("updates_rejected", "updates rejected 12.5")])
 def test_diagnostics_are_words_with_units(key, words):
     assert report._with_unit(key, 12.5) == words
 

@@ -113,7 +113,8 @@ def test_a_running_plan_is_replaced_in_flight():
 
 
 @pytest.mark.parametrize("inclination, velocity", [
-    (0.0, (3.0, 0.0, 0.0)), (0.0, (8.0, 0.0, 0.0)), (0.0, (0.0, 8.0, 0.0)), (0.0, (-8.0, 0.0, 0.0)), (60.0, (3.5, 0.0, 0.0)), (60.0, (1.5, 0.5, 0.0)), (60.0, (-0.5, 0.0, 0.2))])
+    (0.0, (3.0, 0.0, 0.0)), (0.0, (8.0, 0.0, 0.0)), (0.0, (0.0, 8.0, 0.0)), (0.0, (-8.0, 0.0, 0.0)), (60.0, (3.5, 0.0, 0.0)),
+    (60.0, (1.5, 0.5, 0.0)), (60.0, (-0.5, 0.0, 0.2))])
 def test_moving_pads_are_met_where_they_are(inclination, velocity):
     target = surface(inclination)
     problem = PerchProblem(StartState(HOVER.p, v=(0.5, 0.0, 0.0)), target, target_velocity=np.array(velocity))

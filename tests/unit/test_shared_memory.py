@@ -10,7 +10,8 @@ def test_only_own_unused_segments_are_removed(tmp_path, monkeypatch):
     shm, proc = tmp_path / "shm", tmp_path / "proc"
     monkeypatch.setattr(shared_memory, "_SEGMENT", shared_memory.re.compile(rf"({shm}/(?:sem\.)?fast(?:rtps|dds)_\S+)"))
     shm.mkdir()
-    for name in ("fastrtps_mine", "fastrtps_mine_el", "sem.fastrtps_mine_mutex", "sem.fastrtps_port1_mutex", "fastrtps_port1", "fastrtps_foreign", "other_mine"):
+    for name in ("fastrtps_mine", "fastrtps_mine_el", "sem.fastrtps_mine_mutex", "sem.fastrtps_port1_mutex",
+                 "fastrtps_port1", "fastrtps_foreign", "other_mine"):
         (shm / name).touch()
 
     def uses(pid: int, *names: str) -> None:

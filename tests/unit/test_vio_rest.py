@@ -58,7 +58,8 @@ def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
     vio = VisualInertialOdometry(config, mount, p + rng.normal(0.0, sigma), 0.0)
     vio._known = replace(vio._known, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, config.start.yaw_sigma)]) @ R)  # as a filter that was lost here left it
     bias = rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
-    walk, noise = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(rate), np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) * np.sqrt(rate)
+    walk = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(rate)
+    noise = np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) * np.sqrt(rate)
     seen, frame, k = [], 0.1, 0
     images = [np.clip(rng.normal(3 if dark else 110, 1 if dark else 4, (480, 640)), 0, 255).astype(np.uint8) for _ in range(4)]
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
-import math
 import os
 import re
 import types
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from perch_core.errors import ConfigError
-from perch_core.yaml_text import parse_yaml, read_yaml
+from perch_core.yaml_text import parse_yaml, read_yaml  # noqa: F401 (used as config.parse_yaml)
 
 T = TypeVar("T")
 LARGEST = {"m": 1e4, "m/s": 100.0, "m/s^2": 1e3, "m/s^3": 1e5, "rad": 1e3, "rad/s": 1e4, "rad/s^2": 1e4, "deg": 360.0, "s": 3600.0, "Hz": 1e4,

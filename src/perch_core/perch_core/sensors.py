@@ -56,7 +56,7 @@ class CameraSensor:
         _check_quaternion("orientation", self.orientation)
         if self.model == "pinhole" and any(self.distortion):
             raise ConfigError("", "distortion", f"{list(self.distortion)} of a pinhole: the model with distortion is radtan")
-        self.camera
+        self.camera  # noqa: B018 (raises where it is none)
 
     @cached_property
     def camera(self) -> Camera:

@@ -94,7 +94,7 @@ def _scan(text: str, source: str) -> None:
     anchors: dict[str, tuple[int, int]] = {}  # name -> values, levels
     for event in yaml.parse(text, _Loader):
         def refuse(problem: str) -> None:
-            raise ConfigError(source, f"line {event.start_mark.line + 1}", problem)
+            raise ConfigError(source, f"line {event.start_mark.line + 1}", problem)  # noqa: B023 (called in this turn)
 
         if isinstance(event, NodeEvent):
             weight, height = 1, 0

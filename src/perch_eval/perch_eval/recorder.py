@@ -15,7 +15,8 @@ from perch_eval.mcap_log import McapLog
 from perch_eval.messages_in import Listener, listening
 
 CHANNELS = (
-    "ground_truth/odometry", "ground_truth/target", "contact", "imu/data_raw", "rotor_state", "motor_command", "rates_thrust_command", "attitude_thrust_command",
+    "ground_truth/odometry", "ground_truth/target", "contact", "imu/data_raw", "rotor_state", "motor_command",
+    "rates_thrust_command", "attitude_thrust_command",
     "odometry", "vio/odometry", "estimator/status", "target/pose", "target/detections", "powerlines", "trajectory", "recovery", "controller/command",
     "controller/status", "controller/reference", "/diagnostics", "/tf", "/tf_static", "robot_description")
 SECOND = NANOSECONDS

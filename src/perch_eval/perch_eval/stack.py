@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.program import Ending, Program, RunningProgram

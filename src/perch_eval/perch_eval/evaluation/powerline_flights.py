@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from perch_core import config, so3
+from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder, seconds
 from perch_core.vehicle import load_vehicle

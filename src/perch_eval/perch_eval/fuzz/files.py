@@ -165,10 +165,13 @@ FACTS: dict[type, dict[str, Callable[[Any], bool]]] = {
     },
 }
 
-NASTY = (0, -1, 1, 1e308, -1e308, 1e-320, -0.0, 1e9, math.nan, math.inf, -math.inf, 2**31, 2**63, 2**64, 10**400, "", "abc", "nan", "1.0", "../../x", "/dev/zero",
-         "x.yaml", "a" * 300, "\x00", "\u202e", "\n", None, True, False, [], {}, [[]], [{}], {"a": 1}, [1.0, 2.0], [math.nan] * 3, [0.0] * 3, ["a"] * 3, [1e200] * 4)
-TOKENS = (b"[", b"{", b"]", b"}", b"[" * 3000, b"{a: " * 3000, b"- " * 500, b": ", b"? ", b"&a ", b"*a", b"<<: ", b"!!python/object:os.system ", b"!!float ", b"!!set ",
-          b"%YAML 9.9\n", b"---\n", b"...\n", b"|\n", b">\n", b"\t", b"\x00", b"\xff", b"\xef\xbb\xbf", b"'", b'"', b"\\", b"#", b"1" * 5000, b"1e999", b".nan", b"-.inf", b"0x1",
+NASTY = (0, -1, 1, 1e308, -1e308, 1e-320, -0.0, 1e9, math.nan, math.inf, -math.inf, 2**31, 2**63, 2**64, 10**400, "", "abc", "nan", "1.0", "../../x",
+         "/dev/zero", "x.yaml", "a" * 300, "\x00", "\u202e", "\n", None, True, False, [], {}, [[]], [{}], {"a": 1}, [1.0, 2.0],
+         [math.nan] * 3, [0.0] * 3, ["a"] * 3, [1e200] * 4)
+TOKENS = (b"[", b"{", b"]", b"}", b"[" * 3000, b"{a: " * 3000, b"- " * 500, b": ", b"? ", b"&a ", b"*a", b"<<: ", b"!!python/object:os.system ",
+          b"!!float ", b"!!set ",
+          b"%YAML 9.9\n", b"---\n", b"...\n", b"|\n", b">\n", b"\t", b"\x00", b"\xff", b"\xef\xbb\xbf", b"'", b'"', b"\\",
+          b"#", b"1" * 5000, b"1e999", b".nan", b"-.inf", b"0x1",
           b"2024-99-99", b"1:30", b"=", b"~", b"@", b"`", b"\r", b"\xe2\x80\xa8", b"&x [*x, *x]\n")
 
 

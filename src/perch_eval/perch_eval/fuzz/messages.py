@@ -15,13 +15,13 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import psutil
 
-from perch_core.component import Component, Input, Job, JobFailed, JobStopped, Output, ports
+from perch_core.component import Input, Job, JobFailed, JobStopped, Output, ports
 from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
 from perch_core.ros import topics

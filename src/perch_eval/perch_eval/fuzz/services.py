@@ -39,7 +39,8 @@ NO_CERTIFICATE = 1.02  # rotor thrusts of a flat trajectory are looked at as the
 TASKS = {"plan_perch": "perching_planner", "plan_powerline": "powerline_planner", "goal": "mission", "set_controller": "controller",
          "parameters": "controller", "abort": "controller", "depart": "mission"}
 SHARES = ("plan_perch",) * 12 + ("plan_powerline",) + ("goal",) * 6 + ("set_controller",) * 2 + ("parameters",) * 6 + ("abort", "depart")
-FREE = {"plan_perch": ("current", "start_time"), "plan_powerline": ("start_time", "lines.0.covariance", "lines.0.direction_sigma", "lines.0.observations", "perch_pose")}
+FREE = {"plan_perch": ("current", "start_time"), "plan_powerline": ("start_time", "lines.0.covariance", "lines.0.direction_sigma",
+                                                                              "lines.0.observations", "perch_pose")}
 """Task -> fields that mean nothing in the requests here; a planner has no clock, so any time may be planned for."""
 
 
@@ -192,9 +193,11 @@ def _some_goal(rng: random.Random) -> tuple[PerchGoal, bool]:
     """A goal, and whether it makes no sense."""
     values: dict[str, Any] = {"mode": rng.choice((0, 0, 0, 1, 2, 9, 255)), "attempts": rng.choice((0, 1, 3, 2**32 - 1)), "replan": rng.random() < 0.5}
     bad = values["mode"] in (2, 9, 255) or values["attempts"] > 100  # an inspection needs waypoints
-    for name, sensible, rest in (("takeoff_height", (math.nan, 1.2, 9.9), (math.inf, 0.0, -1.0, 1e308)), ("search_timeout", (math.nan, 5.0), (-1.0, 0.0, math.inf)),
+    for name, sensible, rest in (("takeoff_height", (math.nan, 1.2, 9.9), (math.inf, 0.0, -1.0, 1e308)),
+                                 ("search_timeout", (math.nan, 5.0), (-1.0, 0.0, math.inf)),
                                  ("inclination_hint", (math.nan, 1.5), (4.0, -1.0, math.inf)), ("perch_pitch", (0.0, 3.1), (math.nan, -0.1, 7.0)),
-                                 ("search_frame", ("", "", "map"), ("odom", "x" * 9999)), ("perch_point", ((4.0, 0.0, 4.2),), ((math.nan, 0.0, 0.0), (1e308,) * 3)),
+                                 ("search_frame", ("", "", "map"), ("odom", "x" * 9999)),
+                                 ("perch_point", ((4.0, 0.0, 4.2),), ((math.nan, 0.0, 0.0), (1e308,) * 3)),
                                  ("search_position", ((0.0, 0.0, 1.0),), ((math.inf, 0.0, 1.0), (0.0, 0.0, -5.0), (1e9, 0.0, 1.0)))):
         wrong = rng.random() < 0.1
         values[name] = rng.choice(rest if wrong else sensible)

@@ -177,7 +177,7 @@ class Pilot:
         for node, service in SERVICES.items():
             if node in scenario.nodes:
                 name = self._node.resolve_service_name(service)
-                self._spin_until(lambda: self._node.count_services(name) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
+                self._spin_until(lambda name=name: self._node.count_services(name) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
         progress = _Progress(self._time)
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
         self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")

@@ -111,7 +111,7 @@ class Gate:
             from_inner, inner = await asyncio.open_connection(*self._behind)
             inner.write(header)
             await asyncio.gather(_pass_on(reader, inner), _pass_on(from_inner, writer))
-        except (OSError, asyncio.TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.CancelledError):
+        except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.CancelledError):
             pass  # no handshake, or the end of a connection
         finally:
             for end in filter(None, (writer, inner)):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Sequence
+from typing import Protocol
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def _score_followed(last: LineObservation, seen: LineObservation) -> float:
     turned = float(np.arccos(np.clip(abs(seen.normal @ normal), 0.0, 1.0)))
     # along the arc: the pieces must overlap
     along = np.cross(normal, last.middle)
-    spans = [sorted((float(np.arcsin(np.clip(r @ along, -1, 1))) for r in o.ends_W)) for o in (last, seen)]
+    spans = [sorted(float(np.arcsin(np.clip(r @ along, -1, 1))) for r in o.ends_W) for o in (last, seen)]
     gap = max(spans[0][0], spans[1][0]) - min(spans[0][1], spans[1][1])
     if gap > 0.05 or turned > 0.35:
         return np.inf
@@ -92,7 +93,7 @@ def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings
             scores[i, near[~np.array(as_wide)]] = np.inf
     answer: list[int | None] = [-1] * len(seen)
     taken: set[int] = set()
-    order = sorted(((scores[i, j], i, j) for i in range(len(seen)) for j in range(len(tracks)) if scores[i, j] <= 1.0))
+    order = sorted((scores[i, j], i, j) for i in range(len(seen)) for j in range(len(tracks)) if scores[i, j] <= 1.0)
     done: set[int] = set()
     for value, i, j in order:
         if i in done or j in taken:

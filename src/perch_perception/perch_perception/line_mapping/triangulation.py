@@ -13,7 +13,7 @@ distance, and so the radius; near the wire, where the camera flies towards it, t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Sequence
+from collections.abc import Sequence
 
 import numpy as np
 

@@ -154,7 +154,7 @@ class Msckf:
     def _spend(self, spanning: dict[int, Track]) -> dict[int, Track]:
         """Use spanning tracks that found no place as landmarks as if they had ended here; they begin anew."""
         spent = {}
-        for i, track in spanning.items():
+        for i in spanning:
             if i not in self.state.landmarks and len(spent) < self.config.filter.tracks_per_frame:
                 spent[i] = self.tracks.by_id[i]
                 self.tracks.by_id[i] = Track()
