@@ -11,7 +11,7 @@ from pathlib import Path
 
 from perch_setup import ROOT, enter, leave_quietly_on_interrupt
 
-GROUPS = ("planner", "perception", "control", "powerline", "sim", "ros")
+GROUPS = ("planner", "perception", "control", "powerline", "sim", "autopilot", "ros")
 EXAMPLES = """examples:
   python3 scripts/bench.py                          every group
   python3 scripts/bench.py planner                  one group

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
 from perch_core.config import part, quantity, text
 from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
-from perch_core.vehicle import GRAVITY, load_vehicle
+from perch_core.vehicle import load_vehicle
 from perch_autopilot import msp
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.keeper import KeeperLink
@@ -55,7 +55,7 @@ class Betaflight(Component[BetaflightParameters]):
         super().__init__(config)
         vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        hover, descent = (self._sticks.channels((0.0, 0.0, 0.0), share * GRAVITY)[2] for share in (1.0, config.watchdog.descent))
+        hover, descent = self._sticks.carrying(1.0), self._sticks.carrying(config.watchdog.descent)
         self._link, self._parser = KeeperLink(config.wire, config.watchdog, hover, descent), msp.Parser()
         try:
             self.version = self._greet()

@@ -13,15 +13,11 @@ from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 
 _SET = re.compile(r"set\s+(\w+)\s*=\s*(\S.*)")
-_ANSWER_TIME = 5.0  # for one line [s]
+_ANSWER_TIME = 20.0  # for one line, on a busy machine [s]
 
 
 class CliError(PerchError):
     """The firmware's command line does not answer, or does not take a line."""
-
-
-class CliSilent(CliError):
-    """The command line does not answer."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +82,14 @@ class Cli:
         """The answer to a line.
 
         Raises:
-            CliSilent: there is none.
+            CliError: there is none.
         """
         self._send((line + end).encode())
         text, last = b"", time.monotonic() + _ANSWER_TIME
         while not text.endswith(b"\n# "):
             text += self._receive(0.1)
             if time.monotonic() > last:
-                raise CliSilent(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s: {text[-80:]!r}")
+                raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s: {text[-80:]!r}")
         return text.decode("ascii", "replace")
 
     def apply(self, configuration: Configuration) -> None:

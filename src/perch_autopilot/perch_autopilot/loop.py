@@ -7,15 +7,18 @@ from typing import Protocol
 
 import numpy as np
 
+from perch_core.values import NANOSECONDS
 from perch_core.vehicle import Vehicle
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.firmware import FirmwareError
 from perch_autopilot.rates import Sticks, rate_curves
-from perch_autopilot.sitl import GRAVITY, LEVEL, STARTS, Sitl
-from perch_autopilot.watchdog import CENTRED, OFF, ON
+from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
+from perch_autopilot.watchdog import CENTRED, OFF, ON, Watchdog, WatchdogSettings
 
-_TOGGLE, _LAST = 600, 20000    # cycles from one attempt to arm to the next, and in all: calibrations last 4000
+_SETTLED = 500            # cycles on the bench before it is armed: a radio that has just come counts after half a second
+_LAST = 500               # cycles in which it arms there, or does not at all
 _STILL = (0.0, 0.0, 0.0)
+_WATCHDOG = WatchdogSettings(arming=0.0)  # the throttle follows when the motors turn: they are seen here
 
 
 class Reading(Protocol):
@@ -28,8 +31,15 @@ class Reading(Protocol):
 class FirmwareLoop:
     """Flies the simulated vehicle as its autopilot: it sees what the IMU reads, and moves sticks and switches.
 
-    Before the flight it stands on a bench, until the firmware has calibrated its sensors and has armed once.
+    What it is told when commands stop is the watchdog's, as on a vehicle. Before the flight it arms once on a bench.
+
+    Attributes:
+        sitl: the firmware.
+        watchdog: what comes of commands that stop.
+        watches: commands that stop are its own business.
     """
+
+    watches = True
 
     def __init__(self, vehicle: Vehicle) -> None:
         """
@@ -41,51 +51,51 @@ class FirmwareLoop:
             NamespaceError, CliError, ConfigError: see `Sitl`, `load_configuration`.
         """
         loaded = load_configuration(vehicle.actuation.firmware)
-        self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
+        self.sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
+        self.watchdog = Watchdog(_WATCHDOG, self.sticks.carrying(1.0), self.sticks.carrying(_WATCHDOG.descent))
         self._low, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self._idle = float(loaded.settings.get("motor_idle", 550)) * 1e-4  # motors of an armed vehicle with the throttle down
-        self._armed, self._turning, self._channels = False, False, CENTRED
-        for start in range(1, STARTS + 1):
-            self.sitl = Sitl(loaded)
-            try:
-                self._arm_once()
+        self._turning = False
+        self.sitl = Sitl(loaded)
+        try:
+            for _ in range(_SETTLED):
+                self._bench(OFF, "disarm")
+            self._bench(ON, "arm")
+            self._bench(OFF, "disarm")
+        except BaseException:
+            self.sitl.close()
+            raise
+
+    def _bench(self, switch: int, what: str) -> None:
+        """Motors turn with the arming switch, and stand without it."""
+        for _ in range(_LAST):
+            motors = self.sitl.step(_STILL, GRAVITY, LEVEL, (*CENTRED, switch))
+            if min(motors) > 0.5 * self._idle if switch == ON else max(motors) == 0.0:
                 return
-            except BaseException as error:
-                self.sitl.close()
-                if not isinstance(error, FirmwareError) or start == STARTS:  # now and then it starts with a sensor that it does not believe
-                    raise
-
-    def _arm_once(self) -> None:
-        for cycle in range(_LAST):
-            if min(self._cycle(cycle % _TOGGLE > _TOGGLE // 2)) > 0.5 * self._idle:
-                break
-        else:
-            raise FirmwareError("Betaflight's firmware does not arm: " + ", ".join(self.sitl.status().refusals))
-        for _ in range(_TOGGLE):
-            motors = self._cycle(False)
-        if max(motors) > 0.0:
-            raise FirmwareError("Betaflight's firmware does not disarm")
-
-    def _cycle(self, armed: bool) -> tuple[float, ...]:
-        return self.sitl.step(_STILL, GRAVITY, LEVEL, (*CENTRED, ON if armed else OFF))
+        reasons = ", ".join(self.sitl.status().refusals) or "it gives no reason"
+        raise FirmwareError(f"Betaflight's firmware does not {what}: {reasons}")
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float) -> None:
-        """Take a command: body rates in B [rad/s], collective thrust / mass [m/s^2]."""
-        self._armed, self._channels = armed, self._sticks.channels(rates, thrust)
+        """Take a command at a time [ns]: body rates in B [rad/s], collective thrust / mass [m/s^2]."""
+        self.watchdog.command(now / NANOSECONDS, armed, self.sticks.channels(rates, thrust))
 
     def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: Reading) -> np.ndarray:
-        """Rotor speeds that the motors aim at in the period that begins now, shape (4,) [rad/s]; zero where they stand.
+        """Rotor speeds that the motors aim at in the period that begins now [ns], shape (4,) [rad/s]; zero where they stand.
 
         Args:
             now, x, speeds: as in `perch_sim.inner_loop`; of the state only the orientation goes to the firmware, whose rate loop does not
                 look at it.
             sample: what the IMU has read last.
         """
-        sticks = self._channels if self._armed and self._turning else CENTRED  # it arms with the throttle down only
-        motors = np.array(self.sitl.step(sample.gyro, sample.accel, (x[6], x[3], x[4], x[5]), (*sticks, ON if self._armed else OFF)))
+        motors = np.array(self.sitl.step(sample.gyro, sample.accel, (x[6], x[3], x[4], x[5]), self.channels(now / NANOSECONDS)))
         turn = motors > 0.5 * self._idle
         self._turning = bool(turn.all())
         return np.where(turn, self._low + self._span * np.clip((motors - self._idle) / (1.0 - self._idle), 0.0, 1.0), 0.0)
+
+    def channels(self, now: float) -> Sequence[int]:
+        """What the firmware's receiver has at a time [s], pulse widths [us]."""
+        channels = self.watchdog.channels(now)
+        return channels if self._turning else (*CENTRED, *channels[len(CENTRED):])  # it arms with the throttle down only
 
     def close(self) -> None:
         """End the firmware."""

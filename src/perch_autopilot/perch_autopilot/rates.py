@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import degrees, sqrt
 
 from perch_core.errors import ConfigError
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import GRAVITY, Vehicle
 
 CENTRE, HALF, LOW, HIGH = 1500, 500, 1000, 2000  # pulse widths [us]
 AXES = ("roll", "pitch", "yaw")
@@ -74,6 +74,10 @@ class Sticks:
         """Throttle 0..1 at which the four rotors together give a thrust per mass [m/s^2]: their speed is linear in it."""
         speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient))
         return min(max((speed - self._idle) / self._span, 0.0), 1.0)
+
+    def carrying(self, share: float) -> int:
+        """Throttle [us] that carries a share of the weight."""
+        return self.channels((0.0, 0.0, 0.0), share * GRAVITY)[2]
 
     def channels(self, rates: tuple[float, float, float], thrust: float) -> tuple[int, int, int, int]:
         """Pulse widths [us] of roll, pitch, throttle, yaw.

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-import select
+import os
 import shutil
 import struct
 import tempfile
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from perch_core.timing import CONTROL_PERIOD
 from perch_autopilot import firmware, msp
-from perch_autopilot.configuration import Cli, CliError, CliSilent, Configuration
+from perch_autopilot.configuration import Cli, CliError, Configuration
 from perch_autopilot.firmware import FirmwareError
 from perch_autopilot.namespace import IsolatedProgram
 
@@ -28,16 +28,16 @@ CHANNELS = 16
 _FROM_PACKET = (2, 1, 3, 0)       # front left, rear left, rear right, front right
 _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
 _START = 10.0                     # for the firmware to open its port [s]
-_ANSWER = 1.0                     # for motors after a state; a busy machine takes its time [s]
-_TRIES = 5                        # packets that stay unanswered before the firmware counts as frozen
-STARTS = 4                        # of one that freezes
+_ANSWER = 5.0                     # for motors after a state; a busy machine takes its time [s]
+_FOLDER = "perch-betaflight-"     # in which it finds its memory; removed when it has read it
+_ORPHAN = 600.0                   # age of a folder whose owner was killed before that [s]
 _EEPROM = "eeprom.bin"
 LEVEL = (1.0, 0.0, 0.0, 0.0)      # w x y z
 GRAVITY = (0.0, 0.0, 9.81)
 
 
 class Frozen(FirmwareError):
-    """The firmware runs but does not answer: it has to be started again."""
+    """The firmware runs but does not answer."""
 
 
 class Sitl:
@@ -45,7 +45,6 @@ class Sitl:
 
     Attributes:
         time: of the last packet [s].
-        starts: how often it was started until it answered.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -59,44 +58,39 @@ class Sitl:
             CliError: the configuration is refused, or not what is read back.
         """
         self._program, self._configuration = firmware.found(), configuration
-        self._folder = tempfile.TemporaryDirectory(prefix="perch-betaflight-")
         self._running: IsolatedProgram | None = None
-        self.time, self.starts = 0.0, 0
-        self._late = False
+        self.time = 0.0
+        remove_orphans()
         try:
-            shutil.copy2(self._configured(), Path(self._folder.name, _EEPROM))
-            self._start()
+            with tempfile.TemporaryDirectory(prefix=_FOLDER) as folder:
+                memory = Path(folder, _EEPROM)
+                shutil.copyfile(self._configured(memory), memory)
+                self._launch(memory)
+                self.step((0.0, 0.0, 0.0), GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
         except BaseException:
             self.close()
             raise
 
     # -- start -------------------------------------------------------------------------------------------------------
 
-    def _configured(self) -> Path:
-        """The firmware's memory with the configuration in it, made once."""
+    def _configured(self, draft: Path) -> Path:
+        """The firmware's memory with the configuration in it, made once by a firmware whose own is `draft`."""
         memory = self._program.parent / f"{self._configuration.identity}.eeprom"
         if not memory.exists():
-            self._command_line().apply(self._configuration)
+            self._launch(draft)
+            Cli(self.send, self.receive).apply(self._configuration)
             self._running.process.wait(_START)  # saving restarts it, which here is its end
-            self._command_line().check(self._configuration)
-            self._stop()
-            draft = memory.with_suffix(f".{id(self)}")
-            shutil.copy2(Path(self._folder.name, _EEPROM), draft)
-            draft.replace(memory)
+            self._launch(draft)
+            Cli(self.send, self.receive).check(self._configuration)
+            self.close()
+            made = memory.with_suffix(f".{os.getpid()}-{id(self)}")
+            shutil.copyfile(draft, made)
+            made.replace(memory)
         return memory
 
-    def _command_line(self) -> Cli:
-        """Of a firmware that has just been started, again where it freezes."""
-        for _ in range(STARTS - 1):
-            self._launch()
-            with suppress(CliSilent):
-                return Cli(self.send, self.receive)
-        self._launch()
-        return Cli(self.send, self.receive)
-
-    def _launch(self) -> None:
-        self._stop()
-        self._running = IsolatedProgram([self._program], Path(self._folder.name), MOTORS)
+    def _launch(self, memory: Path) -> None:
+        self.close()
+        self._running = IsolatedProgram([self._program], memory.parent, MOTORS)
         self._running.received.settimeout(_ANSWER)
         last = time.monotonic() + _START
         while True:
@@ -109,18 +103,6 @@ class Sitl:
                 if time.monotonic() > last:
                     raise Frozen(f"Betaflight's firmware does not open its port {SERIAL} within {_START:g} s") from None
                 time.sleep(0.01)
-
-    def _start(self) -> None:
-        while True:
-            self.starts += 1
-            try:
-                self._launch()
-                self.time = 0.0
-                self.step((0.0, 0.0, 0.0), GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
-                return
-            except Frozen:
-                if self.starts >= STARTS:
-                    raise
 
     # -- cycles ------------------------------------------------------------------------------------------------------
 
@@ -144,20 +126,15 @@ class Sitl:
         p, q, r = gyro
         x, y, z = force
         w, i, j, k = q_wxyz
-        if self._late:  # a packet that was repeated may have been answered twice
-            self._late = bool(select.select([running.received], [], [], 0.01)[0] and running.received.recv(64))
         sticks = _STICKS.pack(self.time, *channels, *(1000,) * (CHANNELS - len(channels)))
-        for attempt in range(_TRIES):
-            stamp = self.time + attempt * 1e-5
-            running.sent.sendto(sticks, ("127.0.0.1", STICKS))
-            running.sent.sendto(_STATE.pack(stamp, p, -q, -r, -x, -y, -z, w, i, -j, -k, 0, 0, 0, 0, 0, 0, 101325.0), ("127.0.0.1", STATE))
-            try:
-                motors = _MOTORS.unpack_from(running.received.recv(64))
-            except TimeoutError:
-                continue
-            self._late = self._late or attempt > 0
-            return tuple(min(max(motors[n], 0.0), 1.0) for n in _FROM_PACKET)
-        raise Frozen(f"Betaflight's firmware has not answered {_TRIES} packets at {self.time:.3f} s")
+        running.sent.sendto(sticks, ("127.0.0.1", STICKS))
+        state = _STATE.pack(self.time, p, -q, -r, -x, -y, -z, w, i, -j, -k, 0, 0, 0, 0, 0, 0, 101325.0)
+        running.sent.sendto(state, ("127.0.0.1", STATE))
+        try:
+            motors = _MOTORS.unpack_from(running.received.recv(64))
+        except TimeoutError:
+            raise Frozen(f"Betaflight's firmware has not answered for {_ANSWER:g} s at {self.time:.3f} s") from None
+        return tuple(min(max(motors[n], 0.0), 1.0) for n in _FROM_PACKET)
 
     # -- CLI and MSP -------------------------------------------------------------------------------------------------
 
@@ -188,15 +165,19 @@ class Sitl:
                 return msp.status(frame)
         raise Frozen("Betaflight's firmware does not answer MSP")
 
-    def _stop(self) -> None:
+    def close(self) -> None:
+        """End it."""
         if self._running is not None:
             self._running.close()
             self._running = None
 
-    def close(self) -> None:
-        """End it."""
-        self._stop()
-        self._folder.cleanup()
+
+def remove_orphans() -> None:
+    """Folders of those who were killed while the firmware had not read its memory yet."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
+        with suppress(OSError):  # another process has removed it
+            if time.time() - folder.stat().st_mtime > _ORPHAN:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 __all__ = ["CliError", "Frozen", "Sitl"]

@@ -10,7 +10,6 @@ from perch_core.config import quantity
 STICKS = 4
 CENTRED = (1500, 1500, 1000, 1500)
 ON, OFF = 1900, 1000  # of a switch [us]
-ARMING = 0.2          # the throttle stays down so long, as the firmware arms with it down only [s]
 Channels = tuple[int, ...]
 
 
@@ -18,8 +17,9 @@ Channels = tuple[int, ...]
 class WatchdogSettings:
     """When a command is stale, and what follows."""
 
-    rate: float = quantity(100.0, unit="Hz", low=50.0, high=250.0, doc="of the frames that the autopilot gets, whatever happens")
-    stale_after: float = quantity(0.1, unit="s", low=0.02, high=0.25, doc="a command that is older is not sent any more: level")
+    rate: float = quantity(200.0, unit="Hz", low=50.0, high=250.0, doc="of the frames that the autopilot gets, whatever happens")
+    arming: float = quantity(0.2, unit="s", low=0.0, high=2.0, doc="the throttle stays down so long, as the firmware asks for it")
+    stale_after: float = quantity(0.04, unit="s", low=0.02, high=0.25, doc="a command that is older is not sent any more: level")
     descend_after: float = quantity(0.5, unit="s", low=0.0, high=0.9, doc="after so long without a command, level: descend")
     disarm_after: float = quantity(4.0, unit="s", low=0.5, high=60.0, doc="after so long without a command: motors off")
     descent: float = quantity(0.9, low=0.5, high=1.0, doc="thrust of the descent as a share of the weight")
@@ -74,7 +74,7 @@ class Watchdog:
             self.mode = Mode.DISARMED
         elif age <= limits.stale_after:
             self.mode = Mode.FOLLOWING
-            return (*(self._sticks if now - self._since >= ARMING else CENTRED), ON, OFF)
+            return (*(self._sticks if now - self._since >= limits.arming else CENTRED), ON, OFF)
         elif age <= limits.disarm_after:
             self.mode = Mode.LEVEL if age <= limits.descend_after else Mode.DESCENDING
             return (1500, 1500, self._hover if self.mode is Mode.LEVEL else self._descent, 1500, ON, ON)

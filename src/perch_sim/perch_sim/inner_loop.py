@@ -101,7 +101,13 @@ def targets(w, speeds, rates, thrust, J, mixing, coefficient, low, high, motor_l
 
 
 class InnerLoop:
-    """Takes body rates, or attitudes, with thrust; says what the motors aim at."""
+    """Takes body rates, or attitudes, with thrust; says what the motors aim at.
+
+    Attributes:
+        watches: what happens when commands stop is its own business; not of this one.
+    """
+
+    watches = False
 
     def __init__(self, vehicle: Vehicle, lag_factor: float = 1.0) -> None:
         """

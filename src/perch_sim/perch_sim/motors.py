@@ -56,9 +56,11 @@ class Motors:
         if armed:
             self._speeds = np.array([min(max(s, self._low), self._high) for s in values])
 
-    def aim(self, speeds: np.ndarray) -> None:
-        """Speeds of an inner loop, within the armed range (4,) [rad/s]: they count as long as its last command does."""
+    def aim(self, speeds: np.ndarray, now: int | None = None) -> None:
+        """Speeds of an inner loop, within the armed range (4,) [rad/s]: they count as long as its last command does, or, with a time
+        [ns], from then on: a loop that watches over its commands itself."""
         self._speeds = speeds
+        self._received = self._received if now is None else now
 
     def target(self, now: int) -> np.ndarray:
         """Speeds that the rotors aim at, (4,) [rad/s]."""

@@ -110,7 +110,8 @@ class Simulation:
             self._starts = self.motors.starts
             self.plant.release()
         if self.loop is not None:
-            self.motors.aim(self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed, self._sample))
+            speeds = self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed, self._sample)
+            self.motors.aim(speeds, self.time if self.loop.watches else None)
         result = self.plant.advance(self.motors.target(self.time))
         for state in result.states:
             self._history.append(state)

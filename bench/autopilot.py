@@ -1,0 +1,161 @@
+"""The watchdog and the pilot's takeover on Betaflight's own firmware, in simulated time: commands stop in each phase of a perch.
+
+A perch on `surface_90` (modelled VIO and tags) through the firmware; the commands go to the process that holds the wire (`Keeper`), from
+it over MSP to the firmware, whose self-level mode levels the simulated body. They stop for 50 ms to 5 s, or for good: the node is killed,
+or hangs. Times count from the last command that has reached the keeper. Needs the firmware (`python3 scripts/betaflight.py build`).
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+
+from closed_loop.kept_loop import KeptLoop  # noqa: E402
+from harness import Figure, figure  # noqa: E402
+
+from perch_autopilot.watchdog import OFF, Mode  # noqa: E402
+from perch_core import so3  # noqa: E402
+from perch_core.vehicle import load_vehicle  # noqa: E402
+from perch_eval.goal import goal_of  # noqa: E402
+from perch_eval.in_process import Loop, arrange  # noqa: E402
+from perch_sim.scenario import load_scenario  # noqa: E402
+
+SCENARIO = replace(load_scenario("surface_90"), vehicle="betaflight")
+LEVEL = 10.0                              # tilt that counts as level [deg]
+PHASES = {"take-off": ("take_off", 0.6), "hover": ("searching", 0.3), "way to the wall": ("tracking", 0.5),
+          "turn begins": ("contact", -0.35), "turn": ("contact", -0.25), "turn, late": ("contact", -0.15), "perched": ("perched", 0.3)}
+"""Name -> after the beginning of which phase of the mission [s]; `contact`: before the first touch."""
+GAPS = (0.05, 0.2, 0.5, 1.0, 5.0)         # commands stop for so long [s]; then they go on
+WATCHED = 6.0                             # after they have stopped [s]
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What came of commands that stopped; times from the last command [s], nan: it did not happen before the next, or a touch.
+
+    Attributes:
+        tilt: of the body at the last command [deg].
+        most: largest tilt after it [deg].
+        told: the autopilot gets "level", or "off".
+        levelled: the body is level, and stays so.
+        down: it is told to descend, or motors are off.
+        held: the last command was sent for so long.
+    """
+
+    tilt: float
+    most: float
+    told: float
+    levelled: float
+    down: float
+    held: float
+
+
+def begun(seed: int = 1) -> tuple[Loop, KeptLoop]:
+    """A flight before its first step, with the goal sent."""
+    loop = arrange(SCENARIO, seed)
+    simulation = loop.vehicle.simulation
+    simulation.loop.close()
+    simulation.loop = kept = KeptLoop(load_vehicle(SCENARIO.vehicle))
+    loop.send("mission", goal_of(SCENARIO))
+    return loop, kept
+
+
+def moments() -> dict[str, float]:
+    """When each of `PHASES` is in the undisturbed flight [s]."""
+    loop, kept = begun()
+    touched: list[float] = []
+    loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
+    try:
+        while not any(phase == "perched" for _, phase, _ in loop.trace.phases):
+            loop.step()
+    finally:
+        loop.close()
+    at = {phase: time for time, phase, _ in reversed(loop.trace.phases)}
+    at["contact"] = min(time for time in touched if time > at["tracking"])
+    return {name: at[phase] + offset for name, (phase, offset) in PHASES.items()}
+
+
+def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
+    """Fly, and stop the commands.
+
+    Args:
+        at: from this time on [s].
+        gap: for so long [s]; None: for good.
+        kill: the node is killed; else it says nothing.
+    """
+    loop, kept = begun()
+    touched: list[float] = []
+    loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
+    try:
+        while loop.time < at:
+            loop.step()
+        kept.kill() if kill else setattr(kept, "cut", True)
+        last, touched[:] = kept.heard, []
+        flying = loop.vehicle.simulation.plant.rotor_speed.min() > 0.0
+        until, rows = last + min(gap or WATCHED, WATCHED), []
+        while loop.time < until and not touched:
+            rows.append((loop.time - last, _tilt(loop), kept.watchdog.mode))
+            loop.step()
+    finally:
+        loop.close()
+    t, tilt = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    modes = [row[2] for row in rows]
+
+    def first(which: set[Mode]) -> float:
+        return next((float(time) for time, mode in zip(t, modes) if mode in which), float("nan"))
+
+    above = np.flatnonzero(tilt > LEVEL)
+    after = 0 if above.size == 0 else above[-1] + 1
+    followed = [float(time) for time, mode in zip(t, modes) if mode is Mode.FOLLOWING]
+    return Stop(tilt[0], tilt.max(), first({Mode.LEVEL, Mode.DESCENDING, Mode.DISARMED}),
+                float(t[after]) if after < len(t) and flying else float("nan"), first({Mode.DESCENDING, Mode.DISARMED}),
+                max(followed, default=0.0))
+
+
+def taken_over(at: float) -> float:
+    """From the pilot's switch to the first cycle in which the motors stand, as his arming switch is off [s]."""
+    loop, kept = begun()
+    try:
+        while loop.time < at:
+            loop.step()
+        kept.radio[4], kept.radio[6], begin = OFF, OFF, loop.time
+        while np.any(kept.aimed):
+            loop.step()
+            if loop.time > begin + 1.0:
+                return float("inf")
+        return loop.time - begin
+    finally:
+        loop.close()
+
+
+def _tilt(loop: Loop) -> float:
+    x = loop.vehicle.simulation.state.x
+    return float(np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x[3:7])[2, 2], -1.0, 1.0))))
+
+
+def figures(quick: bool) -> list[Figure]:
+    """Every phase with every gap; quick: commands stop for good only."""
+    found, out = {}, []
+    print(f"{'phase':16s} {'stop':>8s} {'tilt':>5s} {'most':>5s} {'told':>6s} {'level':>6s} {'down':>6s} {'held':>6s}   [deg], [s]")
+    for name, at in (when := moments()).items():
+        for gap, kill in ((None, True), *(() if quick else ((None, False), *((gap, False) for gap in GAPS)))):
+            one = found[name, gap, kill] = stopped(at, gap, kill)
+            word = "killed" if kill else "hung" if gap is None else f"{gap:g} s"
+            times = " ".join(f"{value:6.3f}" for value in (one.told, one.levelled, one.down, one.held))
+            print(f"{name:16s} {word:>8s} {one.tilt:5.0f} {one.most:5.0f} {times}", flush=True)
+    flying = {key: one for key, one in found.items() if key[0] != "perched"}
+    out.append(figure("last command held", "s", [one.held for one in flying.values()], 0.05, "max <="))
+    long = [one for (_, gap, _), one in flying.items() if gap is None or gap > 0.3]
+    upright = [one.levelled for one in long if one.most < 90.0 and np.isfinite(one.levelled)]
+    beyond = [one.levelled for one in long if one.most >= 90.0 and np.isfinite(one.levelled)]
+    out.append(figure(f"level within {LEVEL:g} deg, body never beyond 90 deg", "s", upright, 0.3, "max <="))
+    if beyond:
+        out.append(figure(f"level within {LEVEL:g} deg, body beyond 90 deg", "s", beyond, 0.3, "max <="))
+    out.append(figure("descent or motors off", "s", [one.down for one in long if np.isfinite(one.down)], 1.0, "max <="))
+    out.append(figure("pilot takes over", "s", [taken_over(at) for name, at in when.items() if name != "perched"], 0.05, "max <="))
+    return out

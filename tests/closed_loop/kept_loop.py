@@ -1,0 +1,140 @@
+"""Betaflight's firmware as a simulated vehicle's autopilot, spoken to as on a vehicle: the node's commands go to a keeper, and from it
+over MSP to the firmware, whose receiver hears the pilot's radio. All of it in simulated time, so that the same flight is the same again."""
+
+from __future__ import annotations
+
+import socket
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from closed_loop.plant import Plant
+from perch_autopilot import msp
+from perch_autopilot.keeper import COMMAND, Keeper
+from perch_autopilot.loop import FirmwareLoop
+from perch_autopilot.watchdog import OFF, ON, Watchdog, WatchdogSettings
+from perch_core import so3
+from perch_core.timing import CONTROL_PERIOD_NS
+from perch_core.values import NANOSECONDS
+from perch_core.vehicle import Vehicle
+
+_PATIENCE = 20.0  # for the firmware's answer to a frame [s]
+
+
+class KeptLoop(FirmwareLoop):
+    """Of a node that can be cut off, and be killed, and of a pilot.
+
+    Attributes:
+        radio: the pilot's channels [us]: sticks, arming, level, hand-over to the companion computer.
+        cut: commands do not reach the keeper.
+        heard: time of the last command that has reached it [s].
+        aimed: what the motors aim at, (4,) [rad/s].
+    """
+
+    def __init__(self, vehicle: Vehicle, settings: WatchdogSettings = WatchdogSettings()) -> None:
+        super().__init__(vehicle)
+        self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
+        self.watchdog = Watchdog(settings, self.sticks.carrying(1.0), self.sticks.carrying(settings.descent))
+        self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._node.setblocking(False)
+        self._time, self._parser = 0.0, msp.Parser()
+        self._keeper = Keeper(f"fd:{self.sitl.file}", theirs, self.watchdog, settings.rate, lambda: self._time)
+        self._killed = False
+        self.aimed = np.zeros(4)
+
+    def command(self, now, armed, rates, thrust):
+        if not (self.cut or self._killed):
+            self.heard = now / NANOSECONDS
+            self._node.send(b"C" + COMMAND.pack(armed, *self.sticks.channels(rates, thrust)))
+
+    def kill(self) -> None:
+        """End the node."""
+        self._killed = True
+        self._node.close()
+
+    def speeds(self, now, x, speeds, sample):
+        self.aimed = super().speeds(now, x, speeds, sample)
+        return self.aimed
+
+    def channels(self, now):
+        self._time = now
+        spoken = now >= self._keeper._due
+        self._keeper.work(0.0)
+        if spoken:  # a frame counts from the cycle on that follows its answer
+            self._answered()
+        return tuple(self.radio)
+
+    def _answered(self) -> None:
+        last = time.monotonic() + _PATIENCE
+        while time.monotonic() < last:
+            if self._killed:  # nobody hears the answer
+                if self._keeper._wire.read(1.0):
+                    return
+                continue
+            self._keeper.work(1.0)
+            while True:
+                try:
+                    word = self._node.recv(8192)
+                except BlockingIOError:
+                    break
+                if word[:1] == b"D" and any(frame.command == msp.SET_RAW_RC for frame in self._parser.feed(word[1:])):
+                    return
+        raise AssertionError("the firmware does not answer the keeper")
+
+    def close(self) -> None:
+        self._node.close()
+        super().close()
+
+
+@dataclass
+class Felt:
+    """What an IMU reads, see `FirmwareLoop.speeds`."""
+
+    gyro: np.ndarray
+    accel: np.ndarray
+
+
+class Body:
+    """A free body with rotors behind a `KeptLoop`, 500 m up.
+
+    Attributes:
+        loop: its autopilot.
+        plant: the body.
+        time: [s].
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.loop, self.plant = KeptLoop(vehicle), Plant(vehicle, p=np.array([0.0, 0.0, 500.0]))
+        self._step, self._force = 0, np.array([0.0, 0.0, 9.81])
+
+    @property
+    def time(self):
+        return self._step * CONTROL_PERIOD_NS / NANOSECONDS
+
+    @property
+    def tilt(self) -> float:
+        """[deg]."""
+        return float(np.degrees(np.arccos(np.clip(self.plant.R[2, 2], -1.0, 1.0))))
+
+    def step(self, armed: bool, rates=(0.0, 0.0, 0.0), moving: bool = True) -> None:
+        """A period with a command, thrust that of a hover; on a bench where the body is not `moving`."""
+        now = self._step * CONTROL_PERIOD_NS
+        self.loop.command(now, armed, rates, 9.81)
+        x = np.r_[np.zeros(3), so3.quat_from_matrix(self.plant.R), np.zeros(6)]
+        speeds = self.loop.speeds(now, x, np.zeros(4), Felt(self.plant.w, self._force))
+        if moving:
+            self.plant.advance(speeds)
+            self._force = self.plant.specific_force_B
+        self._step += 1
+
+    def hover(self) -> None:
+        """Armed, and settled: half a second."""
+        for k in range(500):
+            self.step(k >= 50, moving=k >= 250)
+
+    def found(self, axis, tilt: float, rate: float) -> None:
+        """Tilted about an axis by an angle [deg], turning at a rate [rad/s] as it is told to, for 50 ms."""
+        self.plant.R, self.plant.w = so3.exp(np.radians(tilt) * np.array(axis)), rate * np.array(axis)
+        for _ in range(25):
+            self.step(True, tuple(rate * np.array(axis)))
