@@ -33,6 +33,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 LOUD = ("log", "diagnostics")  # outputs that are no topics of their own
 FEW = 300                      # calls whose durations are kept
@@ -93,6 +94,19 @@ class ComponentNode(Node):
         subscription = self.create_subscription(message, channel, lambda _: None, profile, raw=True)
         self._unwatched.add(subscription)
         return subscription
+
+    def take_time_here(self) -> None:
+        """Simulation time of a vehicle in this process comes as values do: a message of it to every node, 100 times a second, makes
+        steps late. All nodes of the process are there by now."""
+        for subscription in tuple(self.subscriptions):
+            topic = subscription.topic_name
+            if subscription.msg_type is ClockMessage and not subscription.raw and self.wiring.writer(topic) is not None:
+                self.wiring.add_reader(topic, partial(self._pass_time, subscription.callback))
+                self.destroy_subscription(subscription)
+
+    @staticmethod
+    def _pass_time(take: Callable[[ClockMessage], None], stamp: int) -> None:
+        take(topics.topic("/clock").to_message(stamp))
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 

@@ -128,6 +128,7 @@ def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
 def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
     """Connect nodes that share a process; all of them are there by now."""
     for one in nodes:
+        one.take_time_here()
         executor.add_node(one)
         one.connect()
     for one in nodes:
