@@ -48,12 +48,11 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=10000, help="problems (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
     parser.add_argument("--step", type=float, default=1e-4, help="sampling of the verifier [s] (default: %(default)s)")
-    parser.add_argument("--rotors", action="store_true", help="the thrust of each rotor keeps its range in every plan")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     arguments = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    vehicle, settings = load_vehicle("snapdragon"), PerchSettings(rotors="required" if arguments.rotors else "preferred")
+    vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
     codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
     begin = time.time()
     try:
@@ -71,7 +70,7 @@ def main() -> int:
             else:
                 times.append(time.perf_counter() - started)
                 durations.append(answer.duration)
-                need = requirements(problem, settings, vehicle, rotors=arguments.rotors)
+                need = requirements(problem, settings, vehicle)
                 findings = verify(answer.trajectory.durations, answer.trajectory.coefficients, need, arguments.step)
                 broken += [[seed, f.requirement, f.excess, f.time] for f in findings]
             done += 1
@@ -81,7 +80,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     ms = 1e3 * np.array(times or [np.nan])
-    result = {"problems": done, "first_seed": arguments.first, "rotors": arguments.rotors, "plans": len(times), "refusals": dict(codes),
+    result = {"problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
               "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}

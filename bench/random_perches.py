@@ -41,10 +41,10 @@ def random_problem(rng: np.random.Generator) -> PerchProblem:
     return PerchProblem(start, surface, tuple(Waypoint(p) for p in points), velocity)
 
 
-def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, rotors: bool = True) -> Requirements:
-    """What was asked, in the plain numbers of the verifier; with or without the thrusts of the single rotors."""
+def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
+    """What was asked, in the plain numbers of the verifier."""
     limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
-    each = Rotors(np.array(vehicle.inertia), vehicle.allocation, (vehicle.thrust_min, vehicle.thrust_max))
+    each = Rotors(np.array(vehicle.inertia), vehicle.allocation, limits.rotor_thrust)
     return Requirements(
         start=np.array([start.p, start.v, start.a, start.j]), start_yaw=(start.yaw, start.yaw_rate),
         waypoints=np.array([w.p for w in problem.waypoints]).reshape(-1, 3), p_S=surface.p_WS, s1=surface.R_WS[:, 0],
@@ -53,7 +53,7 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
         tube=(settings.tube_time, settings.tube_step, settings.tube_tolerance, settings.tube_floor), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
-        rotors=each if rotors else None)
+        rotors=each)
 
 
 def paper_like_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:

@@ -26,8 +26,7 @@ def mapping(name: str = "surface_90") -> dict:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_example_has_a_plan(name):
     problem, settings, vehicle = read_problem(mapping(name), name)
-    broken = {c.quantity for c in plan(problem, settings, vehicle).certificates if not c.holds}
-    assert broken == ({"rotor_thrust"} if name == "ceiling" else set())  # preferred limits, which give way there
+    assert all(c.holds for c in plan(problem, settings, vehicle).certificates)
 
 
 @pytest.mark.parametrize("change, words", [

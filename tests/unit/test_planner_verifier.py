@@ -24,9 +24,9 @@ from random_perches import requirements  # noqa: E402
 VEHICLE = load_vehicle("snapdragon")
 PROBLEM = PerchProblem(StartState((0.0, 0.0, 1.5)), PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), np.radians(70.0)),
                        (Waypoint((0.7, 0.1, 1.4)),))
-ROTORS = PerchSettings(rotors="required")
-PLAN = plan(PROBLEM, ROTORS, VEHICLE)
-NEED = requirements(PROBLEM, ROTORS, VEHICLE)
+SETTINGS = PerchSettings()
+PLAN = plan(PROBLEM, SETTINGS, VEHICLE)
+NEED = requirements(PROBLEM, SETTINGS, VEHICLE)
 
 
 def findings(coefficients=None, durations=None, **changes):

@@ -24,8 +24,6 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
     out = []
     for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, results.tolist(), table):
         minimum, at_minimum, maximum, at_maximum, holds = row
-        if quantity == "rotor_thrust":  # preferred limits are searched without them
-            holds = low <= minimum and maximum <= high
         out.append(Certificate(quantity=quantity, unit=unit, lower_limit=low, upper_limit=high, minimum=scale * minimum,
                                maximum=scale * maximum, time_of_minimum=at_minimum, time_of_maximum=at_maximum, method=method,
                                holds=bool(holds)))

@@ -156,13 +156,11 @@ class PerchSettings:
     clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of that rim from the surface")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
     solver: str = choice("daqp", options=("daqp", "osqp"), doc="quadratic programming solver; osqp where DAQP has no wheel")
-    rotors: str = choice("preferred", options=("preferred", "required"),
-                         doc="each rotor's thrust stays in its range, on samples: where a plan is soon found, or always")
-    rotor_margin: float = quantity(0.0, low=0.0, high=0.4, doc="share of a rotor's range kept free at both its ends")
+    rotor_margin: float = quantity(0.0, low=-1e3, high=0.4, doc="share of a rotor's range kept free at both its ends; negative: of what lies beyond")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
     last_segment_min: float = quantity(0.25, unit="s", low=0.05, high=5.0, doc="shortest last segment")
-    iterations_max: int = quantity(200, low=1, high=1000, doc="QPs per search")
+    iterations_max: int = quantity(100, low=1, high=1000, doc="QPs per search")
 
     def __post_init__(self) -> None:
         if self.impact_speed_max < self.impact_speed_min:
@@ -192,11 +190,6 @@ class Limits(NamedTuple):
     extension: float
     clearance: float
     rotor_thrust: tuple[float, float]
-
-    def without(self, name: str) -> Limits:
-        """The limits with one of them taken away: thrust, body_rate, speed, height, clearance or rotor_thrust."""
-        none = {"thrust": (1e-3, 1e3), "height": (-1e3, 1e3), "clearance": -1e3, "rotor_thrust": (-1e3, 1e3)}
-        return self._replace(**{name: none.get(name, 1e3)})
 
     @classmethod
     def of(cls, settings: PerchSettings, vehicle: Vehicle) -> Limits:

@@ -1,18 +1,22 @@
 """What stands in the way of a plan: the smallest set of limits whose relaxation gives one, and how little of it.
 
-Each limit is taken away alone, and the plan that there is then says by how much it would have to give at most; bisection finds
-how little is enough. Where no limit alone is enough, all are taken away, and put back one by one where there is a plan with them.
-Every value that is named was tried: with it there is a plan.
+Only limits that acted on the search can be the cause: without one that did not, it would go the same way. These are taken away one
+at a time, in the order of `_LIMITS`: first what a caller can change, last what the vehicle has. The first one without which there is
+a plan gives way, and bisection finds how little is enough. Where no limit alone is enough, all are taken away, and put back one by
+one where there is a plan with them (the deletion filter of Chinneck and Dravnieks, 1991). Every value that is named was tried: with
+it there is a plan.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import ceil, floor, inf, log10
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks, refusals
 from perch_planner.certificates import certificates
 from perch_planner.plan_checks import MAXIMUM, MINIMUM
@@ -20,9 +24,8 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
-_PROGRAMS = 40   # of each search with relaxed limits
+_PROGRAMS = 30   # of each search with relaxed limits
 _HALVINGS = 4    # of what a limit gives
-_BEYOND = 10.0   # what the vehicle does not have counts so many times as far
 
 
 class _Limit(NamedTuple):
@@ -32,27 +35,25 @@ class _Limit(NamedTuple):
         free: value that takes it away.
         code: of a refusal because of it.
         words, unit: for the message.
-        scale: a change of the setting that weighs as much as doubling or halving others; 0: its own value.
     """
 
-    free: Any
+    free: float
     code: str
     words: str
     unit: str = ""
-    scale: float = 0.0
 
 
 _LIMITS = {
-    "thrust_max": _Limit(1e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
-    "height_min": _Limit(-1e3, refusals.BOX, "height limits", "m", 1.0),
-    "height_max": _Limit(1e3, refusals.BOX, "height limits", "m", 1.0),
-    "body_rate_max": _Limit(1e3, refusals.BODY_RATE, "body-rate limit", "rad/s"),
-    "speed_max": _Limit(1e3, refusals.BOX, "speed limit", "m/s"),
+    "height_min": _Limit(-1e3, refusals.BOX, "height limits", "m"),
+    "height_max": _Limit(1e3, refusals.BOX, "height limits", "m"),
     "duration_max": _Limit(600.0, refusals.BOX, "duration_max", "s"),
-    "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m", 0.1),
-    "tangential_speed_max": _Limit(20.0, refusals.INFEASIBLE_WINDOW, "slip over the surface at contact [M:eq14]", "m/s", 1.0),
+    "speed_max": _Limit(1e3, refusals.BOX, "speed limit", "m/s"),
+    "thrust_max": _Limit(1e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "thrust_min": _Limit(1e-3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
-    "rotors": _Limit("preferred", refusals.THRUST_FLOOR, "thrust range of the single rotors", scale=0.1),
+    "body_rate_max": _Limit(1e3, refusals.BODY_RATE, "body-rate limit", "rad/s"),
+    "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m"),
+    "tangential_speed_max": _Limit(20.0, refusals.INFEASIBLE_WINDOW, "slip over the surface at contact [M:eq14]", "m/s"),
+    "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
 }
 
 
@@ -71,78 +72,82 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
     proofs = () if best.results is None else certificates(best.results, Limits.of(settings, vehicle), vehicle.mass)
     longest = max((attempt.duration for attempt in search.attempts), default=float(search.first.sum()))
     tried = f"{search.iterations} programs up to {longest:.2f} s"
-    names = [name for name in _LIMITS if asked[name] != _LIMITS[name].free]
-    ways = [way for name in names if (way := _relaxed(search, asked, (name,)))]
-    if not ways and (way := _relaxed(search, asked, _smallest(search, names))):
-        ways = [way]
-    if not ways:
+    names = [name for name in _LIMITS if name in search.acted and asked[name] != _LIMITS[name].free]
+    least, most = vehicle.thrust_min, vehicle.thrust_max
+    ways = (_relaxed(search, asked, (name,)) for name in names)
+    way = next((way for way in ways if way), None) or _relaxed(search, asked, _smallest(search, asked))
+    if way is None:
         return PerchRefusal(refusals.INFEASIBLE_WINDOW, "impact window and tube [M:eq14, M:eq15]", -inf,
                             f"no plan, even without the other limits ({tried}); widen the impact speeds or the tube", proofs,
                             search.iterations)
-    most = 4.0 * vehicle.thrust_max
-    ways.sort(key=lambda way: sum(_far(name, asked[name], value, most) for name, value in way.items()))
-    first, *others = [" and ".join(_said(name, value, most) for name, value in way.items()) for way in ways]
-    name, value = next(iter(ways[0].items()))
-    kept = " and ".join(dict.fromkeys(_LIMITS[name].words for name in ways[0]))
-    also = f"; so there is with {' or '.join(others)}" if others else ""
-    margin = -abs(value - asked[name]) if isinstance(value, float) else -inf
-    return PerchRefusal(_LIMITS[name].code, kept, margin, f"no plan keeps the {kept} ({tried}); with {first} there is one{also}", proofs,
-                        search.iterations, ways[0])
+    name, value = next(iter(way.items()))
+    kept = " and ".join(dict.fromkeys(_LIMITS[name].words for name in way))
+    first = " and ".join(_said(name, value, least, most) for name, value in way.items())
+    return PerchRefusal(_LIMITS[name].code, kept, -abs(value - asked[name]),
+                        f"no plan keeps the {kept} ({tried}); with {first} there is one", proofs, search.iterations, way)
 
 
-def _asked(settings: PerchSettings, limits: Limits) -> dict[str, Any]:
+def _asked(settings: PerchSettings, limits: Limits) -> dict[str, float]:
     """The limits that hold, by the names of their settings."""
     return {name: getattr(settings, name) for name in _LIMITS} | {
         "thrust_min": limits.thrust[0], "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
 
 
-def _said(name: str, value: Any, most: float) -> str:
-    beyond = f" (the vehicle has {most:.3g} N)" if name == "thrust_max" and value > most else ""
-    return f"{name} {value:g} {_LIMITS[name].unit}{beyond}" if isinstance(value, float) else f"{name}: {value}"
+def _said(name: str, value: float, least: float, most: float) -> str:
+    """A value in words; least, most: thrust of a rotor [N]."""
+    beyond = ""
+    if name == "thrust_max" and value > 4.0 * most:
+        beyond = f" (the vehicle has {4.0 * most:.3g} N)"
+    if name == "rotor_margin" and value < 0.0:
+        free = value * (most - least)
+        beyond = f" (rotors from {least + free:.2f} to {most - free:.2f} N; the vehicle's from {least:.2f} to {most:.2f} N)"
+    unit = _LIMITS[name].unit
+    return f"{name} {value:g}{' ' + unit if unit else ''}{beyond}"
 
 
-def _far(name: str, asked: Any, value: Any, most: float) -> float:
-    """How much a relaxation asks of a limit, in multiples of its scale."""
-    limit = _LIMITS[name]
-    if not isinstance(value, float):
-        return limit.scale
-    return abs(value - asked) / (limit.scale or abs(asked)) * (_BEYOND if name == "thrust_max" and value > most else 1.0)
+def _free(names: Iterable[str]) -> dict[str, float]:
+    """Values that take limits away."""
+    return {name: _LIMITS[name].free for name in names}
 
 
-def _outcome(search: Search, changes: dict[str, Any]) -> Outcome | None:
+def _outcome(search: Search, changes: dict[str, float]) -> Outcome | None:
     """The plan under changed settings, None where none is soon found."""
     settings = replace(search.settings, iterations_max=_PROGRAMS, minimum_time=False, **changes)
-    limits = Limits.of(settings, search.vehicle)
     try:
-        _, outcome = Search(search.problem, settings, search.vehicle,
-                            limits if settings.rotors == "required" else limits.without("rotor_thrust")).run()
+        _, outcome = Search(search.problem, settings, search.vehicle, Limits.of(settings, search.vehicle)).run()
     except PerchRefusal:
         return None
     return outcome if outcome.proved else None
 
 
-def _smallest(search: Search, names: list[str]) -> tuple[str, ...]:
+def _smallest(search: Search, asked: dict[str, float]) -> tuple[str, ...]:
     """Limits without which there is a plan, and none of which can stay; those that give first are put back last."""
-    taken = list(names)
-    for name in reversed(names):
+    taken = list(_LIMITS)
+    if (outcome := _outcome(search, _free(taken))) is None:
+        return ()
+    used = _used(search.problem, outcome, search.vehicle)
+    beyond = [name for name in taken if (used[name] - asked[name]) * (_LIMITS[name].free - asked[name]) > 0.0]  # of that plan
+    if _outcome(search, _free(beyond)):
+        taken = beyond
+    for name in reversed(taken):
         left = [n for n in taken if n != name]
-        if _outcome(search, {n: _LIMITS[n].free for n in left}):
+        if _outcome(search, _free(left)):
             taken = left
     return tuple(taken)
 
 
-def _relaxed(search: Search, asked: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any] | None:
-    """Values of some limits with which there is a plan, as near to what was asked as bisection finds them."""
-    free = {name: _LIMITS[name].free for name in names}
+def _relaxed(search: Search, asked: dict[str, float], names: Sequence[str]) -> dict[str, float] | None:
+    """Values of some limits with which there is a plan, as near to what was asked as bisection finds them; None: no such values."""
+    free = _free(names)
     outcome = _outcome(search, free)
     if outcome is None:
         return None
-    used = _used(search.problem, outcome, search.vehicle.mass)
-    values, low, high = free, 0.0, 2.0  # shares of the way to what the plan takes; a plan under a limit may take another way
+    used = _used(search.problem, outcome, search.vehicle)
+    values, low, high = None, 0.0, 2.0  # shares of the way to what the plan takes; a plan under a limit may take another way
     for _ in range(_HALVINGS):
         share = 0.5 * (low + high)
-        tried = {name: _outward(asked[name], asked[name] + share * (used[name] - asked[name])) if name in used else value
-                 for name, value in free.items()}
+        tried = {name: _outward(asked[name], asked[name] + share * (used[name] - asked[name]))
+                 for name in free}
         if _outcome(search, tried):
             values, high = tried, share
         else:
@@ -158,13 +163,15 @@ def _outward(asked: float, value: float) -> float:
     return round((ceil if value > asked else floor)(value / unit) * unit, 9)
 
 
-def _used(problem: PerchProblem, outcome: Outcome, mass: float) -> dict[str, float]:
+def _used(problem: PerchProblem, outcome: Outcome, vehicle: Vehicle) -> dict[str, float]:
     """What a plan takes of each limit, by the names of their settings."""
     rows = dict(zip(plan_checks.NAMES, outcome.results))
     last, T = outcome.coefficients[-1], outcome.durations[-1]
     v = (last.shape[1] - 1) * (last[:, -1] - last[:, -2]) / T - problem.target_velocity
-    s3 = problem.surface.normal
+    s3, mass, least, most = problem.surface.normal, vehicle.mass, vehicle.thrust_min, vehicle.thrust_max
+    rotors = rows["rotor_thrust"]
     return {"thrust_max": mass * rows["thrust"][MAXIMUM], "thrust_min": mass * rows["thrust"][MINIMUM],
             "height_min": rows["height"][MINIMUM], "height_max": rows["height"][MAXIMUM], "body_rate_max": rows["body_rate"][MAXIMUM],
             "speed_max": rows["speed"][MAXIMUM], "duration_max": float(outcome.durations.sum()),
-            "clearance_min": rows["clearance"][MINIMUM], "tangential_speed_max": float(np.linalg.norm(v - (v @ s3) * s3))}
+            "clearance_min": rows["clearance"][MINIMUM], "tangential_speed_max": float(np.linalg.norm(v - (v @ s3) * s3)),
+            "rotor_margin": min(rotors[MINIMUM] - least, most - rotors[MAXIMUM]) / (most - least)}

@@ -12,10 +12,12 @@ from perch_planner.contact_constraints import Contact
 from perch_planner.cutting import turning_side
 from perch_planner.judgement import Judgement, Question
 from perch_planner.linear_bounds import Bounds
+from perch_planner.plan_checks import BODY_RATE, HEIGHT, HOLDS, MAXIMUM, MINIMUM, SPEED
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.rotor_thrusts import linear_bounds, rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
-from perch_planner.time_allocation import SEGMENT_MIN, allocate, lengthen_approach, split_last, stretch_factor, with_last_segment
+from perch_planner.time_allocation import (
+    FINE, allocate, lengthen_approach, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
 _CUT_ROUNDS = 24
@@ -23,7 +25,9 @@ _PATIENCE = 5         # so often, peaks are stretched where a longer time helps 
 _NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
 _PLAIN_STRETCH = 1.15
 _BISECTIONS = 12
-_RESTARTS = 40        # draws of durations where lengthening the first ones has led to no plan
+_COARSE = 3           # so many durations are tried with few last pieces, which cost least; then with all divisions in turn
+_STEPS = 6            # so often the approach becomes a quarter longer,
+_GROWTH = (1.25, 1.6)  # then by more
 
 
 class Attempt(NamedTuple):
@@ -53,6 +57,12 @@ class Outcome(NamedTuple):
     extrema: np.ndarray | None = None
 
 
+def divided(durations: np.ndarray, fails: int) -> np.ndarray:
+    """The division of the approach that is tried after so many have failed."""
+    turn = (fails - _COARSE) % (len(FINE) + 1)
+    return split_last(durations) if fails < _COARSE or turn == len(FINE) else split_finely(durations, FINE[turn])
+
+
 class Search:
     """State of one planning call."""
 
@@ -68,6 +78,8 @@ class Search:
             len(problem.waypoints))
         self.rotors = rotor_model(vehicle)
         self.attempts: list[Attempt] = []
+        self.acted = {"tangential_speed_max", "clearance_min"}
+        """Settings whose limits had an influence on the search: those of rows that every program has, and those that plans left."""
 
     @property
     def iterations(self) -> int:
@@ -97,6 +109,7 @@ class Search:
                 self._note(duration, np.nan, np.nan, count)
                 break
             self._note(duration, found.least, found.most, count)
+            self._remember(found)
             outcome = self._thrust(durations, found)
             if found.stretch:
                 return outcome
@@ -106,6 +119,8 @@ class Search:
                 thrusts, row = sampled(found.coefficients, yaw, durations, *self.rotors)
                 kept = low <= row[0] and row[2] <= high
                 results, turning = np.vstack([found.results, [*row, kept]]), turning or not kept
+                if not kept:
+                    self.acted.add("rotor_margin")
                 if found.holds and kept:
                     return Outcome(durations, found.coefficients, yaw, results, True)
                 if turning:
@@ -129,58 +144,54 @@ class Search:
         mass = self.vehicle.mass
         self.attempts.append(Attempt(duration, mass * least, mass * most, cuts))
 
+    def _remember(self, found: Judgement) -> None:
+        """Note which limits a plan leaves."""
+        left = {"thrust_min": found.least < self.low, "thrust_max": found.most > self.high}
+        if found.checked:
+            results, (floor, ceiling) = found.results, self.limits.height
+            left |= {"speed_max": not results[SPEED, HOLDS], "body_rate_max": not results[BODY_RATE, HOLDS],
+                     "height_min": results[HEIGHT, MINIMUM] < floor, "height_max": results[HEIGHT, MAXIMUM] > ceiling}
+        self.acted |= {name for name, left_it in left.items() if left_it}
+
     def run(self) -> tuple[np.ndarray, Outcome]:
-        """Lengthen until every limit is proved, or the time or the number of programs is used up.
+        """Lengthen until every limit is proved, or the time or the number of programs is used up. [M:IV-C.3]
+
+        Where the thrust fails before the last waypoint everything becomes longer, else the approach, which is also divided otherwise.
 
         Raises:
             PerchRefusal: the first durations are longer than `duration_max` already.
         """
-        durations, best, stretched = self.first, None, 0
+        durations, best, stretched, fails = self.first, None, 0, 0
         if not self.settings.minimum_time and float(durations.sum()) > self.settings.duration_max:  # they only grow
             raise refusals.too_long(self.settings, float(durations.sum()))
         while True:
-            outcome = self.try_durations(split_last(durations), patient=stretched < _PATIENCE)
+            outcome = self.try_durations(divided(durations, fails), patient=stretched < _PATIENCE)
             if outcome.proved:
                 return durations, outcome
-            stretched += 1
             if best is None or outcome.results is not None:
                 best = outcome
-            grown = self.longer(durations, outcome)
-            if grown.sum() > self.settings.duration_max or self.iterations >= self.settings.iterations_max:
+            early = self.fails_early(durations, outcome)
+            grown = outcome.stretch * durations if early else lengthen_approach(durations, _GROWTH[stretched >= _STEPS])
+            grown = with_last_segment(grown, self.settings)
+            stretched, fails = stretched + 1, fails + (not early)
+            if grown.sum() > self.settings.duration_max:
+                self.acted.add("duration_max")
+                return durations, best
+            if self.iterations >= self.settings.iterations_max:
                 return durations, best
             durations = grown
 
-    def restarted(self) -> Outcome | None:
-        """Other divisions of the way and of the time, drawn around the first durations: a plan, or None.
-
-        The drawing is seeded: the same problem has the same answer.
-        """
-        rng = np.random.default_rng(0)
-        for _ in range(_RESTARTS):
-            if self.iterations >= self.settings.iterations_max:
-                break
-            durations = self.first * np.exp(rng.uniform(-0.5, 1.2)) * np.exp(rng.normal(0.0, 0.25, len(self.first)))
-            pieces = np.exp(rng.normal(0.0, 0.5, rng.integers(1, 6)))
-            pieces *= durations[-1] / pieces.sum()
-            pieces[-1] = max(pieces[-1], self.settings.tube_time, self.settings.last_segment_min)
-            durations = np.append(durations[:-1], pieces)
-            if durations.min() >= SEGMENT_MIN and durations.sum() <= self.settings.duration_max:
-                outcome = self.try_durations(durations, patient=True)
-                if outcome.proved:
-                    return outcome
-        return None
-
-    def longer(self, durations: np.ndarray, outcome: Outcome) -> np.ndarray:
-        """The next durations: all are longer where the thrust fails before the last waypoint, else the approach. [M:IV-C.3]
+    def fails_early(self, durations: np.ndarray, outcome: Outcome) -> bool:
+        """Whether the thrust leaves its range before the last waypoint.
 
         Args:
             durations: of the problem's segments, shape (waypoints + 1,).
             outcome: what they gave.
         """
-        before = None if outcome.extrema is None else outcome.extrema[:len(durations) - 1]
-        early = before is not None and ((before[:, 4] > self.high) | (before[:, 1] < self.low)).any()
-        grown = outcome.stretch * durations if early else lengthen_approach(durations)
-        return with_last_segment(grown, self.settings)
+        if outcome.extrema is None:
+            return False
+        before = outcome.extrema[:len(durations) - 1]
+        return bool(((before[:, 4] > self.high) | (before[:, 1] < self.low)).any())
 
     def shortest(self, durations: np.ndarray, outcome: Outcome) -> Outcome:
         """Bisect the scale of all durations for the shortest plan whose limits are still proved."""

@@ -14,6 +14,7 @@ CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints
 CRUISE_ACCELERATION = 2.8  # [m/s^2]
 TURN_ACCELERATION = 1.2    # [m/s^2]
 FINAL_TIME = 0.45          # [s] of the last piece, where the rotation happens
+FINE = (np.array([0.26, 0.2, 0.2]), np.array([0.375, 0.25]))  # [s] last pieces where the rotation takes all that the rotors have
 PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
@@ -116,10 +117,26 @@ def split_last(durations):
     return out
 
 
-def lengthen_approach(durations: np.ndarray) -> np.ndarray:
+@compiled
+def split_finely(durations, pieces):
+    """Divide the last segment so that it ends with given pieces [s], at whose ends nothing is given.
+
+    A polynomial that turns the vehicle for 0.45 s asks the rotors for less than they have nearly everywhere, to stay within what they
+    have at one instant; shorter pieces follow their limits more closely.
+    """
+    run_up, before = durations[-1] - pieces.sum(), len(durations) - 1
+    if run_up < FINAL_TIME:
+        return split_last(durations)
+    count = int(np.ceil(run_up / PIECE_MAX))
+    out = np.empty(before + count + len(pieces))
+    out[:before], out[before:before + count], out[before + count:] = durations[:before], run_up / count, pieces
+    return out
+
+
+def lengthen_approach(durations: np.ndarray, factor: float) -> np.ndarray:
     """More time for the last segment, where the run-up and the rotation have to happen, and a little for the rest."""
     grown = 1.05 * durations
-    grown[-1] = max(1.25 * durations[-1], 2.2 * FINAL_TIME)
+    grown[-1] = max(factor * durations[-1], 2.2 * FINAL_TIME)
     return grown
 
 
