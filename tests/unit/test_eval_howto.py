@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from perch_core.tag_board import load_board
-from perch_eval import demo, soak
+from perch_eval import comparison, demo, soak
 from perch_eval.campaign import command as campaign
 from perch_eval.campaign.specification import load_campaign
 from perch_eval.evaluation import command as evaluation
@@ -35,7 +35,7 @@ GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
 PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
            "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser,
-           "soak.py": soak.parser}
+           "soak.py": soak.parser, "compare.py": comparison.parser}
 
 
 def blocks(language):

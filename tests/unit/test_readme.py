@@ -1,4 +1,4 @@
-"""What the README shows is true: commands are accepted, files exist, nodes have the topics, services and parameters named."""
+"""What README and docs/interface.md show is true: commands are accepted, files exist, nodes have the topics, services and parameters named."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ from rclpy.qos import DurabilityPolicy
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
+INTERFACE = (ROOT / "docs" / "interface.md").read_text()
 BLOCKS = re.findall(r"```(\w*)\n(.*?)```", README, re.S)
 COMMANDS = list(dict.fromkeys(
     [line.split("#")[0].strip() for kind, text in BLOCKS if not kind for line in text.splitlines() if line.startswith("python3 ")]
-    + re.findall(r"`(python3 scripts/[^`]+)`", README)))
+    + re.findall(r"`(python3 scripts/[^`]+)`", README + INTERFACE)))
 
 
 def tables() -> dict[str, list[list[str]]]:
     """The rows of each table, without its head, by the word in its first column's head."""
     found: dict[str, list[list[str]]] = {}
-    for text in re.findall(r"(?:^\|.*\n)+", README, re.M):
+    for text in re.findall(r"(?:^\|.*\n)+", f"{README}\n{INTERFACE}", re.M):
         head, _, *rows = [[cell.strip() for cell in line.strip("| \n").split("|")] for line in text.splitlines()]
         found[head[0]] = rows
     return found
