@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from nodes.node_process import Running, nodes
+from nodes.node_process import FREE, Running, nodes
 from perch_eval.domain import reserved_domain
-
-FREE = ("estimator", "vio", "target_localizer", "powerline_mapper", "controller", "perching_planner", "powerline_planner", "mission", "description")
-
 
 @pytest.fixture(scope="session")
 def free(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
-    """Every node but those of simulation and evaluation; the mapper, which looks through another vehicle's camera, is in `/lines`."""
+    """All of `FREE`; the mapper, which looks through another vehicle's camera, is in `/lines`. In the end they stop cleanly on SIGTERM."""
     with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
         with nodes(FREE, tmp_path_factory.mktemp("free"), {"powerline_mapper": "/lines"}, {"perching_planner": {"time_limit": 60.0}}) as running:

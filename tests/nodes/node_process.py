@@ -19,6 +19,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 PLAIN = Path(__file__).parent / "plain"
+FREE = ("estimator", "vio", "target_localizer", "powerline_mapper", "controller", "perching_planner", "powerline_planner", "mission", "description")
+"""Every node but those of simulation and evaluation."""
 PATIENCE = 300.0  # only ever waited for in full when a test fails [s]
 
 
@@ -44,10 +46,10 @@ class Running:
         assert self.process.poll() is None, f"{self.name} has ended:\n{self.log[-3000:]}"
         assert "defect" not in self.log and "Traceback" not in self.log, f"{self.name}:\n{self.log[-3000:]}"
 
-    def stop(self) -> None:
-        """End it."""
-        self.process.terminate()
-        self.process.wait(timeout=PATIENCE)
+    def ended(self) -> str:
+        """What is wrong with how it ended upon SIGTERM."""
+        code = self.process.wait(timeout=PATIENCE)
+        return "" if code == 0 and "Traceback" not in self.log else f"{self.name} ended with exit code {code}:\n{self.log[-3000:]}"
 
 
 @contextmanager
@@ -69,7 +71,9 @@ def nodes(names: Collection[str], folder: Path, namespaces: Mapping[str, str] | 
         yield running
     finally:
         for node in running.values():
-            node.stop()
+            node.process.terminate()
+        problems = [problem for node in running.values() if (problem := node.ended())]
+    assert not problems, "\n".join(problems)
 
 
 def wait_for(running: Collection[Running]) -> None:

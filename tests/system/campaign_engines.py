@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from perch_eval.campaign.results import RunResult
@@ -21,12 +22,12 @@ def quick(task) -> RunResult:
 
 
 def mortal(task) -> RunResult:
-    """As `quick`, but the worker that flies run 11 for the first time is killed in mid-run."""
+    """The worker that flies run 11 for the first time is killed in mid-run; the others say on how many threads BLAS adds there."""
     marker = Path(os.environ["PERCH_TEST_MARKER"])
     if task.run.number == 11 and not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return quick(task)
+    return replace(quick(task), message=str(threads()))
 
 
 def broken(task) -> RunResult:
@@ -36,10 +37,10 @@ def broken(task) -> RunResult:
     return quick(task)
 
 
-def threads(task) -> RunResult:
-    """Says on how many threads BLAS adds here."""
+def threads() -> int:
+    """On how many threads BLAS adds in this process."""
     with open("/proc/self/maps") as file:
         path = next(line.split()[-1] for line in file if "openblas" in line and "numpy" in line)
     library = ctypes.CDLL(path)
     name = next(name for name in ("scipy_openblas_get_num_threads64_", "openblas_get_num_threads64_", "openblas_get_num_threads") if hasattr(library, name))
-    return RunResult(task.run.number, task.run.seed, "perched", "perched", str(getattr(library, name)()))
+    return getattr(library, name)()

@@ -1,4 +1,4 @@
-"""Publishes on every topic that a flight uses, latched, good messages and nonsense in turn. Started by test_one_flight.py; SIGTERM ends it."""
+"""Publishes on every topic that a flight uses, latched, good messages and nonsense in turn. Started by test_flight_surface.py; SIGTERM ends it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-RATE = 50.0  # rounds of one message on each topic [Hz]
+RATE = 10.0  # rounds of one message on each topic [Hz]
 NEXT = 4_000_000  # [ns] ahead of the clock: nobody else has said anything of this stamp yet
 
 

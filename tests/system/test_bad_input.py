@@ -29,6 +29,15 @@ from rclpy.node import Node
 from system.scripts import PATIENCE, run_script
 
 
+BLIND = """
+extends: surface_90
+name: blind
+nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
+parameters: {vehicle: {cameras: none}}
+"""
+"""A perch without images."""
+
+
 # -- scenarios -------------------------------------------------------------------------------------------------------
 
 SCENARIOS = {
@@ -75,7 +84,7 @@ def test_arguments_of_the_demo(arguments, words, capsys):
 
 def test_a_parameter_that_a_node_refuses_is_the_caller_s_mistake(tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text("name: mine\nparameters: {estimator: {gate_probability: 7.0}}\n")
+    file.write_text(BLIND.replace("{vehicle", "{estimator: {gate_probability: 7.0}, vehicle"))
     result = run_script("demo.py", "--scenario", str(file), "--out", str(tmp_path))
     assert result.returncode == 2, result.stderr
     assert "estimator: gate_probability: 7 is outside (0, 0.999999]" in result.stderr and "Traceback" not in result.stderr
@@ -215,14 +224,16 @@ def test_the_mission_refuses_goals_that_are_none(asker):
 # -- a flight that is broken off -------------------------------------------------------------------------------------
 
 @pytest.fixture
-def airborne(tmp_path):
-    """A demo with one process per node that has just taken off, and its nodes by name."""
+def airborne(tmp_path, request):
+    """A demo that has climbed, and looks for a target, with the options that the test names as its parameter, and its nodes by name."""
+    file = tmp_path / "blind.yaml"
+    file.write_text(BLIND)
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "perch_eval.demo", "--separate", "--out", str(tmp_path)], env=dict(os.environ),
+        [sys.executable, "-u", "-m", "perch_eval.demo", "--scenario", str(file), "--out", str(tmp_path), *request.param], env=dict(os.environ),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         for line in process.stdout:
-            if "take_off" in line:
+            if "searching" in line:
                 break
         else:
             raise AssertionError(process.stderr.read())
@@ -241,6 +252,7 @@ def check_recording(folder: Path) -> None:
     assert len(flight.states("ground_truth/odometry").t) > 100 and len(flight.values("imu/data_raw")) > 100
 
 
+@pytest.mark.parametrize("airborne", [["--separate"]], indirect=True, ids=["separate"])
 def test_a_killed_node_ends_the_flight_and_is_named(airborne, tmp_path):
     process, nodes = airborne
     nodes["target_localizer"].kill()
@@ -254,9 +266,10 @@ def test_a_killed_node_ends_the_flight_and_is_named(airborne, tmp_path):
     assert "target_localizer ended" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.parametrize("airborne", [["--composed", "estimator", "controller", "mission"]], indirect=True, ids=["some together"])
 def test_an_interrupted_flight_leaves_nothing_running(airborne, tmp_path):
     process, nodes = airborne
-    assert len(nodes) == 9
+    assert set(nodes) == {"vehicle", "vio_model", "target_localizer", "perching_planner", "description", "recorder", "composed"}
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=PATIENCE)
     assert (process.returncode, error) == (130, "interrupted; all nodes are stopped\n")

@@ -1,25 +1,31 @@
-"""A whole perch on a wall on the real nodes: what the report says of it, and that a seed is a flight."""
+"""A whole perch on a wall on the real nodes: what the report says of it.
+
+And a seed is a flight: composed, in separate processes and without ROS, whatever the environment says, whoever looks on or talks in.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from perch_eval import demo, in_process
+from perch_eval import demo
 from perch_eval.flight import HASHED, Flight, numbers
-from perch_eval.in_process.flights import Sensing
 from perch_eval.nodes import ALL_NODES
 from perch_eval.ros.recorded_flight import RecordedFlight
-from perch_sim.scenario import load_scenario
+from system.scripts import PATIENCE, ROOT
 
 SCENARIO, SEED = "surface_90", 1
+ECHOED = (("/odometry", "nav_msgs/msg/Odometry"), ("/camera_front/image_raw", "sensor_msgs/msg/Image"))
 
 
 @pytest.fixture(scope="module")
@@ -89,23 +95,47 @@ def test_the_page_is_complete(flight):
     assert not re.search(r"\bnan\b|None", re.sub(r'src="[^"]*"', "", page))
 
 
-def test_one_process_per_node_and_a_busy_core_give_the_same_flight(flight, tmp_path):
-    report, folder = flight
-    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+@pytest.fixture
+def crowd(ros_domain, monkeypatch) -> Iterator[list[subprocess.Popen]]:
+    """A foreign publisher on every topic, a viewer and two echoes, in the domain that the next demo flies in."""
+    monkeypatch.setattr(demo, "reserved_domain", lambda: contextlib.nullcontext(ros_domain))
+    stranger = subprocess.Popen([sys.executable, str(Path(__file__).parent / "stranger.py")], stdout=subprocess.PIPE, text=True,
+                                env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")))})
+    scripts = [("run_node.py", "viewer", "--ros-args", "-p", "port:=0"), *(("topic.py", "echo", *topic) for topic in ECHOED)]
+    others = [subprocess.Popen([sys.executable, str(ROOT / "scripts" / script), *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+              for script, *arguments in scripts]
     try:
-        again = demo.fly(SCENARIO, SEED, tmp_path, composed=())
+        assert stranger.stdout.readline().startswith("up")
+        yield [stranger, *others]
     finally:
-        busy.kill()
-        busy.wait()
-    assert again["outcome"] == report["outcome"]
+        for process in (stranger, *others):
+            process.terminate()
+        for process in (stranger, *others):
+            process.wait(PATIENCE)
+
+
+def test_one_process_per_node_in_a_crowd_is_the_same_flight(flight, crowd, tmp_path):
+    """The crowd keeps both cores busy, too."""
+    report, folder = flight
+    again = demo.fly(SCENARIO, SEED, tmp_path, composed=())
+    assert not {" ".join(process.args): process.poll() for process in crowd if process.poll() is not None}
     if again["flight_hash"] != report["flight_hash"]:
         pytest.fail(first_difference(RecordedFlight(folder / "flight.mcap"), RecordedFlight(tmp_path / "flight.mcap")))
+    log = (tmp_path / "logs" / "vehicle.log").read_text()
+    for topic in ("trajectory", "controller/command", "motor_command", "odometry", "imu/data_raw"):
+        assert log.count(f"[vehicle]: {topic}: /stranger publishes it but takes no part in the lockstep: it is ignored") == 1, topic
 
 
-def test_without_ros_it_is_the_same_flight(flight):
+def test_without_ros_and_with_sums_on_two_threads_it_is_the_same_flight(flight):
+    """In a process of its own, whose BLAS is told so before it is loaded; the demo's nodes add on one."""
     report, _ = flight
-    trace = in_process.fly(load_scenario(SCENARIO), SEED, Sensing("rendered", "rendered"), linger=0.5)
-    assert trace.flight.digest(trace.end_time) == report["flight_hash"]
+    program = ("import sys; from perch_sim.scenario import load_scenario; from perch_eval.in_process import fly\n"
+               "from perch_eval.in_process.flights import Sensing\n"
+               "trace = fly(load_scenario(sys.argv[1]), int(sys.argv[2]), Sensing('rendered', 'rendered'), linger=0.5)\n"
+               "print(trace.flight.digest(trace.end_time))")
+    environment = {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")}
+    flown = subprocess.run([sys.executable, "-c", program, SCENARIO, str(SEED)], check=True, capture_output=True, text=True, env=environment)
+    assert flown.stdout.strip() == report["flight_hash"]
 
 
 def first_difference(a: Flight, b: Flight) -> str:

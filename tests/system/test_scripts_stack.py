@@ -11,7 +11,7 @@ from contextlib import suppress
 import psutil
 import pytest
 from perch_eval.domain import reserved_domain
-from system.scripts import PATIENCE, run_script, start_script
+from system.scripts import PATIENCE, call_script, run_script, start_script
 
 NODES = ("estimator", "controller")  # they wait for a vehicle that does not come: no flight is needed here
 
@@ -54,8 +54,8 @@ def children(process: subprocess.Popen) -> dict[str, psutil.Process]:
     return found
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("mode", [[], ["--composed"]], ids=["processes", "composed"])
+@pytest.mark.parametrize("mode, number", [([], signal.SIGINT), (["--composed", "--namespace", "/quad1"], signal.SIGTERM)],
+                         ids=["processes", "composed in a namespace"])
 def test_ready_then_stopped_without_leftovers(start, tmp_path, mode, number):
     process = start(*mode)
     started = children(process)
@@ -93,13 +93,6 @@ def test_a_killed_node_is_named_and_the_others_are_stopped(start):
     assert not started["controller"].is_running()
 
 
-def test_nodes_in_a_namespace_become_ready(start):
-    process = start("--namespace", "/quad1")
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0
-
-
 @pytest.mark.parametrize("arguments, words", [
     (["--scenario", "surface_900"], "surface_900: unknown; there are: "),
     (["--scenario", "/no/file.yaml"], "/no/file.yaml: no such file"),
@@ -110,12 +103,16 @@ def test_nodes_in_a_namespace_become_ready(start):
     (["--domain", "200"], "200 is outside [0, 101]"),
     (["--view", "70000"], "70000 is outside [0, 65535]"),
     (["--namespace", "quad1"], "must begin with '/'"),
-    (["--only", "estimator", "-p", "estimator.no_such_gain:=1"], "no_such_gain"),
-    (["--only", "estimator", "-p", "estimator.gate_probability:=7.0"], "gate_probability: 7 is outside"),
 ])
-def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, domain, tmp_path):
-    more = [] if "--domain" in arguments else ["--domain", domain]
-    result = run_script("start_stack.py", *arguments, *more, "--log-dir", str(tmp_path))
+def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, tmp_path):
+    result = call_script("start_stack.py", *arguments, *([] if "--domain" in arguments else ["--domain", "1"]), "--log-dir", str(tmp_path))
+    assert result.returncode == 2 and not list(tmp_path.glob("*.log")), "nothing is started"
+    assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
+
+
+@pytest.mark.parametrize("parameter, words", [("no_such_gain:=1", "no_such_gain"), ("gate_probability:=7.0", "gate_probability: 7 is outside")])
+def test_a_parameter_that_a_node_refuses_is_the_callers_mistake(parameter, words, domain, tmp_path):
+    result = run_script("start_stack.py", "--only", "estimator", "-p", f"estimator.{parameter}", "--domain", domain, "--log-dir", str(tmp_path))
     assert result.returncode == 2
     assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
 

@@ -30,6 +30,9 @@ def prepare_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _end)
     end_with_parent(signal.SIGTERM)
+    campaign = multiprocessing.parent_process()
+    if campaign is not None and os.getppid() != campaign.pid:  # it has ended while this worker was starting
+        os._exit(1)
 
 
 def _carry_out(task: Task) -> RunResult:
