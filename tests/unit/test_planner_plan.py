@@ -79,6 +79,12 @@ def test_a_wall_half_a_metre_above_the_ground_is_reached_within_what_the_rotors_
     checked(PerchProblem(StartState((0.0, 0.0, below)), surface(90.0, p=(1.7, 0.0, 0.5))))
 
 
+@pytest.mark.parametrize("inclination, height", [(145.0, 1.6), (155.0, 2.0)])
+def test_overhangs_with_little_room_below_are_reached_within_what_the_rotors_have(inclination, height):
+    """By finer divisions of approaches whose coarse ones have failed."""
+    checked(PerchProblem(StartState((0.0, 0.0, 1.2)), PerchSurface.from_inclination((2.0, 0.0, height), np.radians(inclination))))
+
+
 def test_a_negative_rotor_margin_lets_a_plan_ask_for_more_and_its_certificate_says_what():
     limits = Limits.of(PerchSettings(rotor_margin=-0.5), VEHICLE)
     spread = VEHICLE.thrust_max - VEHICLE.thrust_min

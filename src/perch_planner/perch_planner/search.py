@@ -25,7 +25,7 @@ _PATIENCE = 5         # so often, peaks are stretched where a longer time helps 
 _NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
 _PLAIN_STRETCH = 1.15
 _BISECTIONS = 12
-_COARSE = 3           # so many durations are tried with few last pieces, which cost least; then with all divisions in turn
+_COARSE = 3           # so many durations are tried with few last pieces first, which cost least; from the last of them on with all divisions
 _STEPS = 6            # so often the approach becomes a quarter longer,
 _GROWTH = (1.25, 1.6)  # then by more
 
@@ -57,10 +57,14 @@ class Outcome(NamedTuple):
     extrema: np.ndarray | None = None
 
 
+def turn(fails: int) -> int:
+    """The number in `FINE` of the division of the approach that is tried after so many have failed; len(FINE): the coarse one."""
+    return len(FINE) if fails < _COARSE else (fails - _COARSE) % (len(FINE) + 1)
+
+
 def divided(durations: np.ndarray, fails: int) -> np.ndarray:
-    """The division of the approach that is tried after so many have failed."""
-    turn = (fails - _COARSE) % (len(FINE) + 1)
-    return split_last(durations) if fails < _COARSE or turn == len(FINE) else split_finely(durations, FINE[turn])
+    """The segments that are tried after so many divisions of the approach have failed [s]."""
+    return split_last(durations) if turn(fails) == len(FINE) else split_finely(durations, FINE[turn(fails)])
 
 
 class Search:
@@ -156,7 +160,8 @@ class Search:
     def run(self) -> tuple[np.ndarray, Outcome]:
         """Lengthen until every limit is proved, or the time or the number of programs is used up. [M:IV-C.3]
 
-        Where the thrust fails before the last waypoint everything becomes longer, else the approach, which is also divided otherwise.
+        Where the thrust fails before the last waypoint everything becomes longer, else the approach, from the third on after all
+        divisions of it.
 
         Raises:
             PerchRefusal: the first durations are longer than `duration_max` already.
@@ -170,10 +175,13 @@ class Search:
                 return durations, outcome
             if best is None or outcome.results is not None:
                 best = outcome
-            early = self.fails_early(durations, outcome)
-            grown = outcome.stretch * durations if early else lengthen_approach(durations, _GROWTH[stretched >= _STEPS])
+            if self.fails_early(durations, outcome):
+                grown, stretched = outcome.stretch * durations, stretched + 1
+            elif turn(fails := fails + 1) < len(FINE):
+                grown = durations  # these, divided otherwise
+            else:
+                grown, stretched = lengthen_approach(durations, _GROWTH[stretched >= _STEPS]), stretched + 1
             grown = with_last_segment(grown, self.settings)
-            stretched, fails = stretched + 1, fails + (not early)
             if grown.sum() > self.settings.duration_max:
                 self.acted.add("duration_max")
                 return durations, best
