@@ -65,5 +65,6 @@ def main() -> int:
         print(f"error: {error.filename or arguments.out}: {error.strerror}", file=sys.stderr)
         return 2
     print("\n".join(map(str, found)))
+    print(f"{'thrust against battery voltage':32s} not told: no flight holds the battery's voltage beside what its thrust was")
     print(f"written: {arguments.out / 'vehicle.yaml'}, {arguments.out / 'identify.png'}")
     return 1 if any(one.refused for one in found) else 0
