@@ -47,7 +47,7 @@ def _rise(x: np.ndarray) -> np.ndarray:
 
 
 def motion(name: str, rng: np.random.Generator) -> tuple[Path, float]:
-    """A path and the amplitude of the turns about it [rad]: `circle`, `hand`, `eight`, `far` or `climb`."""
+    """A path and the amplitude of the turns about it [rad]: `circle`, `hand`, `eight`, `far`, `climb` or `slow`."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     if name == "circle":
         return lambda t: np.stack([np.cos(1.6 * t + phases[0]), np.sin(1.6 * t + phases[0]), 1.5 + 0.0 * t], -1), 0.0
@@ -61,7 +61,9 @@ def motion(name: str, rng: np.random.Generator) -> tuple[Path, float]:
     if name == "climb":
         up, sway = np.array([0.0, 0.0, 2.2]), _waves([0.05, 0.05, 0.0], [1.3, 1.1, 1.0], phases, 0.3)
         return lambda t: sway(t) + _rise((t - 0.5) / 4.0)[:, None] * up, 0.0
-    raise ValueError(f"motion {name!r} is not one of circle, hand, eight, far, climb")
+    if name == "slow":
+        return _waves([0.5, 0.4, 0.2], [0.6, 0.5, 0.7], phases, 1.5), 0.1
+    raise ValueError(f"motion {name!r} is not one of circle, hand, eight, far, climb, slow")
 
 
 class Truth:

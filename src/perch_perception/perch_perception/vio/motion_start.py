@@ -4,6 +4,9 @@ First the gyro's bias, which a wrong rotation would carry into everything else (
 frame, with preintegrated dR, dp and p_k = v0 T + g0 T^2/2 + dp_k + (d dp_k / d b_a) b_a, every observation says that the point lies on
 its ray:  (I - d d^T)(X_j - p_k - dR_k p_BC) = 0,  d = dR_k R_BC b.  That is linear in v0, g0, b_a and all X_j; the points are
 eliminated, b_a has its prior, and the 9 x 9 rest is solved with |g0| = g. (Dong-Si and Mourikis 2012.)
+
+That takes much for exact. From each of its minima `start_refinement` goes on with everything that is unknown; the likeliest end is the
+start, unless another is about as likely, or the scale is hardly known.
 """
 
 from __future__ import annotations
@@ -25,8 +28,10 @@ from perch_perception.vio.config import VioConfig
 from perch_perception.vio.gyro_bias import RayPair, solve_gyro_bias
 from perch_perception.vio.preintegration import Preintegration, preintegrate
 from perch_perception.vio.start import KnownPose
+from perch_perception.vio.start_refinement import Refined, Sight, refine
 from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Tracks
+from perch_perception.vio.triangulation import triangulate
 
 _LEAST_FEATURES = 12
 _LEAST_FRAMES = 6
@@ -34,6 +39,11 @@ _MOST_FRAMES = 16      # of the longest stretch; more cost time and tell little
 _ITERATIONS = 10
 _LONGEST = 3.0         # stretch that is kept, in that after which a start is tried
 _GYRO_SIGMA = 0.02     # bias known at least so well before anything else is solved [rad/s]
+_PARALLAX_DEG = 0.3
+_MOST_POINTS = 40
+_MISFIT, _KEPT = 4.0, 0.6  # most chi^2 for each degree of freedom, least share of the points that fit
+_SCALE = 0.3   # 1 sigma of the logarithm of the scale: known worse, it is too far from Gaussian for a filter
+_RIVAL = 10.8  # another minimum that is no less likely than that (chi^2 of one, 99.9 %) is an ambiguity
 _TILT, _SPEED = 0.2, 0.5  # 1 sigma with which a filter may start [rad, m/s]
 
 
@@ -52,12 +62,11 @@ class MotionSolution:
 
 
 def solve_motion(T: np.ndarray, dp: np.ndarray, dv: np.ndarray, by_bias: np.ndarray, centres: np.ndarray, rays: np.ndarray,
-                 seen: np.ndarray, sigma: float, bias_sigma: float) -> MotionSolution | None:
-    """Velocity, gravity and accelerometer bias from rays: the maximum of their likelihood.
+                 seen: np.ndarray, sigma: float, bias_sigma: float) -> list[MotionSolution]:
+    """Velocity, gravity and accelerometer bias from rays: maxima of their likelihood.
 
     The closed form weighs a far point more than a near one, and so prefers a scale that is too small: it is where Gauss-Newton on the
-    bearings begins. Where it has collapsed, gravity along the mean force, and larger velocities, are better beginnings; the likeliest
-    end counts.
+    bearings begins. Where it has collapsed, gravity along the mean force, and larger velocities, are better beginnings.
 
     Args:
         T: time since the first frame [s], shape (n,).
@@ -71,13 +80,17 @@ def solve_motion(T: np.ndarray, dp: np.ndarray, dv: np.ndarray, by_bias: np.ndar
         bias_sigma: 1 sigma of the accelerometer's bias before [m/s^2].
 
     Returns:
-        None where the motion does not tell velocity and gravity.
+        Minima, the likeliest first; none where the motion does not tell velocity and gravity.
     """
     G = np.concatenate([T[:, None, None] * np.eye(3), 0.5 * T[:, None, None] ** 2 * np.eye(3), by_bias], axis=2)
     along = dv * (-GRAVITY / max(float(np.linalg.norm(dv)), 1e-9))
     found = [_refined(G, dp + centres, rays, seen, sigma, bias_sigma, *begin)
              for begin in ((None, 1.0), (along, 1.0), (along, 3.0), (along, 10.0))]
-    return min((end for end in found if end is not None), key=lambda end: end[0], default=(0.0, None))[1]
+    distinct: list[MotionSolution] = []
+    for _, end in sorted((end for end in found if end is not None), key=lambda end: end[0]):
+        if not any(np.linalg.norm(end.g - other.g) < 0.5 and np.linalg.norm(end.v - other.v) < 0.2 * np.linalg.norm(other.v) for other in distinct):
+            distinct.append(end)
+    return distinct
 
 
 def _refined(G: np.ndarray, e: np.ndarray, rays: np.ndarray, seen: np.ndarray, sigma: float, bias_sigma: float,
@@ -157,7 +170,7 @@ class MotionStart:
         """
         self._config, self._mount = config, mount
         self._tracks, self._stamps = Tracks(), {}
-        self.gyro_bias = np.zeros(3) if gyro_bias is None else gyro_bias
+        self.gyro_bias = self._known_bias = np.zeros(3) if gyro_bias is None else gyro_bias
         self.gyro_sigma = config.imu.gyro_bias_init
 
     def add(self, frame: int, stamp: int, ids: np.ndarray, bearings: Bearings) -> None:
@@ -211,12 +224,46 @@ class MotionStart:
         all_rays = np.broadcast_to([0.0, 0.0, 1.0], (*there.shape, 3)).copy()
         for row, (k, d) in enumerate(zip(seen, rays)):
             there[row, k], all_rays[row, k] = True, np.einsum("nij,nj->ni", dR[k], d)
-        found = solve_motion(
+        ends = solve_motion(
             np.array([p.duration for p in parts]), np.array([p.dp for p in parts]), parts[-1].dv, np.array([p.J[3:6, 3:] for p in parts]),
             dR @ self._mount.p_BC, all_rays, there, sigma, self._config.imu.accel_bias_init)
-        if found is None or found.residual > 2 * sigma:
+        steps = [imu.run(self._stamps[i], self._stamps[j]) for i, j in zip(frames[:-1], frames[1:])]
+        refined: list[Refined] = []
+        for end in ends:
+            x = self._refined(end, parts, steps, place) if end.residual < 2 * sigma else None
+            if x is not None and x.scale > 2.0 * _SCALE:
+                return None  # no other minimum will make this motion tell more
+            refined += [] if x is None else [x]
+        best = min(refined, key=lambda x: x.cost, default=None)
+        if best is None or best.misfit > _MISFIT or best.kept < _KEPT or best.scale > _SCALE:
             return None
-        return self._state(found, parts[-1], known(self.gyro_bias), self._stamps[frames[-1]])
+        if any(x.cost < best.cost + _RIVAL and x.differs_from(best) for x in refined):
+            return None
+        return self._state(best, known(best.gyro_bias), self._stamps[frames[-1]])
+
+    def _refined(self, end: MotionSolution, parts: list[Preintegration], steps: list[np.ndarray], place: dict[int, int]) -> Refined | None:
+        R_WB = start.levelled(np.eye(3), -end.g)
+        sights = self._sights(R_WB, end, parts, place)
+        if len(sights) < _LEAST_FEATURES:
+            return None
+        return refine(self._config, self._mount, steps, sights, R_WB, R_WB @ end.v, self.gyro_bias, end.accel_bias, self._known_bias)
+
+    def _sights(self, R_WB: np.ndarray, found: MotionSolution, parts: list[Preintegration], place: dict[int, int]) -> list[Sight]:
+        """Tracks with parallax, their points triangulated along the motion that was found."""
+        R = np.array([R_WB @ p.dR for p in parts])
+        p = np.array([found.v * p.duration + 0.5 * found.g * p.duration**2 + p.dp + p.J[3:6, 3:] @ found.accel_bias for p in parts]) @ R_WB.T
+        centres, out = p + R @ self._mount.p_BC, []
+        for track in self._tracks.by_id.values():
+            ks = [k for k, f in enumerate(track.frames) if f in place]
+            if len(ks) < _LEAST_FRAMES:
+                continue
+            js = np.array([place[track.frames[k]] for k in ks])
+            b_C = np.array([track.b_C[k] for k in ks])
+            X = triangulate(centres[js], np.einsum("nij,nj->ni", R[js] @ self._mount.R_BC, b_C), np.radians(_PARALLAX_DEG),
+                            2.0 * self._config.start.motion_noise / self._mount.camera.fx)
+            if X is not None:
+                out.append(Sight(js, Bearings(b_C, np.array([track.shape[k] for k in ks])), X))
+        return sorted(out, key=lambda sight: -len(sight.frames))[:_MOST_POINTS]
 
     def _find_gyro_bias(self, frames: list[int], imu: ImuBuffer, rays: list[np.ndarray], seen: list[np.ndarray], sigma: float) -> None:
         """From pairs of frames that are half the stretch apart, each frame in one of them."""
@@ -231,30 +278,23 @@ class MotionStart:
         step, P = solve_gyro_bias(pairs, sigma, self._config.imu.gyro_bias_init)
         self.gyro_bias, self.gyro_sigma = self.gyro_bias + step, largest_sigma(P)
 
-    def _state(self, found: MotionSolution, last: Preintegration, pose: KnownPose, stamp: int) -> State | None:
-        """The state at the end of the stretch, if it is known well enough.
-
-        With v_B = dR^T (v0 + g0 T + dv + (d dv / d b_a) b_a) and up_B = -dR^T g0 / g: errors of v0, g0 and b_a go into tilt, velocity
-        and b_a together.
-        """
-        to_end = last.dR.T
-        up_B = to_end @ (-found.g / GRAVITY)
-        R_WB = start.levelled(pose.R_WB, up_B)
-        v_B = to_end @ (found.v + found.g * last.duration + last.dv + last.J[6:, 3:] @ found.accel_bias)
-        # theta: what turns up_B by the error of g0; the heading is the pose's
-        by_theta = so3.hat(up_B) @ to_end / GRAVITY
-        by_y = np.zeros((9, 9))
-        by_y[:3, 3:6] = by_theta
-        by_y[3:6] = R_WB @ (to_end @ np.hstack([np.eye(3), last.duration * np.eye(3), last.J[6:, 3:]])
-                            - so3.hat(v_B) @ np.hstack([np.zeros((3, 3)), by_theta, np.zeros((3, 3))]))
-        by_y[6:, 6:] = np.eye(3)
-        P = by_y @ found.covariance @ by_y.T
+    def _state(self, found: Refined, pose: KnownPose, stamp: int) -> State | None:
+        """The state at the end of the stretch, if it is known well enough: heading and position are the pose's."""
+        R_WB, v_B, P = start.levelled(pose.R_WB, found.R_WB[2]), found.v_B, found.covariance
+        turned = R_WB @ so3.hat(v_B)
         if largest_sigma(P[:3, :3]) > _TILT or largest_sigma(P[3:6, 3:6]) > _SPEED:
             return None
-        state = start.fresh(self._config, self._mount, stamp, R_WB, pose, R_WB @ v_B, self.gyro_bias.copy(), 0.0, 0.05,
-                            2.0 * self.gyro_sigma)
-        state.accel_bias = found.accel_bias.copy()
-        rows = np.r_[at.THETA, at.VELOCITY, at.ACCEL_BIAS]
-        state.P[at.ACCEL_BIAS, at.ACCEL_BIAS] = 0.0
-        state.P[np.ix_(rows, rows)] += P
+        state = start.fresh(self._config, self._mount, stamp, R_WB, pose, R_WB @ v_B, found.gyro_bias, 0.0, 0.0, 0.0)
+        state.accel_bias, state.R_BC, state.p_BC = found.accel_bias, found.R_BC, found.p_BC
+        state.time_offset += found.time_offset
+        rows = np.r_[at.THETA, at.VELOCITY, 9:at.CORE_SIZE]
+        lens = state.P[at.LENS, at.LENS].copy()
+        # v_W = R (v_B + dv_B), and turns with the attitude: by the error of the tilt and by that of the heading
+        to_W = np.eye(len(rows))
+        to_W[3:6, 3:6], to_W[3:6, :3] = R_WB, -turned
+        state.P[at.VELOCITY] = -turned @ state.P[at.THETA]
+        state.P[:, at.VELOCITY] = -state.P[:, at.THETA] @ turned.T
+        state.P[9:, 9:] = 0.0
+        state.P[np.ix_(rows, rows)] += to_W @ P @ to_W.T
+        state.P[at.LENS, at.LENS] = lens  # considered, not estimated
         return state
