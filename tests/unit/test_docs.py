@@ -35,6 +35,12 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(path), f"{target}#{anchor}: there is no such heading"
 
 
+@pytest.mark.parametrize("page", [page for page in ALL if page not in GENERATED], ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_that_are_named_exist(page):
+    named = re.findall(r"`((?:src|tests|scripts|config|docs|bench|requirements)/[\w./-]+)`", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()] == []
+
+
 def leaves(nav) -> list[str]:
     """The pages of a navigation."""
     if isinstance(nav, str):
