@@ -133,7 +133,7 @@ def test_a_filter_that_does_not_fit_what_it_sees_starts_again_and_says_so():
         ids = np.flatnonzero(valid & MOUNT.camera.contains(pixels, 8))[:80]
         return ids, pixels[ids]
 
-    out = standing(see, 3.5, shake=0.3)
+    out = standing(see, 1.8, shake=0.3)
     lost = [r for _, r, _ in out if r.message.startswith("lost:") and r.outcome is FrameOutcome.LOST]
     assert lost and "refused" in lost[0].message and lost[0].estimate is None
     assert out[-1][1].restarts >= 1
