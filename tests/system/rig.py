@@ -28,6 +28,8 @@ nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, contr
 parameters: {vehicle: {cameras: front}, perching_planner: {time_limit: 60.0}}
 """
 """A perch whose VIO is a model, and whose front camera alone takes images; a busy machine may take its time to plan."""
+BLIND = SHORT.replace("cameras: front", "cameras: none") + "mission: {search_timeout: 3.0}\n"
+"""The same without images: it climbs, looks for a target and finds none."""
 
 
 class Rig:
@@ -39,15 +41,16 @@ class Rig:
         controller: newest state of the controller, as in `perch_msgs/ControllerStatus`.
     """
 
-    def __init__(self, folder: Path, alone: Collection[str], lockstep: bool) -> None:
+    def __init__(self, folder: Path, alone: Collection[str], lockstep: bool, scenario: str) -> None:
         """
         Args:
             folder: receives scenario, parameters and logs.
             alone: nodes with a process each; the others share one.
             lockstep: simulation time waits; otherwise the wall clock paces it.
+            scenario: what is flown, in YAML.
         """
         source = folder / "short.yaml"
-        source.write_text(SHORT)
+        source.write_text(scenario)
         self.scenario = load_scenario(source)
         self._folder, self._lines, self._came = folder, [], threading.Condition()
         started = programs(self.scenario, 1, scenario_source=str(source), composed=[n for n in ALL_NODES if n not in alone], lockstep=lockstep,
@@ -155,9 +158,9 @@ class Rig:
 
 
 @contextmanager
-def rig(folder: Path, alone: Collection[str], lockstep: bool = True) -> Iterator[Rig]:
+def rig(folder: Path, alone: Collection[str], lockstep: bool = True, scenario: str = SHORT) -> Iterator[Rig]:
     """A rig that is up, in the domain of `ROS_DOMAIN_ID`."""
-    one = Rig(folder, alone, lockstep)
+    one = Rig(folder, alone, lockstep, scenario)
     try:
         one.start_all()
         yield one

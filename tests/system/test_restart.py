@@ -7,7 +7,7 @@ import time
 
 import pytest
 from perch_msgs.msg import ControllerStatus
-from system.rig import Rig, rig
+from system.rig import BLIND, Rig, rig
 
 NAMED = 5.0  # within which a hanging node is named; its process is stopped, so that only the vehicle's own time counts [s]
 
@@ -73,7 +73,7 @@ def test_a_hanging_node_is_named_with_what_it_owes_and_goes_on(tmp_path):
 def test_in_real_time_every_flight_ends_safely_and_the_next_begins(tmp_path):
     """Deadlines are not judged here: on a busy machine a goal may end otherwise, but it ends, and the vehicle is at rest."""
     safe = (ControllerStatus.DISARMED, ControllerStatus.HOVERING, ControllerStatus.FAILED)  # the last one: motors off, and it says why
-    with rig(tmp_path, ("vio_model", "estimator", "mission", "controller"), lockstep=False) as flight:
+    with rig(tmp_path, ("vio_model", "estimator", "mission", "controller"), lockstep=False, scenario=BLIND) as flight:
         for name in ("vio_model", "estimator", "mission", "controller"):
             def acts():
                 yield "searching"
