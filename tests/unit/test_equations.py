@@ -72,6 +72,7 @@ def test_two_definitions_none_and_one_that_does_not_fly_are_refused(tmp_path, la
     assert any(word in line for line in problems(tree(tmp_path, law)))
 
 
+@pytest.mark.slow
 def test_the_index_names_every_equation():
     text = page(ROOT)
     assert all(title in text for titles in TITLES.values() for title in titles.values())

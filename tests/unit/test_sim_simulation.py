@@ -142,8 +142,7 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
 def test_a_process_that_ends_before_it_has_drawn_anything_holds_nobody_up():
     drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
     try:
-        assert not drawing.ready()
-        os.kill(drawing.process_ids["front"], signal.SIGKILL)
+        os.kill(drawing.process_ids["front"], signal.SIGKILL)  # Python itself takes longer to start than this to come
         assert eventually(drawing.ready)
     finally:
         drawing.close()

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from perch_core import so3
 from perch_core.values import ImuSample
 from perch_core.vehicle import load_vehicle
@@ -57,6 +58,7 @@ def begin(name, seed, give_up=3.5):
 PARTS = {"velocity": (slice(3, 6), at.VELOCITY), "gyro bias": (slice(6, 9), at.GYRO_BIAS), "accelerometer bias": (slice(9, 12), at.ACCEL_BIAS)}
 
 
+@pytest.mark.slow
 def test_a_start_in_motion_is_as_wrong_as_it_says():
     ends = [begin("hand", seed) for seed in range(24)]
     low, high = bounds(len(ends), 3)
