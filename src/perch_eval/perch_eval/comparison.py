@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     out = argparse.ArgumentParser(prog="compare.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
-    out.add_argument("flights", type=Path, nargs=2, metavar=("A", "B"),
+    out.add_argument("flights", type=Path, nargs=2, metavar="FLIGHT",
                      help="recording, or folder with flight.mcap and report.json")
     out.add_argument("--out", type=Path, default=Path("compare.html"), metavar="FILE",
                      help="page to write (default: %(default)s)")
