@@ -64,7 +64,7 @@ def test_a_start_in_motion_is_as_wrong_as_it_says():
     low, high = bounds(len(ends), 3)
     for part, (own, where) in PARTS.items():
         assert low < np.mean([e[own] @ np.linalg.solve(s.P[where, where], e[own]) for s, e, _ in ends]) / 3.0 < high, part
-    assert max(t for _, _, t in ends) < 0.6
+    assert max(t for _, _, t in ends) < 0.7  # at the second trial, if not at the first
 
 
 def test_a_start_in_motion_waits_where_nothing_tells_the_scale():

@@ -38,6 +38,7 @@ _LEAST_FRAMES = 6
 _MOST_FRAMES = 16      # of the longest stretch; more cost time and tell little
 _ITERATIONS = 10
 _LONGEST = 3.0         # stretch that is kept, in that after which a start is tried
+_PAUSE = 0.2           # of that, from a trial that failed to the next: it takes as long as ten frames, and one more tells little
 _GYRO_SIGMA = 0.02     # bias known at least so well before anything else is solved [rad/s]
 _PARALLAX_DEG = 0.3
 _MOST_POINTS = 40
@@ -169,7 +170,7 @@ class MotionStart:
             gyro_bias: as a filter found it that was lost; None: there was none.
         """
         self._config, self._mount = config, mount
-        self._tracks, self._stamps = Tracks(), {}
+        self._tracks, self._stamps, self._next = Tracks(), {}, 0
         self.gyro_bias = self._known_bias = np.zeros(3) if gyro_bias is None else gyro_bias
         self.gyro_sigma = config.imu.gyro_bias_init
 
@@ -189,6 +190,8 @@ class MotionStart:
             imu: samples over all frames.
             known: position and heading at the newest frame, as far as they are known, with a gyro bias (3,).
         """
+        if max(self._stamps.values()) < self._next:
+            return None
         for stretch in (1.0, _LONGEST):  # as short as it can be: tracks end, and noise grows
             frames = self._frames(imu, stretch * self._config.start.motion_time)
             state = None if frames is None else self._solve(frames, imu, known)
@@ -229,6 +232,7 @@ class MotionStart:
             dR @ self._mount.p_BC, all_rays, there, sigma, self._config.imu.accel_bias_init)
         steps = [imu.run(self._stamps[i], self._stamps[j]) for i, j in zip(frames[:-1], frames[1:])]
         refined: list[Refined] = []
+        self._next = self._stamps[frames[-1]] + round(1e9 * _PAUSE * self._config.start.motion_time)
         for end in ends:
             x = self._refined(end, parts, steps, place) if end.residual < 2 * sigma else None
             if x is not None and x.scale > 2.0 * _SCALE:
