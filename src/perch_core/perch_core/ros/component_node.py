@@ -38,6 +38,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 LOUD = ("log", "diagnostics")  # outputs that are no topics of their own
 FEW = 300                      # calls whose durations are kept
 MOST_SAID = 100                # kinds of lines whose times are kept
+DISCOVERY = 5.0                # a node that has just been started may not have found the service that it asks yet [s]
+LOOK = 0.02                    # between two looks for it [s]
 HEARTBEAT = 1.0                # a node whose component has nothing to report says all the same so often that it is there [s]
 LONGEST = 300                  # characters of a line that is no error of this program
 _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
@@ -206,12 +208,27 @@ class ComponentNode(Node):
             setattr(self.component, port.name, self._asker(port, row, client, deliver))
 
     def _asker(self, port: Client, row: topics.ServiceRow, client: Any, deliver: Callable[[Client, Any], None]) -> Callable[[Any, int], None]:
-        def ask(request: Any, due: int) -> None:
-            if not client.service_is_ready():
-                deliver(port, Unavailable(f"service {client.srv_name} is not there"))
-                return
+        def send(request: Any) -> None:
             future = client.call_async(row.request_message(request))
             future.add_done_callback(lambda done: deliver(port, _answer(row, done)))
+
+        def ask(request: Any, due: int) -> None:
+            if client.service_is_ready():
+                send(request)
+                return
+            end = time.monotonic() + DISCOVERY
+
+            def look() -> None:
+                ready = client.service_is_ready()
+                if not ready and time.monotonic() < end:
+                    return
+                self.destroy_timer(timer)
+                if ready:
+                    send(request)
+                else:
+                    deliver(port, Unavailable(f"service {client.srv_name} is not there"))
+
+            timer = self.create_timer(LOOK, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
         return ask
 
