@@ -1,0 +1,83 @@
+"""Requests of a node to another one's service, which it may not have discovered yet."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from perch_core.component import Client, Component, Service, Unavailable  # noqa: E402
+from perch_core.ros import component_node  # noqa: E402
+from perch_core.ros.arrival import ArrivalNode  # noqa: E402
+from perch_core.ros.node import close_nodes  # noqa: E402
+from perch_core.ros.wiring import Wiring  # noqa: E402
+from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+
+REQUEST = PerchPlanRequest(start=0, p=np.zeros(3), p_WS=np.array([1.7, 0.0, 0.0]), q_WS=np.array([1.0, 0.0, 0.0, 0.0]))
+NONE = PerchPlan(success=False, error_code=2, message="there is no plan")
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """No parameters."""
+
+
+class Asking(Component[Nothing]):
+    """Asks, and keeps the answers."""
+
+    config_type = Nothing
+    plan_perch = Client(PerchPlanRequest, PerchPlan, "plan_perch")
+
+    def on_plan_perch(self, answer: PerchPlan | Unavailable) -> None:
+        """Keep it."""
+        self.answers = [*getattr(self, "answers", []), answer]
+
+
+class Serving(Component[Nothing]):
+    """Answers."""
+
+    config_type = Nothing
+    plan_perch = Service(PerchPlanRequest, PerchPlan, "plan_perch")
+
+    def on_plan_perch(self, request, reply) -> None:
+        """At once."""
+        reply(NONE)
+
+
+@pytest.fixture
+def executor(ros_domain):
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    yield executor
+    close_nodes(executor.get_nodes())
+    rclpy.shutdown(context=context)
+
+
+def node(executor, kind):
+    """A node of a component, in a process of its own as far as its neighbours can tell."""
+    one = ArrivalNode(kind.__name__.lower(), kind, Wiring(), context=executor.context)
+    one.connect()
+    executor.add_node(one)
+    return one
+
+
+def test_a_request_waits_for_the_discovery_of_its_service(executor):
+    asking = node(executor, Asking).component
+    asking.plan_perch(REQUEST, 0)
+    executor.spin_once(0.1)
+    node(executor, Serving)
+    while not getattr(asking, "answers", []):
+        executor.spin_once(0.1)
+    assert [answer.message for answer in asking.answers] == [NONE.message]
+
+
+def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
+    monkeypatch.setattr(component_node, "DISCOVERY", 0.1)
+    asking = node(executor, Asking).component
+    asking.plan_perch(REQUEST, 0)
+    while not getattr(asking, "answers", []):
+        executor.spin_once(0.1)
+    assert asking.answers == [Unavailable("service plan_perch is not there")]
