@@ -1,5 +1,7 @@
 """Flights that were recorded: figures, animation, plots, report and comparison of a file are those of the values that were flown; refusals."""
 
+import base64
+import io
 import json
 import math
 import re
@@ -16,10 +18,12 @@ from perch_core.values import (
     PoseStamped, RotorState, TargetPose, TrajectoryOrder, rotated)
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, report
+from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight, timed
 from perch_eval.margins import limits, margins
 from perch_eval.mcap_log import read
 from perch_eval.metrics import flight_metrics, perch_window, rates
+from perch_eval.page import Html, section, table
 from perch_eval.replay.command import main
 from perch_eval.replay.scene import View
 from perch_eval.replay.stroboscope import stroboscope
@@ -114,10 +118,25 @@ def test_a_report_is_written(recorded, tmp_path):
     written = build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
     assert json.loads((tmp_path / "report.json").read_text())["flight_hash"] == written["flight_hash"] == recorded[1].digest(4.0)
     page = (tmp_path / "report.html").read_text()
-    for words in ("mission orders arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad", "front camera, t = 1.40 s"):
+    for words in ("mission orders arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad", "front camera, 1.00 to 3.80 s", "data:image/webp"):
         assert words in page
     assert written["real_time_factor"] == pytest.approx(1.5)
     assert "1.50: 3.00 s of simulated time in 2.00 s" in page
+
+
+def test_the_clip_shows_what_the_cameras_saw_around_the_perch_at_the_speed_of_the_flight(recorded):
+    data = re.search('data:image/webp;base64,([^"]*)', clip(RecordedFlight(recorded[0])))[1]
+    images = Image.open(io.BytesIO(base64.b64decode(data)))
+    assert images.n_frames == 15 and images.info["loop"] == 0  # 1.0 to 3.8 s by 0.2 s
+    images.seek(3)
+    images.load()
+    assert images.info["duration"] == 200
+    assert clip(Flight({})) == ""
+
+
+def test_tables_escape_what_they_are_given():
+    assert table([("<a>", "b & c", Html("<i>d</i>"))]) == "<table><tr><th>&lt;a&gt;</th><td>b &amp; c</td><td><i>d</i></td></tr></table>"
+    assert table([]) == section("title", "") == "" and "<p>none</p>" in section("title", table([]), "none")
 
 
 @pytest.mark.parametrize("key, words", [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import html
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -20,9 +19,9 @@ from perch_eval.arguments import exit_code
 from perch_eval.flight import Flight, States
 from perch_eval.margins import limits, margins
 from perch_eval.metrics import flight_metrics, perch_window, thrust_history, tilt_degrees
+from perch_eval.page import image, page, section, table
 from perch_eval.plots import LIMIT, encode
 from perch_eval.replay.scene import View
-from perch_eval.report import STYLE
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.turnable import AFTER, BEFORE, Shown, turnable
 
@@ -149,13 +148,9 @@ def compare(a: Side, b: Side) -> str:
                    min(side.last, side.end + AFTER), side.start) for side, colour in zip(sides, COLOURS)]
     figures = [("Path, seen from the side", _path), ("Position", _positions), ("Errors", _errors), ("Rates and tilt", _rates),
                ("Collective thrust, and its bounds", _thrust)]
-    pictures = "".join(f'<h2>{title}</h2><img alt="{title}" src="data:image/png;base64,{encode(draw(sides))}">'
-                       for title, draw in figures)
-    title = html.escape(f"{a.name} and {b.name}")
-    return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
-            f"<h1>{title}</h1><p>{verdict} Times count from the start of the perch.</p>"
-            f"<h2>Figures</h2>{_table(sides)}<h2>Margins</h2>{_margin_table(sides)}"
-            f"<h2>Flight in 3-D</h2>{turnable(shown)}{pictures}</html>\n")
+    return page(f"{a.name} and {b.name}", f"<p>{verdict} Times count from the start of the perch.</p>",
+                section("Figures", _table(sides)), section("Margins", _margin_table(sides), "No perch was planned."),
+                section("Flight in 3-D", turnable(shown)), *(section(name, image(encode(draw(sides)), name)) for name, draw in figures))
 
 
 # -- tables ----------------------------------------------------------------------------------------------------------
@@ -189,7 +184,7 @@ def _table(sides: Sequence[Side]) -> str:
         one, other = a.get((name, unit)), b.get((name, unit))
         difference = f"{other - one:+.2f}" if one is not None and other is not None else ""
         rows.append((f"{name} [{unit}]", *("-" if value is None else f"{value:.2f}" for value in (one, other)), difference))
-    return _html_table(("", *(side.name for side in sides), "B - A"), rows)
+    return table(rows, ("", *(side.name for side in sides), "B - A"))
 
 
 def _margin_table(sides: Sequence[Side]) -> str:
@@ -199,15 +194,7 @@ def _margin_table(sides: Sequence[Side]) -> str:
         one = next(found[name] for found in by_name if name in found)
         kept = (f"{found[name]['value']:.2f}, {found[name]['left']:+.2f} left" if name in found else "-" for found in by_name)
         rows.append((f"{name} [{one['unit']}]", limits(one), *kept))
-    return _html_table(("", "limits", *(side.name for side in sides)), rows) if rows else "<p>No perch was planned.</p>"
-
-
-def _html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def line(tags: Sequence[str], cells: Sequence[str]) -> str:
-        return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for tag, cell in zip(tags, cells))}</tr>"
-
-    lines = (line(("th", *["td"] * len(row)), row) for row in rows)
-    return f"<table>{line(['th'] * len(head), head)}{''.join(lines)}</table>"
+    return table(rows, ("", "limits", *(side.name for side in sides))) if rows else ""
 
 
 # -- pictures --------------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ import base64
 import io
 from typing import Any
 
-import cv2
 import matplotlib
 import numpy as np
 
@@ -137,7 +136,7 @@ def thrust_figure(flight: Flight, vehicle: Vehicle) -> str:
     figure, axis = plt.subplots(figsize=(12, 2.8))
     tr, wanted = flight.vectors("controller/reference", lambda r: r.thrust)
     inside = (tr >= t0) & (tr <= t1)
-    axis.plot(tr[inside], wanted[inside] if len(tr) else [], color=WANTED, lw=1.2, label="wanted")
+    axis.plot(tr[inside], wanted[inside] if len(tr) else [], color=WANTED, lw=1.2, label="reference")
     axis.plot(t[keep], commanded[keep], color=ESTIMATE, lw=0.9, label="commanded to the rotors (leads the lag)")
     axis.plot(t[keep], reached[keep], color=TRUTH, lw=1.4, label="reached")
     for bound in (4 * vehicle.thrust_min, 4 * vehicle.thrust_max):
@@ -172,16 +171,3 @@ def error_figure(flight: Flight) -> str:
         axis.grid(alpha=0.3)
         _mark(axis, flight)
     return encode(figure)
-
-
-def camera_frames(flight: Flight, times: list[float]) -> list[tuple[str, str]]:
-    """Images nearest to given times: (caption, base64 JPEG) of each camera."""
-    out = []
-    for camera in ("front", "down"):
-        frames = flight.values(f"camera_{camera}/image_raw/compressed")
-        for time in times:
-            if frames:
-                t, image = min(frames, key=lambda item: abs(item[0] - time))
-                _, jpeg = cv2.imencode(".jpg", cv2.resize(image.pixels(), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-                out.append((f"{camera} camera, t = {t:.2f} s", base64.b64encode(jpeg.tobytes()).decode()))
-    return out

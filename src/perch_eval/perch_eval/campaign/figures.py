@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,17 +10,11 @@ from matplotlib.figure import Figure
 
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.results import RunResult
+from perch_eval.plots import encode
 from perch_eval.statistics import Rate
 
 BINS = 6
 GOOD, BAD = "#2b8a3e", "#c92a2a"
-
-
-def encoded(figure: Figure) -> str:
-    """A figure as base64 PNG."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=95)
-    return base64.b64encode(buffer.getvalue()).decode()
 
 
 class Axis:
@@ -72,7 +64,7 @@ def success_map(found: Sequence[RunResult], x: str, y: str) -> str:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     figure.colorbar(image, label="success rate")
-    return encoded(figure)
+    return encode(figure)
 
 
 def success_curve(found: Sequence[RunResult], name: str) -> str:
@@ -91,7 +83,7 @@ def success_curve(found: Sequence[RunResult], name: str) -> str:
     axes.set_xlabel(name)
     axes.set_ylabel("success rate")
     axes.grid(alpha=0.3)
-    return encoded(figure)
+    return encode(figure)
 
 
 def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]]) -> str:
@@ -118,4 +110,4 @@ def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]
                   label=["perched", "failed"])
         axes.axvline(float(np.median(everything)), color="k", lw=0.8, ls="--")
     figure.axes[0].legend(fontsize=8)
-    return encoded(figure)
+    return encode(figure)

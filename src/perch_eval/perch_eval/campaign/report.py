@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.ranking import worst
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Campaign
+from perch_eval.page import Html, image, page, section, table, text
 from perch_eval.statistics import Rate, Spread
 
 METRICS = {
@@ -27,14 +27,6 @@ METRICS = {
 }
 """Metric -> title with unit, factor."""
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1150px; margin: 2em auto; padding: 0 1em; color: #222; }
-h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
-table { border-collapse: collapse; } td, th { padding: 3px 14px 3px 0; text-align: left; vertical-align: top; }
-td.n { text-align: right; font-variant-numeric: tabular-nums; } img { max-width: 100%; } .bar { background: #c92a2a; height: 11px; }
-.curves { display: flex; flex-wrap: wrap; gap: 8px; } code { background: #f4f4f4; padding: 0 3px; }
-"""
-
 
 def write_report(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> Path:
     """Write `report.html` into the campaign's folder and return its path."""
@@ -45,67 +37,54 @@ def write_report(campaign: Campaign, found: Sequence[RunResult], folder: Path) -
 
 def _page(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> str:
     rate = Rate(sum(r.cause == SUCCESS for r in found), len(found))
-    parts = [f"<h1>{html.escape(campaign.name)}: {100 * rate.value:.1f} % success</h1>" if found else f"<h1>{campaign.name}</h1>",
-             f"<p>{html.escape(campaign.description)}</p>", _facts(campaign, found, rate), _causes(found, folder)]
-    complete = [r for r in found if all(name in r.values for name in campaign.vary if name != "seed")]
-    if campaign.axes and complete:
-        parts.append(f"<h2>Success over {' and '.join(map(html.escape, campaign.axes))}</h2>"
-                     + _image(figures.success_map(complete, *campaign.axes)))
     varied = [name for name in campaign.vary if name != "seed"]
-    if varied and complete:
-        curves = "".join(_image(figures.success_curve(complete, name)) for name in varied)
-        parts.append(f'<h2>Success over each quantity, 95 % Wilson intervals</h2><div class="curves">{curves}</div>')
+    complete = [r for r in found if all(name in r.values for name in varied)]
+    parts = [f"<p>{text(campaign.description)}</p>", _facts(campaign, found, rate), _causes(found, folder)]
+    if campaign.axes and complete:
+        parts.append(section(f"Success over {' and '.join(campaign.axes)}", image(figures.success_map(complete, *campaign.axes))))
+    if complete:
+        parts.append(section("Success over each quantity, 95 % Wilson intervals",
+                             "".join(image(figures.success_curve(complete, name)) for name in varied)))
     present = {name: title for name, title in METRICS.items() if any(r.metrics.get(name) is not None for r in found)}
     if present:
-        parts += ["<h2>Errors</h2>", _spreads(found, present), _image(figures.distributions(found, present))]
-    parts.append(_failures(found, folder))
-    return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(campaign.name)}</title>'
-            f"<style>{_STYLE}</style>{''.join(parts)}</html>\n")
+        parts.append(section("Errors", _spreads(found, present) + image(figures.distributions(found, present))))
+    parts.append(section("Failed flights, and kept ones", _flights(found, folder)))
+    return page(campaign.name, *parts, heading=text(campaign.name) + (f": {100 * rate.value:.1f} % success" if found else ""))
 
 
 def _facts(campaign: Campaign, found: Sequence[RunResult], rate: Rate) -> str:
     wall = sum(r.wall_time for r in found)
-    rows = [("successes", f"{rate} (95 % Wilson interval)"), ("flown", f"{len(found)} of {len(campaign.runs)} runs"),
-            ("engine", campaign.engine + (f", cameras: vio {campaign.sensing['vio']}, target {campaign.sensing['target']}"
-                                          if campaign.engine == "in_process" else "")),
-            ("time of the workers", f"{wall:.0f} s, {wall / max(len(found), 1):.1f} s per flight"),
-            ("varied", "; ".join(f"{name}: {d.kind} {list(d.values)}" for name, d in campaign.vary.items()) or "the seed"),
-            ("settings", f"SHA-256 {campaign.digest[:16]}")]
-    return "<table>" + "".join(f"<tr><th>{k}</th><td>{html.escape(v)}</td></tr>" for k, v in rows) + "</table>"
+    return table([
+        ("successes", f"{rate} (95 % Wilson interval)"), ("flown", f"{len(found)} of {len(campaign.runs)} runs"),
+        ("engine", campaign.engine + (f", cameras: vio {campaign.sensing['vio']}, target {campaign.sensing['target']}"
+                                      if campaign.engine == "in_process" else "")),
+        ("time of the workers", f"{wall:.0f} s, {wall / max(len(found), 1):.1f} s per flight"),
+        ("varied", "; ".join(f"{name}: {d.kind} {list(d.values)}" for name, d in campaign.vary.items()) or "the seed"),
+        ("settings", f"SHA-256 {campaign.digest[:16]}")])
 
 
 def _causes(found: Sequence[RunResult], folder: Path) -> str:
     failures = [r for r in found if r.cause != SUCCESS]
-    if not failures:
-        return "<h2>Causes of failure</h2><p>No flight failed.</p>"
     most = Counter(r.cause for r in failures).most_common()
     rows = []
     for cause, count in most:
         examples = ", ".join(_link(r, folder) for r in worst([r for r in failures if r.cause == cause], 4))
-        width = 180 * count / most[0][1]
-        rows.append(f'<tr><td class="n">{count}</td><td><div class="bar" style="width:{width:.0f}px"></div></td>'
-                    f"<th>{cause}</th><td>{html.escape(MEANING.get(cause, ''))}</td><td>{examples}</td></tr>")
-    return (f"<h2>Causes of failure, ranked</h2><table><tr><th>flights</th><th></th><th>cause</th><th></th>"
-            f"<th>worst runs</th></tr>{''.join(rows)}</table>")
+        bar = Html(f'<div class="bar" style="width:{180 * count / most[0][1]:.0f}px"></div>')
+        rows.append((count, bar, Html(f"<b>{text(cause)}</b>"), MEANING.get(cause, ""), Html(examples)))
+    return section("Causes of failure, ranked", table(rows, ("flights", "", "cause", "", "worst runs")) if rows else "", "No flight failed.")
 
 
 def _spreads(found: Sequence[RunResult], present: dict[str, tuple[str, float]]) -> str:
-    rows = "".join(f"<tr><th>{html.escape(title)}</th><td>{Spread.of(r.metrics.get(name) for r in found).words(factor, 2)}</td>"
-                   f"<td>{Spread.of(r.metrics.get(name) for r in found if r.cause == SUCCESS).words(factor, 2)}</td></tr>"
-                   for name, (title, factor) in present.items())
-    return f"<table><tr><th>median [range]</th><th>all flights</th><th>perched</th></tr>{rows}</table>"
+    perched = [r for r in found if r.cause == SUCCESS]
+    return table(((title, *(Spread.of(r.metrics.get(name) for r in some).words(factor, 2) for some in (found, perched)))
+                  for name, (title, factor) in present.items()), ("median [range]", "all flights", "perched"))
 
 
-def _failures(found: Sequence[RunResult], folder: Path) -> str:
+def _flights(found: Sequence[RunResult], folder: Path) -> str:
     shown = [r for r in found if r.cause != SUCCESS][:200]
     kept = [r for r in found if r.cause == SUCCESS and (folder / _report(r)).exists()]
-    rows = "".join(
-        f"<tr><td>{_link(r, folder)}</td><td>{r.seed}</td><td>{r.cause}</td><td>{html.escape(r.message)}</td>"
-        f"<td>{html.escape(', '.join(f'{k} {_short(v)}' for k, v in r.values.items()))}</td></tr>" for r in (*shown, *kept))
-    if not rows:
-        return ""
-    return ("<h2>Failed flights, and kept ones</h2><table><tr><th>run</th><th>seed</th><th>cause</th><th>message</th>"
-            f"<th>conditions</th></tr>{rows}</table>")
+    return table(((Html(_link(r, folder)), r.seed, r.cause, r.message, ", ".join(f"{k} {_short(v)}" for k, v in r.values.items()))
+                  for r in (*shown, *kept)), ("run", "seed", "cause", "message", "conditions"))
 
 
 def _report(result: RunResult) -> str:
@@ -119,7 +98,3 @@ def _link(result: RunResult, folder: Path) -> str:
 
 def _short(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _image(data: str) -> str:
-    return f'<img src="data:image/png;base64,{data}">'

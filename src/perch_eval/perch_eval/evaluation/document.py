@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, Section
+from perch_eval.page import finite
 from perch_eval.revision import banner, commit
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", MISSING: "*not available*"}
@@ -31,15 +30,6 @@ def counts(sections: Sequence[Section]) -> dict[str, int]:
         for row in section.rows:
             out[row.verdict] = out.get(row.verdict, 0) + 1
     return out
-
-
-def finite(value: Any) -> Any:
-    """JSON has no nan: null says that a figure could not be had."""
-    if isinstance(value, dict):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def machine() -> str:

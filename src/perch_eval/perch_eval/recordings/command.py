@@ -16,6 +16,7 @@ from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
 from perch_eval.arguments import exit_code, output_folder
 from perch_eval.node_launch import parse_overrides
+from perch_eval.page import finite
 from perch_eval.recordings import report
 from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check
@@ -255,12 +256,12 @@ def _write_lines(folder: Path, perception: Perception) -> None:
         "covariance": line.covariance.tolist(),
         "observations": line.observations
     } for line in lines]
-    (folder / "powerlines.json").write_text(json.dumps(report.plain(rows), indent=1) + "\n")
+    (folder / "powerlines.json").write_text(json.dumps(finite(rows), indent=1) + "\n")
 
 
 def _write(folder: Path, title: str, content: dict[str, Any], rows: list[tuple[str, str]], findings: Any, plots: dict[str, Any],
            pictures: dict[str, Any], log: Any) -> None:
-    (folder / "report.json").write_text(json.dumps(report.plain(content), indent=1) + "\n")
+    (folder / "report.json").write_text(json.dumps(finite(content), indent=1) + "\n")
     (folder / "report.html").write_text(report.page(title, rows, findings, plots, pictures, log))
 
 
@@ -290,7 +291,7 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
             ("images", f"{len(seen)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
             ("board", f"posed in {poses}"), ("wires", str(sum(len(s["wires"]) for s in seen.values())))]
     rows += [("problem", problem) for problem in problems]
-    (args.out / "detections.json").write_text(json.dumps(report.plain(seen), indent=1) + "\n")
+    (args.out / "detections.json").write_text(json.dumps(finite(seen), indent=1) + "\n")
     _write(args.out, recording.path.name, {
         "images": len(seen),
         "tags": tags,

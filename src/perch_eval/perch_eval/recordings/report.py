@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
+from perch_eval.page import image, images, section, table
+from perch_eval.page import page as document
 from perch_eval.plots import encode
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
@@ -19,15 +16,6 @@ from perch_eval.recordings.gallery import Shown
 from perch_eval.recordings.perception import Frame, Perception
 from perch_eval.recordings.trajectory import Trajectory
 
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
-h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
-table { border-collapse: collapse; } td, th { padding: 3px 20px 3px 0; text-align: left; vertical-align: top; }
-th { font-weight: 600; white-space: nowrap; }
-.ok { color: #17692b; } .warning { color: #9a6700; } .fails { color: #a11; } img { max-width: 100%; }
-.pictures { display: grid; grid-template-columns: repeat(3, 1fr); gap: 10px; }
-figure { margin: 0; } figcaption { font-size: 12px; color: #555; }
-"""
 COLOURS = {
     "TRACKING": "#2ca02c",
     "RESTING": "#1f77b4",
@@ -50,32 +38,12 @@ def page(title: str, summary: Sequence[tuple[str, str]], findings: Sequence[Find
         pictures: title -> pictures.
         log: (node, level, text) -> how often.
     """
-    def row(*cells: str, css: str = "") -> str:
-        return f"<tr><th{css}>{html.escape(cells[0])}</th>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells[1:]) + "</tr>"
-
-    body = [f"<h1>{html.escape(title)}</h1><table>{''.join(row(*pair) for pair in summary)}</table>"]
-    body += [f'<h2>{name}</h2><img src="data:image/png;base64,{encode(figure)}">' for name, figure in figures.items()]
-    for name, shown in pictures.items():
-        if shown:
-            body.append(f'<h2>{name}</h2><div class="pictures">{"".join(map(_picture, shown))}</div>')
-    if findings:
-        rows = "".join(row(f.level, f.about, f.text, css=f' class="{f.level}"') for f in findings)
-        body.append(f"<h2>The sensors</h2><table>{rows}</table>")
-    if log:
-        lines = "".join(row(f"{node}: {level}", text, f"{n} times" if n > 1 else "") for (node, level, text), n in log.items())
-        body.append(f"<h2>What the components said</h2><table>{lines}</table>")
-    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
-    return f'<!doctype html><html lang="en">{head}{"".join(body)}</html>\n'
-
-
-def _picture(shown: Shown) -> str:
-    pixels = shown.pixels
-    scale = min(1.0, 640.0 / pixels.shape[1])
-    if scale < 1.0:
-        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    data = base64.b64encode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()).decode()
-    text = f"{1e-9 * shown.stamp:.3f} s: {html.escape(shown.caption)}"
-    return f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{text}</figcaption></figure>'
+    sensors = table(((f.level, f.about, f.text) for f in findings), classes=[f.level for f in findings])
+    lines = ((f"{node}: {level}", message, f"{n} times" if n > 1 else "") for (node, level, message), n in log.items())
+    return document(title, table(summary), *(section(name, image(encode(figure), name)) for name, figure in figures.items()),
+                    *(section(name, images((f"{1e-9 * one.stamp:.3f} s: {one.caption}", one.pixels) for one in shown))
+                      for name, shown in pictures.items()),
+                    section("The sensors", sensors), section("Log of the components", table(lines)))
 
 
 def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:
@@ -161,12 +129,3 @@ def error_figure(evaluation: Evaluation, sigma: np.ndarray) -> Figure:
     for axes in panels[2:]:
         axes.set_xlabel("time [s]")
     return figure
-
-
-def plain(value: Any) -> Any:
-    """For JSON, which has no nan: null says that a figure could not be had."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,98 @@
+"""HTML of every report: one file, offline, with the same style, tables and pictures; and JSON without nan."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; } td, th { padding: 3px 16px 3px 0; text-align: left; vertical-align: top; }
+td { overflow-wrap: anywhere; } th { font-weight: 600; white-space: nowrap; } img { max-width: 100%; }
+.good, .ok { color: #17692b; } .warning { color: #9a6700; } .bad, .fails { color: #a11; }
+.images { display: grid; grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); gap: 10px; }
+figure { margin: 0; } figcaption { font-size: 12px; color: #555; } .bar { background: #c92a2a; height: 11px; }
+"""
+
+
+class Html(str):
+    """Text that is HTML already and is not escaped."""
+
+
+def text(value: Any) -> str:
+    """Of a cell or a heading: escaped, if it is not HTML."""
+    return value if isinstance(value, Html) else html.escape(str(value))
+
+
+def page(title: str, *parts: str, heading: str | None = None) -> str:
+    """A whole document.
+
+    Args:
+        title: of the window, and the heading where none is given.
+        parts: HTML.
+        heading: HTML of the first line.
+    """
+    return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{text(title)}</title><style>{_STYLE}</style>'
+            f"<h1>{text(title) if heading is None else heading}</h1>{''.join(parts)}</html>\n")
+
+
+def section(title: str, body: str, absent: str = "") -> str:
+    """A heading and what is below it; `absent` where there is nothing below, and no section where that is empty, too."""
+    return f"<h2>{text(title)}</h2>{body or f'<p>{text(absent)}</p>'}" if body or absent else ""
+
+
+def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), classes: Sequence[str] = ()) -> str:
+    """Rows whose first cell is a heading; empty without rows.
+
+    Args:
+        rows: cells, escaped where they are not `Html`.
+        head: titles of the columns.
+        classes: CSS class of each row's first cell.
+    """
+    lines = [f"<tr><th{f' class={classes[k]}' if classes else ''}>{text(row[0])}</th>"
+             + "".join(f"<td>{text(cell)}</td>" for cell in row[1:]) + "</tr>" for k, row in enumerate(rows)]
+    first = f"<tr>{''.join(f'<th>{text(cell)}</th>' for cell in head)}</tr>" if head else ""
+    return f"<table>{first}{''.join(lines)}</table>" if lines else ""
+
+
+def image(png: str, title: str = "") -> str:
+    """A figure [PNG in base64]; empty where there is none."""
+    return f'<img alt="{text(title)}" src="data:image/png;base64,{png}">' if png else ""
+
+
+def images(pictures: Iterable[tuple[str, np.ndarray]], width: int = 640) -> str:
+    """A grid of pictures with captions.
+
+    Args:
+        pictures: caption and pixels, uint8, grey or bgr.
+        width: larger ones are reduced to this [px].
+    """
+    figures = []
+    for caption, pixels in pictures:
+        data = base64.b64encode(jpeg(pixels, width)).decode()
+        figures.append(f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{text(caption)}</figcaption></figure>')
+    return f'<div class="images">{"".join(figures)}</div>' if figures else ""
+
+
+def jpeg(pixels: np.ndarray, width: int) -> bytes:
+    """A picture, reduced to a width [px] where it is wider."""
+    scale = width / pixels.shape[1]
+    if scale < 1.0:
+        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+
+
+def finite(value: Any) -> Any:
+    """JSON has no nan: null means that a figure is not available."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
