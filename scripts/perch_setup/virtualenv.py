@@ -8,6 +8,7 @@ import shutil
 import sys
 from typing import Callable, Optional
 
+from .copies import link_copies
 from .layout import STATE, VENV, VENV_PYTHON
 from .machine import Platform
 from .progress import Step
@@ -41,11 +42,13 @@ def install(wanted: Platform, fresh: bool) -> None:
     with Step(f"installing {total} packages") as step:
         arguments = [word for lock in wanted.locks for word in ("-r", str(lock))]
         # The locks are complete, so pip has nothing to resolve; tests check that they fit together.
-        pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--progress-bar", "off", "--no-input"]
+        pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--no-compile", "--progress-bar", "off", "--no-input"]
         quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
         step.run([*pip, *quiet, *arguments], "pip", environment, _narrator(total))
         if wanted.uses_wheels:
             mend_wheels(VENV)
+        for packages in VENV.glob("lib/python3.*/site-packages/casadi"):  # 130 MB of 280
+            link_copies(packages)
     _UNFINISHED.unlink()
 
 

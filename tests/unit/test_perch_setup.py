@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from perch_setup import alone, machine, progress, stamps, virtualenv, wheel_paths, workspace
+from perch_setup import alone, copies, machine, progress, stamps, virtualenv, wheel_paths, workspace
 from perch_setup.errors import SetupError
 from perch_setup.layout import REQUIREMENTS, ROOT
 from perch_setup.machine import INSTALLED, WHEELS, check_python, check_tools, detect_platform
@@ -232,3 +232,12 @@ def test_wheel_exports_lose_the_paths_of_the_machine_that_built_them():
     mended = wheel_paths.mend(text, "/usr/include/python3.11", "/venv/numpy")
     assert '"/usr/include/python3.11;/venv/numpy"' in mended and '"${_IMPORT_PREFIX}/include"' in mended
     assert wheel_paths.mend(mended, "/usr/include/python3.11", "/venv/numpy") == mended
+
+
+def test_equal_libraries_under_several_names_become_one_file(tmp_path):
+    for name, text in {"libb.so": "b", "liba.so": "a", "liba.so.3": "a", "liba.so.3.7": "a", "a.txt": "a"}.items():
+        (tmp_path / name).write_text(1000 * text)
+    assert [copies.link_copies(tmp_path) for _ in range(2)] == [2000, 0]
+    assert (tmp_path / "liba.so").samefile(tmp_path / "liba.so.3.7") and (tmp_path / "liba.so.3").read_text() == 1000 * "a"
+    assert (tmp_path / "libb.so").read_text() == 1000 * "b" and not (tmp_path / "a.txt").samefile(tmp_path / "liba.so")
+    assert len(list(tmp_path.iterdir())) == 5
