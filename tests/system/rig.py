@@ -18,17 +18,17 @@ from perch_eval.nodes import ALL_NODES, programs
 from perch_eval.program import RunningProgram
 from perch_eval.ros.pilot import FlightResult, Pilot
 from perch_msgs.msg import ControllerStatus
-from perch_sim.scenario import load_scenario
+from perch_sim.scenario import Scenario, load_scenario
 from system.scripts import PATIENCE
 
 SHORT = """
 extends: surface_90
 name: short
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
-parameters: {vehicle: {cameras: front}, perching_planner: {time_limit: 60.0}}
+parameters: {vehicle: {cameras: front, start_timeout: 300.0, lockstep_timeout: 300.0}}
 """
-"""A perch whose VIO is a model, and whose front camera alone takes images; a busy machine may take its time to plan."""
-BLIND = SHORT.replace("cameras: front", "cameras: none") + "mission: {search_timeout: 3.0}\n"
+"""A perch whose VIO is a model, and whose front camera alone takes images; on a busy machine nodes may take their time to start."""
+BLIND = SHORT.replace("cameras: front", "cameras: none")
 """The same without images: it climbs, looks for a target and finds none."""
 
 
@@ -111,22 +111,33 @@ class Rig:
         end = time.monotonic() + duration
         self.until(lambda: time.monotonic() > end, "")
 
-    def fly(self, acts: Iterator[Callable[[], bool] | str]) -> FlightResult | PerchError:
-        """Fly the scenario's goal, and meanwhile go through `acts`: it yields what it waits for, a condition, or a phase or the goal's end."""
-        state: dict[str, object] = {"phase": "", "waits": None, "over": False}
+    def fly(self, acts: Iterator[Callable[[], bool] | str], scenario: Scenario | None = None) -> FlightResult | PerchError:
+        """Fly a goal, and meanwhile go through `acts`: it yields what it waits for, a condition, or a phase or the goal's end.
+
+        Args:
+            acts: done while it flies.
+            scenario: whose goal is flown; None: the rig's.
+        """
+        state: dict[str, object] = {"waits": None, "over": False}
+        phases = [""]  # the present one, and those that were told since the last act
+
+        def hear(_: float, phase: str, __: str) -> None:
+            if phase != "waiting":  # which is the pilot's own word
+                phases.append(phase)
 
         def go_on() -> None:
             while not state["over"]:
                 waits = state["waits"]
-                if waits is not None and not (state["phase"] == waits if isinstance(waits, str) else waits()):
+                if waits is not None and not (waits in phases if isinstance(waits, str) else waits()):
                     return
+                del phases[:-1]
                 try:
                     state["waits"] = next(acts)
                 except StopIteration:
                     state["over"] = True
 
         try:
-            result: FlightResult | PerchError = self.pilot.fly(self.scenario, lambda t, phase, text: state.update(phase=phase), go_on)
+            result: FlightResult | PerchError = self.pilot.fly(scenario or self.scenario, hear, go_on, PATIENCE)
         except PerchError as error:
             result = error
         while not state["over"]:  # what is still to be done after the goal's end

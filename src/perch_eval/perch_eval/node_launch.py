@@ -37,6 +37,7 @@ class NodeKind:
 NODES = {name: NodeKind(package, name in flight_tasks(Latency())) for name, package in PACKAGES.items()}
 ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
+PATIENT = 60.0  # wall-clock limit of a plan for which simulation time waits [s]
 HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")
 """Parameters of a node that its component knows nothing of."""
 
@@ -200,6 +201,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
     mission = {"mission.planner_latency": scenario.latency.perching_planner,
                "mission.powerline_latency": scenario.latency.powerline_planner}
     controller = dict(vehicle)
+    planner = vehicle | ({"time_limit": PATIENT} if lockstep else {})  # simulation time waits: what is flown depends on no processor
     if scenario.mode == "inspection":
         mission |= {"mission.waypoints": [v for w in scenario.inspection.waypoints for v in (*w.position, w.yaw_deg)],
                     "mission.inspection_speed": scenario.inspection.speed}
@@ -211,7 +213,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         # in lockstep the schedule lets what it says count later
         "vio_model": vehicle | {"seed": seed, "latency": 0.0 if lockstep else scenario.latency.vio}, "powerline_mapper": vehicle,
         "target_localizer": vehicle | {"board": scenario.target.board},
-        "perching_planner": vehicle, "powerline_planner": vehicle, "controller": controller, "mission": mission,
+        "perching_planner": planner, "powerline_planner": vehicle, "controller": controller, "mission": mission,
     }
 
 

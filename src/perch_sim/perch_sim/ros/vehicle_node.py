@@ -23,7 +23,6 @@ LOOK = 0.05         # between looks at who is silent [s]
 STRANGERS = 1.0     # between looks for writers that do not count [s]
 NAMED = 3.0         # a wait is named after so long [s] ...
 NAG = 10.0          # ... and again this often [s]
-GONE = 5.0          # one whose process has ended is dropped after so long [s]
 PATIENCE = 0.005    # with which results are waited for before other events are looked at [s]
 BURST = 40          # steps between which other events are looked at
 DRAWING_WAIT = 0.02  # for an image without which nobody can go on, at a time [s]
@@ -49,7 +48,7 @@ class VehicleNode(ComponentNode):
         self._looks = 0
         self._begun = self._progress = self._named = time.monotonic()
         self._dropped: set[str] = set()
-        self._gone: dict[str, float] = {}  # name -> when its connection ended, monotonic clock [s]
+        self._gone: set[str] = set()  # whose connection has ended
         self._undrawn: list[tuple[Publication, CameraImage]] = []
         self._pacing: Pacing | None = None
         self._allowance = 0
@@ -95,7 +94,7 @@ class VehicleNode(ComponentNode):
             one = self._remote[name] = RemoteParticipant(name, inputs, connection)
             self._links.add(connection)
             self._dropped.discard(name)
-            self._gone.pop(name, None)
+            self._gone.discard(name)
             if self._started:
                 self._schedule.join(one)
                 self.get_logger().warning(f"lockstep: {name} is back")
@@ -110,7 +109,7 @@ class VehicleNode(ComponentNode):
             one.receive()
             if one.gone:
                 self._links.remove(connection)
-                self._gone[one.name] = time.monotonic()
+                self._gone.add(one.name)
                 self.get_logger().error(f"lockstep: {one.name} is gone")
         return bool(connections)
 
@@ -219,12 +218,9 @@ class VehicleNode(ComponentNode):
             self._named = now
             self.get_logger().warning(f"lockstep: for {silence:.0f} s waiting for {self._waiting()}")
         for name in [one.name for one in owed if one.name in self._remote]:
-            limit = self.component.config.lockstep_timeout
-            if name in self._gone:
-                limit = min(GONE, limit)
-            elif self._schedule.now < BEGUN:
+            if name not in self._gone and self._schedule.now < BEGUN:
                 continue  # it may wait for a goal, and planners that are to serve it may still compile
-            if silence > limit:
+            if silence > self.component.config.lockstep_timeout:  # one that has ended may be started again meanwhile
                 self._drop(name, "gone" if name in self._gone else f"silent for {silence:.0f} s")
                 self._progress = now
 
