@@ -1,4 +1,4 @@
-"""The pad along a flight of the evaluation: what is wrong with the body's pose is wrong with the target's, and counted."""
+"""The pad along a flight of the evaluation: what is wrong with the body's pose is wrong with the target's, and does not count."""
 
 import numpy as np
 import pytest
@@ -35,12 +35,11 @@ def test_the_estimated_body_is_the_truth_less_the_error(hover):
 
 
 @pytest.mark.slow
-def test_errors_of_the_body_are_errors_of_the_target(hover):
+def test_errors_of_the_body_move_vehicle_and_target_alike(hover):
     scenario, flight = hover
     exact = see_target(scenario, flight, track_of(flight), 3, 3.5, 3.8)
     wrong = see_target(scenario, flight, track_of(flight, np.r_[OFF, np.zeros(12)], sigma=0.015), 3, 3.5, 3.8)
     assert np.isfinite(exact.errors).all() and len(exact.times) == 9
     assert np.linalg.norm(exact.errors[:, :3], axis=1).max() < 0.01
-    np.testing.assert_allclose(wrong.errors[:, :3] - exact.errors[:, :3], np.tile(OFF, (9, 1)), atol=2e-3)
-    nees = consistency.nees(wrong.errors, wrong.covariances)
-    assert nees.max() < 16.8 < consistency.nees(wrong.errors, exact.covariances).min()  # 99 % of chi2 with 6 degrees of freedom
+    np.testing.assert_allclose(wrong.errors[:, :3], exact.errors[:, :3], atol=2e-3)
+    assert consistency.nees(wrong.errors, wrong.covariances).max() < 16.8  # 99 % of chi2 with 6 degrees of freedom

@@ -49,6 +49,7 @@ class World:
         self.period, self.stamp, self.clock, self.planner = period, 5 * NANOSECONDS, 900 * NANOSECONDS, planner or self.plan
         self.p, self.q, self.state, self.id = np.zeros(3), LEVEL, ControllerState.DISARMED, 0
         self.flown = self.contact = None
+        self.covariance = NONE
         self.requests, self.orders, self.commands, self.lines, self.sees, self.odometry = [], [], [], [], True, True
         self.mission.trajectory.receivers.append(self.fly)
         self.mission.recovery.receivers.append(self.orders.append)
@@ -83,7 +84,7 @@ class World:
         for stamp in range(self.stamp - TICK + self.period, self.stamp + 1, self.period):
             self.mission.on_imu(ImuSample(stamp, (0.0,) * 3, force))
             if self.odometry:
-                self.mission.on_odometry(OdometryState(stamp, tuple(map(float, self.p)), self.q, (0.0,) * 3, (0.0,) * 3, NONE, NONE))
+                self.mission.on_odometry(OdometryState(stamp, tuple(map(float, self.p)), self.q, (0.0,) * 3, (0.0,) * 3, self.covariance, NONE))
         self.mission.on_status(ControllerStatus(self.stamp, int(self.state), "geometric", self.id, 0.0, 0.0, 0.0, 0.0, 1.0, "says so"))
         self.mission.on_estimator(EstimatorHealth(self.stamp, 1, 0.0, 1, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""))
         if self.sees:
@@ -280,6 +281,18 @@ def test_a_target_before_any_odometry_is_not_believed():
     world.mission.on_target(TargetPose(10**15, SURFACE.p_WS, Q_PERCH, 1e-4 * np.eye(6)))
     world.send().run()
     assert world.goal.ending == "succeeded"
+
+
+@pytest.mark.parametrize("sigma, grown, found", [(3.0, 0.0, True), (3.0, 0.2, False)])
+def test_of_the_odometrys_uncertainty_only_what_has_come_since_the_sighting_counts(sigma, grown, found):
+    """Metres of drift since take-off move vehicle and pad alike; what comes after the pad was last seen does not."""
+    world = World()
+    world.covariance = sigma**2 * np.eye(6)
+    world.send().run(until=lambda w: w.phase == "searching").run(0.1)  # seen since then
+    world.sees, world.covariance = False, (sigma**2 + grown**2) * np.eye(6)
+    world.run()
+    assert world.goal.ending == ("succeeded" if found else "aborted")
+    assert found or "position uncertain by" in world.goal.result.message
 
 
 @pytest.mark.parametrize("odometry", [

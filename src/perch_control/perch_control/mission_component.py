@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Wake
-from perch_core.covariance import largest_sigma
+from perch_core.covariance import drift, largest_sigma
 from perch_core.errors import PerchError
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, ControllerCommand, ControllerStatus, Done, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
@@ -98,7 +98,7 @@ class Mission(Component[MissionParameters]):
         self._moves = Moves(self.config.mission)  # home stays from goal to goal
         self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_MOST)
         self._odometry: OdometryState | None = None
-        self._pad: Target | None = None
+        self._pad: tuple[TargetPose, np.ndarray] | None = None  # and the covariance of the odometry when it came, shape (6, 6)
         self._map: PowerlineMap | None = None
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
@@ -149,17 +149,26 @@ class Mission(Component[MissionParameters]):
 
     def on_target(self, pose: TargetPose) -> None:
         """Keep the newest pose of the pad."""
-        p, q, covariance = pose.p_WS, pose.q_WS, pose.covariance
-        newest, problem = self._stamps.newest, ""
-        if newest is None or pose.stamp > newest + AHEAD:
+        problem = ""
+        if self._odometry is None:
+            problem = "there is no odometry yet"
+        elif pose.stamp > self._stamps.newest + AHEAD:
             problem = "its stamp is in the future"
-        elif self._pad is not None and seconds(pose.stamp) < self._pad.time:
+        elif self._pad is not None and pose.stamp < self._pad[0].stamp:
             problem = "it is older than the newest"
         if problem:
             self.warn(f"target/pose refused: {problem}", every=1.0)
             return
-        self._pad = Target(seconds(pose.stamp), p, q / np.linalg.norm(q), position_sigma=largest_sigma(covariance[:3, :3]),
-                           attitude_sigma=largest_sigma(covariance[3:, 3:]))
+        self._pad = pose, self._odometry.pose_covariance
+
+    def _pad_now(self) -> Target | None:
+        """The pad as it stands to the vehicle: what the odometry has drifted since it was seen makes it less certain."""
+        if self._pad is None:
+            return None
+        (pose, before), x = self._pad, self._odometry
+        covariance = pose.covariance + drift(x.pose_covariance, before, pose.p_WS - x.p_WB)
+        return Target(seconds(pose.stamp), pose.p_WS, pose.q_WS / np.linalg.norm(pose.q_WS), largest_sigma(covariance[:3, :3]),
+                      largest_sigma(covariance[3:, 3:]))
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
         """Keep the newest map."""
@@ -251,7 +260,7 @@ class Mission(Component[MissionParameters]):
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0, trajectory_time=status.trajectory_time if status else 0.0,
-            target=self._machine.target(self._pad, self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3), plan=answer,
+            target=self._machine.target(self._pad_now(), self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3), plan=answer,
             cancel=self._goal.cancel_requested, imu_period=self._imu_period.value)
 
     def _act(self, stamp: int, outputs: Outputs) -> None:

@@ -1,8 +1,10 @@
-"""What a covariance says in one number."""
+"""What a covariance says in one number, and how much of one a moving vehicle adds."""
 
 from __future__ import annotations
 
 import numpy as np
+
+from perch_core import so3
 
 
 def largest_sigma(covariance: np.ndarray) -> float:
@@ -12,3 +14,25 @@ def largest_sigma(covariance: np.ndarray) -> float:
         covariance: symmetric, shape (n, n); one that rounding has made slightly negative counts as zero.
     """
     return float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance)[-1])))
+
+
+def drift(now: np.ndarray, before: np.ndarray, u_W: np.ndarray) -> np.ndarray:
+    """What the odometry's drift since a sighting adds to the covariance of a place relative to the vehicle.
+
+    The odometry's error is the sum of independent increments, e_t = e_s + w, so that cov(w) = P_t - P_s; what it is surer of than before
+    is no drift (the positive semidefinite part is taken). w moves the vehicle, and the place stays where it was seen:
+    J cov(w) J^T with J = [I, -[u]x; 0, I].
+
+    Args:
+        now: P_t, covariance of the odometry's pose (position in W, rotation about W's axes) [m, rad], shape (6, 6).
+        before: P_s, the same at the sighting.
+        u_W: from the vehicle to the place, in W [m], shape (3,).
+
+    Returns:
+        Covariance of (position, rotation) in the axes of W [m, rad], shape (6, 6).
+    """
+    values, vectors = np.linalg.eigh(now - before)
+    J = np.eye(6)
+    J[:3, 3:] = -so3.hat(u_W)
+    J = J @ vectors
+    return (J * np.clip(values, 0.0, None)) @ J.T

@@ -1,7 +1,7 @@
-"""The pad seen by the front camera along a flight of `estimation_flight`, and how wrong and how sure its pose in W is.
+"""The pad seen by the front camera along a flight of `estimation_flight`, and how wrong and how sure its pose relative to the vehicle is.
 
 The images have the camera's calibration errors, the body's pose is the estimator's, so that everything is in the error that
-`target/pose` claims to know.
+`target/pose` claims to know: that of T_BS, in the axes of W.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class Sightings:
 
     Attributes:
         times: middle of the exposure [s], shape (n,).
-        errors: truth minus estimate of (position, rotation about W's axes), shape (n, 6); NaN where the pad was not found.
+        errors: truth minus estimate of (position, rotation) relative to the vehicle, in the axes of W, shape (n, 6); NaN where the pad was
+            not found.
         covariances: shape (n, 6, 6); NaN likewise.
     """
 
@@ -72,6 +73,9 @@ def see_target(scenario: Scenario, flight: Flight, track: EstimatorTrack, seed: 
         found = localizer.process(image, exposed, body).board
         if found is not None:
             pose = to_map(found, body, mount, CalibrationSigma())
-            errors[k] = np.concatenate([surface.p_WS - pose.p_WS, so3.log(surface.R_WS @ pose.R_WS.T)])
+            true = flight.motion.sample(np.array([exposed]))
+            turn = body.R_WB @ true.R_WB[0].T  # where the true vehicle is put where the estimated one is, the true pad is there
+            p_WS, R_WS = body.p_WB + turn @ (surface.p_WS - true.p_WB[0]), turn @ surface.R_WS
+            errors[k] = np.concatenate([p_WS - pose.p_WS, so3.log(R_WS @ pose.R_WS.T)])
             covariances[k] = pose.covariance
     return Sightings(times, errors, covariances)

@@ -38,7 +38,7 @@ class TargetLocalizerConfig:
                               doc="joint: latest image, all corners together; average: the paper's mean over the tags of "
                                   "the first complete image; fused: all images")
     max_position_sigma: float = config.quantity(0.10, unit="m", above=0.0, high=10.0,
-                                                doc="worst axis with which target/pose is still published")
+                                                doc="worst axis, relative to the vehicle, with which target/pose is still published")
     max_attitude_sigma: float = config.quantity(5.0, unit="deg", above=0.0, high=180.0, doc="the same for the attitude")
     localizer: LocalizerConfig = config.part(LocalizerConfig)
     calibration: CalibrationSigma = config.part(CalibrationSigma)
@@ -158,7 +158,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
     def _fuse(self, measured: MapPose) -> None:
         if self._target is not None:
             self._target = fuse(self._target, measured)
-        elif self._good(measured.covariance):  # not before the estimator knows where it is
+        elif self._good(measured.covariance):
             self._target = start_fusion(measured)
 
     def _good(self, covariance: np.ndarray) -> bool:

@@ -85,8 +85,8 @@ class Target:
         time: stamp of the image [s].
         p_WS: position in W [m], shape (3,).
         q_WS: attitude xyzw, shape (4,).
-        position_sigma: largest 1-sigma of the position [m].
-        attitude_sigma: largest 1-sigma of the attitude [rad].
+        position_sigma: largest 1-sigma of the position relative to the vehicle [m].
+        attitude_sigma: the same of the attitude [rad].
         lines: the map of powerlines that the target belongs to; none for a pad.
         line: id of the target's line in that map.
     """

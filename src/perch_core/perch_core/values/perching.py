@@ -16,7 +16,8 @@ class TargetPose(NamedTuple):
         stamp: middle of the last image's exposure on the IMU's clock [ns].
         p_WS: position [m], shape (3,).
         q_WS: attitude, shape (4,).
-        covariance: of (position in W, rotation about W's axes) [m, rad], shape (6, 6).
+        covariance: of (position, rotation) in the axes of W relative to the vehicle at the stamp [m, rad], shape (6, 6): the odometry's own
+            error there moves vehicle and target alike and is not in it.
     """
 
     stamp: int

@@ -1,8 +1,8 @@
 """Recursive fusion of all images into one target pose in the map, with an honest covariance.
 
-A Schmidt-Kalman filter: the target's six errors are estimated, the shared errors (calibration, time offset,
-odometry) are only considered, with their correlation to the estimate. So corner noise averages out, shared errors do
-not, and near images, which they move less, weigh more.
+A Schmidt-Kalman filter: the target's six errors relative to the vehicle are estimated, the shared errors (calibration, time offset)
+are only considered, with their correlation to the estimate. So corner noise averages out, shared errors do not, and near images, which
+they move less, weigh more. Between images the odometry's drift is process noise.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core import so3
+from perch_core.covariance import drift
 from perch_perception.tags.map_pose import MapPose
 
 GATE = 22.5        # chi^2 with 6 degrees of freedom, 99.9 %
@@ -25,7 +26,8 @@ class FusedTarget:
     Attributes:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
-        joint: covariance of (dp, dtheta, c), shape (20, 20), c being the shared errors of `map_pose`.
+        joint: covariance of (dp, dtheta, c), shape (14, 14), c being the shared errors of `map_pose`.
+        odometry: covariance of the vehicle's pose at the last image, shape (6, 6).
         frames: images in it.
         refused: images in a row that contradicted it.
     """
@@ -33,19 +35,20 @@ class FusedTarget:
     p_WS: np.ndarray
     R_WS: np.ndarray
     joint: np.ndarray
+    odometry: np.ndarray
     frames: int = 1
     refused: int = 0
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of (dp, dtheta) in the axes of W, shape (6, 6)."""
+        """Of (dp, dtheta) relative to the vehicle at the last image, in the axes of W, shape (6, 6)."""
         return self.joint[:6, :6]
 
 
 def start_fusion(pose: MapPose) -> FusedTarget:
     """The target after its first image."""
     cross = pose.by_shared @ pose.shared
-    return FusedTarget(pose.p_WS, pose.R_WS, np.block([[pose.covariance, cross], [cross.T, pose.shared]]))
+    return FusedTarget(pose.p_WS, pose.R_WS, np.block([[pose.covariance, cross], [cross.T, pose.shared]]), pose.odometry)
 
 
 def fuse(target: FusedTarget, pose: MapPose) -> FusedTarget:
@@ -54,7 +57,8 @@ def fuse(target: FusedTarget, pose: MapPose) -> FusedTarget:
     An image that contradicts the estimate (a flip, a wrong tag) is counted but not used; after five in a row the
     estimate is taken to be the wrong one (the pad was moved, the odometry jumped) and starts anew.
     """
-    joint = _drifted(target.joint, pose.shared)
+    joint = target.joint.copy()
+    joint[:6, :6] += drift(pose.odometry, target.odometry, pose.p_BS_W)
     innovation = np.concatenate([pose.p_WS - target.p_WS, so3.log(pose.R_WS @ target.R_WS.T)])
     # With e = estimate - truth and measurement = truth + G c + v: innovation = -(e - G c) + v.
     H = np.concatenate([np.eye(6), -pose.by_shared], axis=1)
@@ -62,20 +66,11 @@ def fuse(target: FusedTarget, pose: MapPose) -> FusedTarget:
     if innovation @ np.linalg.solve(S, innovation) > GATE:
         if target.refused + 1 >= RESTART_AFTER:
             return start_fusion(pose)
-        return FusedTarget(target.p_WS, target.R_WS, joint, target.frames, target.refused + 1)
+        return FusedTarget(target.p_WS, target.R_WS, joint, pose.odometry, target.frames, target.refused + 1)
     K = np.linalg.solve(S, (joint @ H.T)[:6].T).T             # gain of the target only: Schmidt
     shift = K @ innovation
     update = np.eye(joint.shape[0])
     update[:6] -= K @ H
     joint = update @ joint @ update.T
     joint[:6, :6] += K @ pose.noise @ K.T                     # Joseph form
-    return FusedTarget(target.p_WS + shift[:3], so3.exp(shift[3:]) @ target.R_WS, 0.5 * (joint + joint.T),
-                       target.frames + 1, 0)
-
-
-def _drifted(joint: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """The shared errors' covariance brought up to date: where the odometry became less certain, the growth is new."""
-    joint = joint.copy()
-    growth = np.clip(np.diag(shared) - np.diag(joint)[6:], 0.0, None)
-    joint[6:, 6:] += np.diag(growth)
-    return joint
+    return FusedTarget(target.p_WS + shift[:3], so3.exp(shift[3:]) @ target.R_WS, 0.5 * (joint + joint.T), pose.odometry, target.frames + 1)

@@ -1,8 +1,10 @@
-"""The board's pose in the map W, and where its uncertainty comes from.
+"""The board's pose in the map W, and how uncertain it is relative to the vehicle.
 
-Two kinds of errors: the corners' noise is new in every image; calibration, time offset and the odometry's drift are the
-same in all images of a second, and averaging does not remove them. They are kept apart: `noise` is a covariance,
-`by_shared` says how the shared errors c move the result.
+The odometry's own error at the exposure moves vehicle and board alike: a perch depends on T_BS = T_WB^-1 T_WS alone, so that error is not
+counted here, though it grows for as long as VIO flies. What the odometry drifts after the exposure does count: `perch_core.covariance.drift`.
+
+Two kinds of errors are left: the corners' noise is new in every image; calibration and time offset are the same in all images, and
+averaging does not remove them. They are kept apart: `noise` is a covariance, `by_shared` says how the shared errors c move the result.
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.pose import BoardPose
 
 # The shared errors c, in this order
-ROTATION, INTRINSICS, TIME, BODY = slice(0, 3), slice(3, 7), 7, slice(8, 14)
-SHARED = 14
+ROTATION, INTRINSICS, TIME = slice(0, 3), slice(3, 7), 7
+SHARED = 8
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,11 @@ class MapPose:
     Attributes:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
-        noise: covariance of (dp, dtheta) in the axes of W from this image alone [m, rad], shape (6, 6).
-        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 14).
-        shared: covariance of c, shape (14, 14).
+        noise: covariance of (dp, dtheta), T_BS turned into the axes of W, from this image alone [m, rad], shape (6, 6).
+        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 8).
+        shared: covariance of c, shape (8, 8).
+        p_BS_W: from the vehicle to S, in W [m], shape (3,).
+        odometry: covariance of the vehicle's pose at the exposure, shape (6, 6); with a later one it says how far the odometry has drifted.
     """
 
     p_WS: np.ndarray
@@ -57,15 +61,17 @@ class MapPose:
     noise: np.ndarray
     by_shared: np.ndarray
     shared: np.ndarray
+    p_BS_W: np.ndarray
+    odometry: np.ndarray
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of (dp, dtheta) from all causes, shape (6, 6)."""
+        """Of (dp, dtheta), relative to the vehicle: noise + G cov(c) G^T, shape (6, 6)."""
         return self.noise + self.by_shared @ self.shared @ self.by_shared.T
 
 
 def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: CalibrationSigma) -> MapPose:
-    """T_WS = T_WB T_BC T_CS with all its errors, to first order.
+    """T_WS = T_WB T_BC T_CS with the errors of T_BS, to first order.
 
     Args:
         board: pose in the camera.
@@ -76,18 +82,14 @@ def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: C
     R_WB = body.R_WB
     R_WC = R_WB @ mount.R_BC
     v_CS_W = R_WC @ board.p_CS                       # from the camera to S, in W
-    v_BS_W = R_WB @ mount.p_BC + v_CS_W              # from the body to S, in W
+    p_BS_W = R_WB @ mount.p_BC + v_CS_W              # from the body to S, in W
     turned = np.kron(np.eye(2), R_WC)
     by_shared = np.zeros((6, SHARED))
     # the camera turned on the vehicle by a rotation in axes of B, where it is constant
     by_shared[:, ROTATION] = np.concatenate([-so3.hat(v_CS_W), np.eye(3)]) @ R_WB
     by_shared[:, INTRINSICS] = turned @ board.by_intrinsics
     w_W = R_WB @ body.w_WB_B
-    by_shared[:, TIME] = np.concatenate([body.v_WB + np.cross(w_W, v_BS_W), w_W])
-    by_shared[:3, BODY] = np.concatenate([np.eye(3), -so3.hat(v_BS_W)], axis=1)
-    by_shared[3:, BODY] = np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1)
-    shared = np.zeros((SHARED, SHARED))
+    by_shared[:, TIME] = np.concatenate([body.v_WB + np.cross(w_W, p_BS_W), w_W])
     sigma = [*[np.radians(calibration.rotation)] * 3, *calibration.lens, calibration.time]
-    shared[:8, :8] = np.diag(np.square(sigma))
-    shared[BODY, BODY] = body.covariance
-    return MapPose(body.p_WB + v_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, shared)
+    return MapPose(body.p_WB + p_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, np.diag(np.square(sigma)),
+                   p_BS_W, body.covariance)
