@@ -21,7 +21,7 @@ from perch_core import compiled
 from perch_core.errors import PlanningRefusal
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.progress import Progress
-from perch_eval.evaluation.perching import source_digest
+from perch_eval.revision import digest
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PowerlineRequest
@@ -61,7 +61,7 @@ def figures(quick: bool) -> list[Figure]:
 def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
     """What the planner says to so many random starts of each case; plans of the same sources are not made again."""
     STATE.mkdir(parents=True, exist_ok=True)
-    path = STATE / f"powerline_{source_digest()[:12]}.jsonl"
+    path = STATE / f"powerline_{digest()}.jsonl"
     lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
     known = {(one["case"], one["start"]): one for one in (json.loads(line) for line in lines if line.endswith("\n"))}
     asked = [(case, k) for case in SOLVE_BARS for k in range(starts)]

@@ -21,6 +21,7 @@ def part(*claims, missing=False):
         section = Section("s", "A table", "seeds 1 to 5")
         for k, holds in enumerate(claims):
             section.claim(f"claim {k}", "1 | 2", "3", holds, "smaller")
+        section.claim("recoveries", "0 of 0", "", None, "all that did not grip")
         section.compare("a comparison", "4 cm", "3 cm", False)
         if missing:
             section.missing("flown", "7 cm", "no such flight yet")
@@ -44,6 +45,9 @@ def test_the_exit_code_tells_failed_claims_and_missing_rows(tmp_path, monkeypatc
     page = (tmp_path / "results" / "README.md").read_text()
     content = json.loads((tmp_path / "results" / "results.json").read_text())
     assert ("**FAILS**" in page) == (code == 1)
+    assert "| 0 of 0 |  | *vacuous* |" in page or parts == {"a": broken}
+    assert "`python3 scripts/evaluate.py --seeds 5 --line-seeds 1 --layouts 3 --out results` on " in page
+    assert content["command"].endswith("--out results") and len(content["digest"]) == 12 and content["commit"] and content["machine"]
     assert ("*not available*" in page) == any(row["verdict"] == "not available" for s in content["sections"] for row in s["rows"])
     assert not [line for line in page.splitlines() if line.startswith("|") and "1 | 2" in line]  # a cell keeps its table whole
 

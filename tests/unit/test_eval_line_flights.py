@@ -10,7 +10,7 @@ from perch_eval.campaign.results import RunResult
 from perch_eval.evaluation import powerline_flights
 from perch_eval.evaluation.powerline import flown_sections
 from perch_eval.evaluation.powerline_flights import mapping_errors, perching_errors
-from perch_eval.evaluation.sections import FAILS, HOLDS, Effort
+from perch_eval.evaluation.sections import FAILS, HOLDS, VACUOUS, Effort
 from perch_eval.flight import Flight, States
 from perch_sim.scenario import Cable, Mission, Scenario, World
 
@@ -94,7 +94,7 @@ def test_a_crash_on_the_way_is_no_error_at_the_perch():
 
 
 def effort(tmp_path, seeds: int) -> Effort:
-    return Effort(full=True, jobs=1, out=tmp_path, state=tmp_path, line_seeds=seeds)
+    return Effort(True, 1, tmp_path, tmp_path, "evaluate.py", False, perch_seeds=1, line_seeds=seeds, layouts=1)
 
 
 def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):
@@ -106,11 +106,12 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
             yield RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values)
 
     monkeypatch.setattr(powerline_flights, "in_pool", pool)
-    found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"), "digest")
+    monkeypatch.setattr(powerline_flights, "digest", lambda: "0123456789ab")
+    found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
     assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
         ("line_80_pa", True): [1, 2], ("line_80_pa", False): [], ("line_180", True): [1, 2], ("line_180", False): [1, 2]}
     assert all(task.scenario.get("grip", {}).get("enabled", True) == task.run.values["grips"] for task in handed)
-    found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"), "digest")
+    found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
     assert [r.seed for r in found["line_180", False]] == [1, 2, 3] and [r.seed for r in found["line_180", True]] == [1, 2, 3, 4, 5]
     assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
 
@@ -127,5 +128,6 @@ def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outc
     [section] = flown_sections(effort(tmp_path, 1))
     rows = {row.name: row for row in section.rows}
     assert rows["180 deg, grip switched off: recoveries to a hover"].verdict == verdict
+    assert rows["180 deg: recoveries to a hover"].verdict == VACUOUS, "all gripped"
     assert rows["180 deg: gripped the cable"].ours.startswith("1/1")
     assert "80 deg, perception-aware, grip switched off: recoveries to a hover" not in rows

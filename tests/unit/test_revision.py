@@ -1,4 +1,4 @@
-"""Pages of results say of which commit they are."""
+"""Pages of results say of which commit they are, on which machine and by which command they were made, and when they are older than the code."""
 
 from __future__ import annotations
 
@@ -6,15 +6,41 @@ import re
 from pathlib import Path
 
 import pytest
-from perch_eval.revision import banner
+from perch_eval import revision
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
+PAGES = sorted(RESULTS.rglob("*.md"))
+NOW = revision.digest()
 
 
-@pytest.mark.parametrize("page", sorted(RESULTS.rglob("*.md")), ids=lambda page: str(page.relative_to(RESULTS)))
-def test_a_page_says_of_which_code_it_is(page):
-    assert re.match(r"# .+\n\n> \*\*(Of commits? [0-9a-f]{7}|Older than the code)", page.read_text())
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(RESULTS)))
+def test_a_page_says_of_which_code_it_is_and_how_it_was_made(page):
+    text = page.read_text()
+    assert re.match(r"# .+\n\n> \*\*Of commits? [0-9a-f]{7}", text)
+    for what, pattern in {"command": r"`(python3 )?scripts/\w+\.py", "machine": r"\d+ cores, Python 3", "seeds": r"\b[Ss]eed|without noise|random"}.items():
+        assert re.search(pattern, text), what
 
 
-def test_a_banner_names_all_commits_and_leads_to_what_has_changed():
-    assert "Of commit 13d2870+, cde665f.**" in banner("13d2870+, cde665f") and "git diff --stat 13d2870 -- src config" in banner("13d2870+, cde665f")
+@pytest.mark.skipif(not NOW, reason="not in a git repository")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(RESULTS)))
+def test_a_page_of_other_code_says_so(page):
+    assert not revision.out_of_date(page.read_text(), NOW), "python3 -m perch_eval.revision"
+
+
+def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
+    monkeypatch.setattr(revision, "commit", lambda: "1234567")
+    monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
+    page = tmp_path / "page.md"
+    page.write_text(f"# Results\n\n{revision.banner('1234567')}\n\n## A table\n")
+    assert page.read_text().splitlines()[2] == (
+        "> **Of commit 1234567** (digest 0123456789ab). What has changed since: `git diff --stat 1234567 -- src config`")
+    assert revision.mark([page]) == []
+    monkeypatch.setattr(revision, "digest", lambda: "ba9876543210")
+    assert revision.mark([page]) == [page] and revision.mark([page]) == []
+    assert "> **Of commit 1234567, older than the code** (digest 0123456789ab)." in page.read_text()
+
+
+def test_results_of_several_commits_are_older_than_the_code():
+    text = revision.banner("13d2870+, cde665f")
+    assert "Of commits 13d2870+, cde665f, older than the code**" in text and "git diff --stat 13d2870 -- src config" in text
+    assert not revision.out_of_date(text, NOW)

@@ -1,22 +1,79 @@
-"""Which code a result is of."""
+"""Which code a result is of: commit, and a digest of all sources and configuration.
+
+    python3 -m perch_eval.revision [PAGE...]      mark the pages of results that are of other code
+"""
 
 from __future__ import annotations
 
+import hashlib
+import re
 import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
 
-FLOWN = ("src", "config")
+from perch_core.config import config_dir
+
+CODE = ("src", "config")
+OLDER = ", older than the code"
+_DIGEST = re.compile(r"\(digest ([0-9a-f]{12})\)")
+
+
+def root() -> Path:
+    """The checkout that this code runs from."""
+    return config_dir().resolve().parent
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", "-C", str(root()), *arguments], capture_output=True, text=True, check=False).stdout.strip()
 
 
 def commit() -> str:
     """Of the code, with a plus sign where the sources have changed since; `unknown` outside a repository."""
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], capture_output=True, text=True, check=False).stdout.strip()
+    found = _git("rev-parse", "--short=7", "HEAD")
+    return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)) if found else "unknown"
 
-    found = git("rev-parse", "--short", "HEAD")
-    return found + "+" * bool(git("status", "--porcelain", "--untracked-files=no", *FLOWN)) if found else "unknown"
+
+def digest() -> str:
+    """SHA-256 over all files of src and config that git tracks, as they are in the working tree, 12 digits; empty outside a repository."""
+    total = hashlib.sha256()
+    names = _git("ls-files", *CODE).splitlines()
+    for name in names:
+        path = root() / name
+        total.update(name.encode() + b"\0" + (path.read_bytes() if path.is_file() else b"") + b"\0")
+    return total.hexdigest()[:12] if names else ""
 
 
 def banner(commits: str) -> str:
-    """What a page of results begins with: the commits that it is of, and how to see what has changed since."""
+    """First lines of a page of results: its commits, whether they are older than the code, and how to see the changes.
+
+    Args:
+        commits: as `commit()` gave them when the results were made, separated by commas.
+    """
+    several = "," in commits
+    of = f"(digest {digest()})" if commits == commit() else ""
     first = commits.partition("+")[0].partition(",")[0].partition(" ")[0]
-    return f"> **Of commit {commits}.** What has changed since: `git diff --stat {first} -- {' '.join(FLOWN)}`"
+    return (f"> **Of commit{'s' * several} {commits}{'' if of else OLDER}** {of}".rstrip()
+            + f". What has changed since: `git diff --stat {first} -- {' '.join(CODE)}`")
+
+
+def out_of_date(page: str, now: str) -> bool:
+    """Whether a page is of code of another digest than `now` and does not say so."""
+    made = _DIGEST.search(page)
+    return OLDER not in page.partition("\n## ")[0] and (made is None or made[1] != now)
+
+
+def mark(pages: Iterable[Path]) -> list[Path]:
+    """Write into the banner of each page that is out of date that it is older than the code; returns these pages."""
+    now, marked = digest(), []
+    for path in pages:
+        page = path.read_text()
+        if out_of_date(page, now):
+            path.write_text(re.sub(r"(> \*\*Of commits? [^*\n]*?)\.?\*\*", rf"\g<1>{OLDER}**", page, count=1))
+            marked.append(path)
+    return marked
+
+
+if __name__ == "__main__":
+    for page in mark(map(Path, sys.argv[1:]) if sys.argv[1:] else sorted((root() / "docs" / "results").rglob("*.md"))):
+        print(f"{page}: older than the code")

@@ -14,7 +14,8 @@ from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 
 EXAMPLES = """examples:
-  python3 scripts/evaluate.py                       --quick: both papers, 5 seeds a condition, 1 on lines
+  python3 scripts/evaluate.py                       both papers, 5 seeds a condition, 1 on lines
+  python3 scripts/evaluate.py --seeds 20            20 seeds a condition
   python3 scripts/evaluate.py --full --jobs 2       100 seeds, and what goes beyond the papers; interrupted, the same command goes on
   python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_flights, p_inspection,
                                                     p_cable, c_faults, c_comparison)
@@ -73,6 +74,9 @@ def _comparison(effort: Effort) -> list[Section]:
 
 PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline, "p_flights": _lines,
                           "p_inspection": _inspection, "p_cable": _cable, "c_faults": _faults, "c_comparison": _comparison}
+FLIGHTS = {"seeds": "flights of each perch condition", "line-seeds": "flights of each powerline scenario", "layouts": "random layouts of the inspection"}
+QUICK = {"seeds": 5, "line-seeds": 1, "layouts": 3}
+FULL = {"seeds": 100, "line-seeds": 10, "layouts": 20}
 BEYOND_PAPERS = ("c_faults", "c_comparison")
 """Hundreds of flights of their own: with --full, or by name."""
 
@@ -82,13 +86,13 @@ def parser() -> argparse.ArgumentParser:
     out = argparse.ArgumentParser(prog="evaluate.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     size = out.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="both papers, 5 seeds a condition, 1 on lines (default)")
-    size.add_argument("--full", action="store_true", help="every part, 100 seeds a condition, 10 on lines; resumable")
+    size.add_argument("--quick", action="store_true", help="both papers, with few flights (default)")
+    size.add_argument("--full", action="store_true", help="every part, with many flights; resumable")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
-    out.add_argument("--seeds", type=count, default=100, metavar="N", help="flights of each perch condition with --full (default: %(default)s)")
-    out.add_argument("--line-seeds", type=count, default=10, metavar="N", help="flights of each powerline scenario with --full (default: %(default)s)")
+    for name, what in FLIGHTS.items():
+        out.add_argument(f"--{name}", type=count, metavar="N", help=f"{what} (default: {QUICK[name]}, with --full {FULL[name]})")
     out.add_argument("--fresh", action="store_true", help="fly again what an earlier evaluation of the same code has flown")
     return out
 
@@ -97,12 +101,15 @@ def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
     mode = "full" if args.full else "quick"
-    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, args.fresh, args.seeds, args.line_seeds)
+    counts = {name: getattr(args, name.replace("-", "_")) or default for name, default in (FULL if args.full else QUICK).items()}
+    made_by = ["python3 scripts/evaluate.py", *["--full"] * args.full, *(f"--{name} {n}" for name, n in counts.items()),
+               *(f"--only {name}" for name in args.only or ()), f"--out {args.out}"]
+    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by), args.fresh, *counts.values())
     began = time.monotonic()
     try:
         output_folder(args.out)
         sections = evaluate(effort, args.only or [name for name in PARTS if args.full or name not in BEYOND_PAPERS])
-        document.write(sections, args.out, mode, time.monotonic() - began)
+        document.write(sections, effort, time.monotonic() - began)
     except KeyboardInterrupt:
         print("\ninterrupted; finished flights are kept, the same command goes on", file=sys.stderr)
         return 130

@@ -15,10 +15,10 @@ import numpy as np
 from perch_eval.campaign.progress import Progress
 from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, Fault, fly_fault
-from perch_eval.evaluation.document import finite
-from perch_eval.evaluation.perching import source_digest
+from perch_eval.evaluation.document import made_by
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.revision import banner, commit
+from perch_eval.page import finite
+from perch_eval.revision import digest
 
 MOMENTS = 20                         # of each fault
 QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
@@ -46,7 +46,7 @@ def fault_sections(effort: Effort) -> list[Section]:
         safe = sum(ends[e] for e in END_STATES)
         without = sum(_no_way_out(r) for r in own)
         out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY}" * bool(without),
-                  "", safe + without == len(own), "every flight ends hovering, landed or perched, or had no way out")
+                  "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
         bad += [r for r in own if r["end"] not in END_STATES]
     text = ["# Faults in flight", "", out.about, "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
@@ -134,18 +134,18 @@ def _compared(job: tuple[str, str, str, int]) -> dict[str, Any]:
 def _kept(effort: Effort, name: str, jobs: list[tuple], carry_out: Callable[[tuple], dict[str, Any]]) -> list[dict[str, Any]]:
     """The flights' figures; those of the same code that an earlier evaluation has flown are kept."""
     effort.state.mkdir(parents=True, exist_ok=True)
-    file, digest = effort.state / f"{name}.json", source_digest()
+    file, code = effort.state / f"{name}.json", digest()
     known: dict[str, dict[str, Any]] = {}
     if file.exists() and not effort.fresh:
         content = json.loads(file.read_text())
-        known = content["flights"] if content["digest"] == digest else {}
+        known = content["flights"] if content["digest"] == code else {}
     open_jobs = [job for job in jobs if str(job) not in known]
     progress = Progress(len(jobs), len(jobs) - len(open_jobs), what=f"{name} flights")
     with ProcessPoolExecutor(effort.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         for job, result in zip(open_jobs, pool.map(carry_out, open_jobs)):
             known[str(job)] = finite(result)
             temporary = file.with_suffix(".part")
-            temporary.write_text(json.dumps({"digest": digest, "flights": known}))
+            temporary.write_text(json.dumps({"digest": code, "flights": known}))
             temporary.replace(file)
             progress.add(result.get("end", "held") in (*END_STATES, "held"))
     progress.close()
@@ -153,6 +153,5 @@ def _kept(effort: Effort, name: str, jobs: list[tuple], carry_out: Callable[[tup
 
 
 def _write(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
-    made = "\n\nMade by `python3 scripts/evaluate.py --only c_faults --only c_comparison --out docs/results/control`; edit nothing here.\n"
-    (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", banner(commit()), *lines[1:]]) + made)
+    (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by(effort), *lines[1:]]) + "\n")
     (effort.out / f"{name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")

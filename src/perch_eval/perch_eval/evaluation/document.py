@@ -5,22 +5,26 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Sequence
-from pathlib import Path
 
-from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, Section
+from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, VACUOUS, Effort, Section
 from perch_eval.page import finite
-from perch_eval.revision import banner, commit
+from perch_eval.revision import banner, commit, digest
 
-_MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", MISSING: "*not available*"}
+_MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}
 
 
-def write(sections: Sequence[Section], folder: Path, mode: str, duration: float) -> None:
+def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
     """Write `README.md` and `results.json` into the folder of the figures."""
-    (folder / "README.md").write_text(_page(sections, mode, duration))
-    content = {"mode": mode, "duration_s": duration, "machine": machine(), "sections": [
+    (effort.out / "README.md").write_text(_page(sections, effort, duration))
+    content = {"commit": commit(), "digest": digest(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
-    (folder / "results.json").write_text(json.dumps(finite(content), indent=1) + "\n")
+    (effort.out / "results.json").write_text(json.dumps(finite(content), indent=1) + "\n")
+
+
+def made_by(effort: Effort) -> list[str]:
+    """Lines at the head of a generated page: commit, command, machine."""
+    return [banner(commit()), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
 
 
 def counts(sections: Sequence[Section]) -> dict[str, int]:
@@ -39,12 +43,12 @@ def machine() -> str:
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def _page(sections: Sequence[Section], mode: str, duration: float) -> str:
+def _page(sections: Sequence[Section], effort: Effort, duration: float) -> str:
     found = counts(sections)
-    lines = ["# Results", "", banner(commit()), "",
-             f"Made by `python3 scripts/evaluate.py --{mode}` in {duration / 60:.0f} min on {machine()}; this page is generated, edit nothing here.", "",
-             f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail; {found.get('better', 0)} further values are better than the paper's, "
-             f"{found.get('worse', 0)} worse; {found.get(MISSING, 0)} rows are not available.", "",
+    lines = ["# Results", "", *made_by(effort), f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
+             f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail, {found.get(VACUOUS, 0)} are vacuous (nothing occurred that they are "
+             f"about); {found.get('better', 0)} further values are better than the paper's, {found.get('worse', 0)} worse; "
+             f"{found.get(MISSING, 0)} rows are not available.", "",
              "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "
              "**P**: Paneque et al., *Perception-Aware Perching on Powerlines with Multirotors*. "
              "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", ""]

@@ -10,19 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from perch_eval.campaign.progress import Progress
-from perch_eval.evaluation.perching import source_digest
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.stand_ins import MAP_ERROR
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.layout import random_layout
+from perch_eval.revision import digest
 from perch_eval.statistics import Spread
 from perch_sim.scenario import load_scenario
 
 SCENARIO, SEED = "inspection", 1
 REFERENCE_COLLISIONS = 2
 GAIN = 5.0  # bar and paper: the mean reprojection error is cut by so much
-QUICK_LAYOUTS, FULL_LAYOUTS = 3, 20
 
 
 def inspection_sections(effort: Effort) -> list[Section]:
@@ -63,7 +62,7 @@ def inspected(seed: int) -> dict[str, float]:
 
 
 def _layouts(effort: Effort) -> Section:
-    count = FULL_LAYOUTS if effort.full else QUICK_LAYOUTS
+    count = effort.layouts
     found = _flown(effort, count)
     out = Section("p_inspection_layouts", "[P:VI-A] Inspection over random layouts",
                   f"{count} random layouts (seeds 1 to {count}) of three cables and six waypoints, in each of which the reference collides "
@@ -88,8 +87,8 @@ def _flown(effort: Effort, count: int) -> list[dict[str, float]]:
     """The layouts' figures; those of the same code that an earlier evaluation has flown are kept."""
     folder = Path(effort.state) / "inspection"
     folder.mkdir(parents=True, exist_ok=True)
-    digest = source_digest()[:12]
-    files = {seed: folder / f"{digest}_{seed}.json" for seed in range(1, count + 1)}
+    code = digest()
+    files = {seed: folder / f"{code}_{seed}.json" for seed in range(1, count + 1)}
     known = [] if effort.fresh else [seed for seed, file in files.items() if file.exists()]
     progress = Progress(count, len(known), what="inspections")
     # Not forked: BLAS threads of the parent do not survive a fork.

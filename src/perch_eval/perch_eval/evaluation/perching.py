@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import math
 import multiprocessing
 import tempfile
@@ -13,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from perch_core import config
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.campaign.causes import SUCCESS
@@ -23,6 +21,7 @@ from perch_eval.campaign.results import Results, ResultsError, RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.campaign.workers import in_pool
 from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.revision import digest
 from perch_eval.statistics import Rate, Spread
 from perch_sim.scenario import load_scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -48,16 +47,6 @@ def perching_sections(effort: Effort) -> list[Section]:
     return [_errors(effort, groups), _successes(effort, groups), *_figures(effort, groups), _engines()]
 
 
-def source_digest() -> str:
-    """SHA-256 over every source and configuration file: flights of other code are not these flights."""
-    total = hashlib.sha256()
-    sources = [p for name in ("perch_core", "perch_planner", "perch_control", "perch_perception", "perch_sim")
-               for p in sorted(Path(__import__(name).__file__).resolve().parent.rglob("*.py"))]
-    for path in (*sources, *sorted(config.config_dir().rglob("*.yaml"))):
-        total.update(path.name.encode() + path.read_bytes())
-    return total.hexdigest()
-
-
 def _flights(effort: Effort) -> list[RunResult]:
     """Every flight of every condition; finished ones of the same code are not flown again."""
     tasks = []
@@ -68,12 +57,12 @@ def _flights(effort: Effort) -> list[RunResult]:
     file = effort.state / "flights.sqlite"
     if effort.fresh:
         _remove(file)
-    digest = source_digest()
+    code = digest()
     try:
-        results = Results(file, "evaluation", digest, resume=True)
+        results = Results(file, "evaluation", code, resume=True)
     except ResultsError:
         _remove(file)
-        results = Results(file, "evaluation", digest, resume=True)
+        results = Results(file, "evaluation", code, resume=True)
     try:
         known = [r for r in results.all() if r.number < len(tasks)]
         open_tasks = [t for t in tasks if t.run.number not in {r.number for r in known}]
@@ -128,7 +117,7 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
         bar = BARS[name] if effort.full else paper / 5
         why = f"at least {100 * bar:.0f} %" + ("" if effort.full else ", the paper's rate")
         causes = ", ".join(f"seed {r.seed}: {r.cause}" for r in groups[name] if r.cause != SUCCESS)
-        out.claim(_words(name), str(rate), f"{paper}/5", rate.trials > 0 and rate.value >= bar, why + (f"; failed: {causes}" if causes else ""))
+        out.claim(_words(name), str(rate), f"{paper}/5", rate.value >= bar if rate.trials else None, why + (f"; failed: {causes}" if causes else ""))
         out.data[name] = {"successes": rate.successes, "trials": rate.trials, "interval": rate.interval,
                           "failed": {str(r.seed): [r.cause, r.message] for r in groups[name] if r.cause != SUCCESS}}
     return out

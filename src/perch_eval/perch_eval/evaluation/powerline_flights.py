@@ -20,6 +20,7 @@ from perch_eval.campaign.workers import in_pool
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
 from perch_eval.metrics import flight_metrics, touch_of
+from perch_eval.revision import digest
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -139,10 +140,11 @@ def recovered(run: RunResult) -> bool:
     return run.outcome == "missed" and run.message.endswith("hover")
 
 
-def flights(effort: Effort, cases: tuple[str, ...], digest: str) -> dict[tuple[str, bool], list[RunResult]]:
+def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], list[RunResult]]:
     """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
     effort.state.mkdir(parents=True, exist_ok=True)
-    results = Results(effort.state / f"line_flights_{digest[:12]}.sqlite", "line flights", digest, resume=True)
+    code = digest()
+    results = Results(effort.state / f"line_flights_{code}.sqlite", "line flights", code, resume=True)
     try:
         tasks = []
         for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-HOLDS, FAILS, SHOWN, MISSING = "holds", "FAILS", "shown", "not available"
+HOLDS, FAILS, VACUOUS, SHOWN, MISSING = "holds", "FAILS", "vacuous", "shown", "not available"
 BETTER, WORSE = "better", "worse"  # a comparison, not a claim
 
 
@@ -18,8 +18,8 @@ class Row:
         name: what was measured.
         ours: our value, with interval or range.
         paper: the paper's value; empty: it gives none.
-        verdict: `holds` or `FAILS` for a claim, `better` / `worse` for a comparison without a claim, `shown`,
-            `not available` where the part does not exist.
+        verdict: `holds` or `FAILS` for a claim, `vacuous` for one about nothing that occurred, `better` / `worse` for a
+            comparison without a claim, `shown`, `not available` where the part does not exist.
         note: what the claim is, or why it is not available.
     """
 
@@ -50,9 +50,9 @@ class Section:
     figures: list[tuple[str, str]] = field(default_factory=list)
     data: dict = field(default_factory=dict)
 
-    def claim(self, name: str, ours: str, paper: str, holds: bool, note: str) -> None:
-        """A row that says whether a claim holds."""
-        self.rows.append(Row(name, ours, paper, HOLDS if holds else FAILS, note))
+    def claim(self, name: str, ours: str, paper: str, holds: bool | None, note: str) -> None:
+        """A row that says whether a claim holds; None: there was nothing that it could be tested on."""
+        self.rows.append(Row(name, ours, paper, VACUOUS if holds is None else HOLDS if holds else FAILS, note))
 
     def compare(self, name: str, ours: str, paper: str, better: bool, note: str = "") -> None:
         """A row that compares without claiming."""
@@ -72,32 +72,36 @@ class Effort:
     """How much is spent.
 
     Attributes:
-        full: 100 seeds instead of 5 (on lines 10 instead of 1), and slow comparisons.
+        full: every part, and more problems in those that only compute.
         jobs: processes for flights.
         out: folder of the results.
-        state: folder of what a full evaluation resumes from.
+        state: folder of what an interrupted evaluation resumes from.
+        command: what regenerates the page.
         fresh: forget what an earlier evaluation has done.
-        perch_seeds: flights of each perch condition, if full.
-        line_seeds: flights of each powerline scenario, if full; of the same code, those that were flown before count.
+        perch_seeds: flights of each perch condition.
+        line_seeds: flights of each powerline scenario.
+        layouts: random layouts of the inspection.
     """
 
     full: bool
     jobs: int
     out: Path
     state: Path
-    fresh: bool = False
-    perch_seeds: int = 100
-    line_seeds: int = 10
+    command: str
+    fresh: bool
+    perch_seeds: int
+    line_seeds: int
+    layouts: int
 
     @property
     def seeds(self) -> range:
         """Seeds of the flights of each perch condition."""
-        return range(1, self.perch_seeds + 1) if self.full else range(1, 6)
+        return range(1, self.perch_seeds + 1)
 
     @property
     def seeds_on_lines(self) -> range:
         """Seeds of the flights of each powerline scenario."""
-        return range(1, self.line_seeds + 1) if self.full else range(1, 2)
+        return range(1, self.line_seeds + 1)
 
 
 Part = Callable[[Effort], list[Section]]
