@@ -193,7 +193,7 @@ def edit(sources: Path) -> None:
     """
     for name, pattern, new in EDITS:
         file = sources / name
-        text, count = re.subn(pattern, lambda _: new, file.read_text(), count=1, flags=re.DOTALL)
+        text, count = re.subn(pattern, new.replace("\\", r"\\"), file.read_text(), count=1, flags=re.DOTALL)
         if count != 1:
             raise FirmwareError(f"{name} of the firmware is another than expected: {pattern[:60]!r} is not there")
         file.write_text(text)

@@ -2,7 +2,8 @@
 
 With 13 states the rotor thrusts are the inputs: an input is that at the node, and may change over the interval as the reference's
 thrusts do; with 17 they are states and their rates are the inputs (`perch_core.rotor_model`). To the rotor model come
-rotor drag and a constant disturbance (force and moment, from the L1 augmentation). The optional line terms are those of the powerline planner (`perch_core.lines`).
+rotor drag and a constant disturbance (force and moment, from the L1 augmentation). The optional line terms are those of the
+powerline planner (`perch_core.lines`).
 """
 
 from __future__ import annotations

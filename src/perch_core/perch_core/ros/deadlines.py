@@ -30,9 +30,9 @@ class Deadlines:
     In real time stamps advance with the wall clock, so `clock - stamp` is the same for every answer but for delays. Its
     least value in the last second belongs to an undelayed answer. An answer is *missed* when it leaves more than one
     period later than that: its successor was due by then. Whoever delayed it counts: the vehicle, the node, or the
-    operating system. The period is that of the stamps, whatever the IMU's rate. Where the vehicle gives up time that it cannot catch up, the stamps stay behind the wall clock for
-    good: `MOVED` answers are missed, then those count as undelayed that come as late. Where time is simulated
-    there are no deadlines, and nobody calls this.
+    operating system. The period is that of the stamps, whatever the IMU's rate. Where the vehicle gives up time that it
+    cannot catch up, the stamps stay behind the wall clock for good: `MOVED` answers are missed, then those count as
+    undelayed that come as late. Where time is simulated there are no deadlines, and nobody calls this.
     """
 
     def __init__(self) -> None:
