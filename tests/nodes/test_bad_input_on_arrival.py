@@ -107,9 +107,9 @@ class Stranger:
         return True
 
     def go_on(self) -> None:
-        """A good sample, answered."""
-        self._go_on()
-        self._until(lambda: self._answered >= self.stamp, "a good sample is not answered")
+        """A good sample, answered; one that nobody could take, as its process was stopped for long, is followed by the next."""
+        stamp = self.stamp + PERIOD
+        self._until(lambda: self._answered >= stamp or (self._go_on() and False), "a good sample is not answered")
 
     def spoilt(self, topic: str) -> dict[str, object]:
         """What is wrong -> message of the present that is wrong in that."""

@@ -18,9 +18,8 @@ def test_the_plain_scripts_import_nothing_of_perch_but_messages():
 
 
 def check_chain(seen: dict) -> None:
-    """Every sample was answered by the estimator and by the controller, from when the script was known to both."""
-    begin = max(seen["states"][0], seen["commands"][0])
-    sent, states, commands = ([stamp for stamp in seen[what] if stamp >= begin] for what in ("sent", "states", "commands"))
+    """Every sample was answered by the estimator and by the controller, from when the script was known to both and they to it."""
+    sent, states, commands = ([stamp for stamp in seen[what] if stamp >= seen["begun"]] for what in ("sent", "states", "commands"))
     assert states == sent[:len(states)], "an answer is missing, or stamped with no sample's stamp"
     assert commands[:-1] == states[:len(commands) - 1]  # the last one may have come before the state that it answers
     assert len(seen["speeds"]) == 4 and min(seen["speeds"]) > 100.0, "the controller has not armed"  # idle [rad/s]

@@ -6,9 +6,11 @@ import math
 import os
 import re
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -186,18 +188,18 @@ def test_a_plan_that_takes_too_long_is_stopped(isolated: Asked) -> None:
     assert isolated(request()).success
 
 
-def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked) -> None:
+def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked, tmp_path: Path) -> None:
     waits = planner(isolated.component.config, isolated.runner)
     answers: list[PerchPlan] = []
     futures = []
-    waits.component.work = lambda job: futures.append((job, isolated.runner.submit(replace(job, function=time.sleep, arguments=(60.0,)))))
+    hang = ["sh", "-c", f"touch {tmp_path / 'begun'}; exec sleep 60"]
+    waits.component.work = lambda job: futures.append((job, isolated.runner.submit(replace(job, function=subprocess.run, arguments=(hang,)))))
     waits.component.on_plan_perch(request(), answers.append)
     (job, future), = futures
-    while not future.running():
+    while not (tmp_path / "begun").exists():
         time.sleep(0.01)
-    time.sleep(0.2)  # it has been taken up
     os.kill(isolated.runner.pid, signal.SIGKILL)
-    job.then(future.exception(20.0))
+    job.then(future.exception(120.0))
     assert answers[0].error_code == PerchPlanError.SOLVER and "ended" in answers[0].message
     assert isolated(request()).success
 

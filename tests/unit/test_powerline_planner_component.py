@@ -6,9 +6,11 @@ import math
 import os
 import re
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -217,23 +219,23 @@ def test_a_deadline_counts_while_others_are_planned_and_all_are_answered_in_orde
     component.on_plan_powerline(request(deadline=8.0), answers.append)
     for job, future in futures:  # grows by the fallback of the first
         job.then(future.exception(60.0) or future.result())
-    assert isinstance(hanging.exception(20.0), JobStopped)
+    assert isinstance(hanging.exception(120.0), JobStopped)
     assert sorted(plan.error_code for plan in answers) == [E.OK, E.DEADLINE] or [plan.success for plan in answers] == [True, True]
     assert len(futures) == 3 and isinstance(futures[0][1].exception(), JobStopped)
 
 
-def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked) -> None:
+def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked, tmp_path: Path) -> None:
     component = PowerlinePlannerComponent(PowerlinePlannerParameters())
     futures: list[Any] = []
-    component.work = lambda job: futures.append((job, isolated.runner.submit(replace(job, function=time.sleep, arguments=(60.0,)))))
+    hang = ["sh", "-c", f"touch {tmp_path / 'begun'}; exec sleep 60"]
+    component.work = lambda job: futures.append((job, isolated.runner.submit(replace(job, function=subprocess.run, arguments=(hang,)))))
     answers: list[PowerlinePlan] = []
     component.on_plan_powerline(request(deadline=10.0), answers.append)
     (job, future), = futures
-    while not future.running():
+    while not (tmp_path / "begun").exists():
         time.sleep(0.01)
-    time.sleep(0.2)  # it has been taken up
     os.kill(isolated.runner.pid, signal.SIGKILL)
-    job.then(future.exception(20.0))
+    job.then(future.exception(120.0))
     assert answers[0].error_code == E.SOLVER and "ended" in answers[0].message
     assert isolated.runner.wait_ready() and isolated(request()).success
 

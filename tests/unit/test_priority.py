@@ -23,7 +23,7 @@ assert problem == "" or "no permission" in problem, problem
 
 def test_the_loop_is_raised_and_python_threads_are_not():
     """Where it is not allowed nothing changes and the reason is told."""
-    subprocess.run([sys.executable, "-c", ASK], check=True, timeout=20)
+    subprocess.run([sys.executable, "-c", ASK], check=True, timeout=120)
 
 
 def test_a_process_with_other_work_is_left_alone():
@@ -49,4 +49,4 @@ assert os.sched_getscheduler(0) == os.SCHED_BATCH, 'it interrupts nobody'
 
 
 def test_work_that_has_time_gives_way():
-    subprocess.run([sys.executable, "-c", GIVE_WAY], check=True, timeout=20)
+    subprocess.run([sys.executable, "-c", GIVE_WAY], check=True, timeout=120)

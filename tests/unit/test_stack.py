@@ -89,6 +89,7 @@ def test_a_program_s_own_children_are_stopped_with_it(tmp_path):
 
     with Stack([python("parent", code)], tmp_path, on_line=keep):
         lines.wait_for(("parent", "up"))
+        wait_until(lambda: any(line.startswith("child") for line in seen))
     pid = int(next(line for line in seen if line.startswith("child")).split()[1])
     wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
 
@@ -180,13 +181,16 @@ def test_a_second_interrupt_does_not_stop_the_stopping(tmp_path):
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="util-linux without setpriv")
 def test_programs_die_with_a_killed_parent(tmp_path):
     code = f"""
-import sys, time
+import sys, threading, time
 from pathlib import Path
 from perch_eval.program import Program
 from perch_eval.stack import Stack
+up = threading.Event()
 stack = Stack([Program("a", (sys.executable, "-S", "-c", "import time; print('up', flush=True); time.sleep(1000)"))],
-              Path({str(tmp_path)!r}), on_line=lambda name, line: print(stack.pids['a'], flush=True))
+              Path({str(tmp_path)!r}), on_line=lambda name, line: up.set())
 stack.start()
+up.wait()
+print(stack.pids['a'], flush=True)
 time.sleep(1000)
 """
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)

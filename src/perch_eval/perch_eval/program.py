@@ -79,6 +79,7 @@ class RunningProgram:
         self._log = log
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=_TAIL)
+        self._read_lines = 0
         self._process = subprocess.Popen(
             [*_die_with_parent(), *program.command], env=dict(environment), process_group=0,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
@@ -113,7 +114,11 @@ class RunningProgram:
     def ending(self) -> Ending:
         """How it ended. Waits for the end."""
         code = self._process.wait()
-        self._reader.join(1.0)  # a grandchild may hold the pipe open; do not wait for that
+        while self._reader.is_alive():  # to its last words; a grandchild may hold the pipe open, and is not waited for
+            read = self._read_lines
+            self._reader.join(1.0)
+            if self._read_lines == read:
+                break
         return Ending(self.program.name, code, tuple(self._tail), self._log)
 
     def _read(self) -> None:
@@ -127,6 +132,7 @@ class RunningProgram:
                     if file is not None:
                         file.write(line.encode())
                 self._tail.append(line.rstrip())
+                self._read_lines += 1
                 self._on_line(self.program.name, line.rstrip())
 
 

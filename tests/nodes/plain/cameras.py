@@ -77,7 +77,7 @@ class Cameras(Node):
 
 rclpy.init()
 node = Cameras("compressed" in sys.argv)
-end = time.monotonic() + 90.0
+end = time.monotonic() + 250.0
 while (len(node.poses) < 20 or len(node.targets) < 5) and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.1)
 print(json.dumps({"poses": node.poses, "targets": node.targets}))

@@ -15,8 +15,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 
-WINDOW = 20  # samples without an answer, at most, once there has been one: a busy machine loses nothing
-LOST = 5.0   # [s]
+WINDOW = 20   # samples without an answer of both nodes, at most, once there has been one: a busy machine loses nothing
+LOST = 5.0    # [s] before both answer in time, what is still to come after so long was lost
+PATIENCE = 250.0  # [s]
 
 
 class Rest(Node):
@@ -28,6 +29,7 @@ class Rest(Node):
         self.clock = self.create_publisher(Clock, "/clock", 10) if clock else None
         self.sent, self.states, self.commands, self.speeds = [], [], [], []
         self.heard = time.monotonic()
+        self.begun = None  # stamp from which on both answer in time
         deep = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(Odometry, "odometry", self.take_state, deep)
         self.create_subscription(MotorCommand, "motor_command", self.take_command, deep)
@@ -41,6 +43,7 @@ class Rest(Node):
             self.command(ControllerCommand.ARM)
 
     def take_command(self, msg) -> None:
+        self.heard = time.monotonic()
         self.commands.append(nanoseconds(msg.header.stamp))
         if msg.armed:
             self.speeds = list(map(float, msg.rotor_speed))
@@ -51,9 +54,11 @@ class Rest(Node):
         self.order.publish(order)
 
     def step(self) -> None:
-        waiting = self.states and self.stamp - self.states[-1] > WINDOW * self.period
-        if waiting and time.monotonic() - self.heard < LOST:
-            return
+        if self.states and self.commands:
+            if self.stamp - min(self.states[-1], self.commands[-1]) <= WINDOW * self.period:
+                self.begun = self.begun or self.stamp + self.period
+            elif self.begun or time.monotonic() - self.heard < LOST:
+                return
         self.stamp += self.period
         imu = Imu()
         imu.header.stamp.sec, imu.header.stamp.nanosec = divmod(self.stamp, 10**9)
@@ -76,12 +81,12 @@ def nanoseconds(stamp) -> int:
 
 
 rclpy.init()
-node, count, end = Rest(float(sys.argv[1]), "clock" in sys.argv), int(sys.argv[2]), time.monotonic() + 90.0
+node, count, end = Rest(float(sys.argv[1]), "clock" in sys.argv), int(sys.argv[2]), time.monotonic() + PATIENCE
 while (len(node.commands) < count or not node.speeds) and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.1)
 node.command(ControllerCommand.DISARM)
 for _ in range(20):
     rclpy.spin_once(node, timeout_sec=0.02)
 types = {kind for _, kinds in node.get_topic_names_and_types() for kind in kinds}
-print(json.dumps({"sent": node.sent, "states": node.states, "commands": node.commands, "speeds": node.speeds,
+print(json.dumps({"begun": node.begun, "sent": node.sent, "states": node.states, "commands": node.commands, "speeds": node.speeds,
                   "types": sorted(types), "nodes": node.get_node_names()}))
