@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from perch_eval import revision
+from perch_eval.evaluation import front_page
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 PAGES = sorted(RESULTS.rglob("*.md"))
@@ -44,3 +45,9 @@ def test_results_of_several_commits_are_older_than_the_code():
     text = revision.banner("13d2870+, cde665f")
     assert "Of commits 13d2870+, cde665f, older than the code**" in text and "git diff --stat 13d2870 -- src config" in text
     assert not revision.out_of_date(text, NOW)
+
+
+def test_the_front_page_shows_what_the_pages_of_results_say():
+    readme = (RESULTS.parents[1] / "README.md").read_text()
+    assert front_page.BEGIN + front_page.table() + front_page.END in readme, "python3 -m perch_eval.evaluation.front_page"
+    assert len(readme.splitlines()) <= 200
