@@ -34,8 +34,10 @@ extends: surface_90
 name: blind
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
 parameters: {vehicle: {cameras: none}}
+mission: {search_timeout: 100.0}
+time_limit: 200.0
 """
-"""A perch without images."""
+"""A perch without images: it looks for a target until it is disturbed, however late that comes."""
 
 
 # -- scenarios -------------------------------------------------------------------------------------------------------
@@ -125,10 +127,10 @@ def test_an_executable_ends_with_one_line_and_exit_code_2(arguments, words, ros_
 class Asker:
     """A node under test and its caller, on one executor in one process."""
 
-    def __init__(self, module: str) -> None:
+    def __init__(self, module: str, *arguments: str) -> None:
         self._context = Context()
         rclpy.init(args=[], context=self._context)
-        self.node = importlib.import_module(module).create(cli_args=[], use_global_arguments=False, context=self._context)
+        self.node = importlib.import_module(module).create(cli_args=["--ros-args", *arguments], use_global_arguments=False, context=self._context)
         self.caller = Node("asker", context=self._context)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.caller)
@@ -156,8 +158,8 @@ class Asker:
 
 @pytest.fixture
 def asker(ros_domain, request):
-    """The node of the module that the test names as its parameter."""
-    asker = Asker(request.param)
+    """The node of the module that the test names as its parameter, with its arguments."""
+    asker = Asker(*request.param)
     yield asker
     asker.close()
 
@@ -180,7 +182,7 @@ def spoil(message, path: str, value: float) -> None:
     setattr(message, leaf, value)
 
 
-@pytest.mark.parametrize("asker", ["perch_planner.perching_planner_node"], indirect=True)
+@pytest.mark.parametrize("asker", [("perch_planner.perching_planner_node", "-p", "time_limit:=60.0")], indirect=True)
 def test_the_planner_refuses_numbers_that_are_none_and_goes_on_working(asker):
     client = asker.caller.create_client(PlanPerch, "plan_perch")
     asker.wait(client.service_is_ready)
@@ -197,7 +199,7 @@ def test_the_planner_refuses_numbers_that_are_none_and_goes_on_working(asker):
     assert asker.result(client.call_async(plan_request())).success
 
 
-@pytest.mark.parametrize("asker", ["perch_control.mission_node"], indirect=True)
+@pytest.mark.parametrize("asker", [("perch_control.mission_node",)], indirect=True)
 def test_the_mission_refuses_goals_that_are_none(asker):
     client = ActionClient(asker.caller, Perch, "perch")
     asker.wait(client.server_is_ready)

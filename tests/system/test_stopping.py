@@ -1,9 +1,8 @@
-"""Every node's executable, alone, ends soon and cleanly on SIGINT and on SIGTERM."""
+"""Every node's executable, alone, ends cleanly on SIGINT and on SIGTERM."""
 
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import subprocess
 import time
@@ -21,10 +20,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 
-LIMIT = 1.0
-"""Of processor time, which does not depend on what else the machine does [s]."""
 PATIENCE = 300.0
-"""For nodes to come up, compiled functions included; only ever waited for in full when a test fails [s]."""
+"""For nodes to come up, compiled functions included, and to end; only ever waited for in full when a test fails [s]."""
 
 
 class Watch:
@@ -78,12 +75,6 @@ def works(process: psutil.Process) -> bool:
         return False
 
 
-def ended_time() -> float:
-    """Processor time of all processes of ours that have ended [s]."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
 @pytest.mark.parametrize("number, names", [(signal.SIGINT, set(NODES)), (signal.SIGTERM, set(NODES) - set(FREE))])
 def test_every_executable_stops_cleanly(number, names, ros_domain, tmp_path, record_property, capsys):
     """SIGTERM ends the others when the tests of `tests/nodes` are over, which assert it."""
@@ -95,13 +86,12 @@ def test_every_executable_stops_cleanly(number, names, ros_domain, tmp_path, rec
             watch.wait_for(f"/alone_{node}/{node}", process)
         for node, process in processes.items():
             children = psutil.Process(process.pid).children(recursive=True)
-            family = [psutil.Process(process.pid), *children]  # whose time the kernel adds up where a parent has waited for its child
-            began, used = time.monotonic(), ended_time() + sum(sum(one.cpu_times()) for one in family if works(one))
+            began = time.monotonic()
             process.send_signal(number)
             _, error = process.communicate(timeout=PATIENCE)
-            durations[node], used = time.monotonic() - began, ended_time() - used
-            if process.returncode != 0 or "Traceback" in error or used > LIMIT:
-                problems.append(f"{node}: exit code {process.returncode} after {used:.2f} s of processor time: {error}")
+            durations[node] = time.monotonic() - began
+            if process.returncode != 0 or "Traceback" in error:
+                problems.append(f"{node}: exit code {process.returncode}: {error}")
             while any(map(works, children)) and time.monotonic() - began < PATIENCE:
                 time.sleep(0.02)
             problems += [f"{node} leaves {child}" for child in children if works(child)]
