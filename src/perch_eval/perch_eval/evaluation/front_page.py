@@ -12,13 +12,11 @@ from pathlib import Path
 from perch_eval.revision import root
 
 ROWS = (
-    ("M, Table I: plan with 3 waypoints, QP and bound check", ".", "m_table_1", "QP + global bound check, 3 waypoints"),
     ("M, Table II: tracking error (x, y, z together), 90 deg, 1.7 m", "perches", "m_table_2", "90 deg, 1.7 m: tracking, all axes"),
     ("M, Table II: estimation error, 90 deg, 1.7 m", "perches", "m_table_2", "90 deg, 1.7 m: estimation, all axes"),
     ("M, Table III: perches, 90 deg, 1.7 m", "perches", "m_table_3", "90 deg, 1.7 m"),
     ("M, Table III: perches, 90 deg, 3 m", "perches", "m_table_3", "90 deg, 3 m"),
     ("M, Fig. 6: largest body rate, 90 deg, 1.7 m", "perches", "m_fig_6", "largest body rate"),
-    ("P, Table I: plan upside down", ".", "p_table_1", "180 deg: perch"),
     ("P, Table I: position error at the cable, 80 deg", "powerline", "p_table_1_flown", "80 deg: position RMSE"),
     ("P, Table I: position error at the cable, upside down", "powerline", "p_table_1_flown", "180 deg: position RMSE"),
     ("perches on the cable, upside down", "powerline", "p_table_1_flown", "180 deg: gripped the cable"),
