@@ -55,6 +55,31 @@ def test_gate_takes_a_jump_that_stays_and_refuses_old_stamps():
     assert not any(v.jumped for v in verdicts[first + 1:])
 
 
+@pytest.mark.parametrize("place, limit", [((0, slice(0, 3)), 0.25), ((0, slice(3, 6)), np.radians(20.0)), ((1, slice(0, 3)), 1.5)])
+def test_gate_does_not_take_a_jump_at_which_the_odometry_lost_itself_until_it_is_sure_again(place, limit):
+    """However uncertain a long flight had made it before."""
+    k, axes = place
+    gate, drifted = OdometryGate(OdometryLimits(confirm=0.03)), (9.0 * np.eye(6), 9.0 * np.eye(6))
+    gate.check(1.0, REST, drifted)
+    there = moved(REST, p=(1, 0, 1))
+
+    def taken(begin, sigma):
+        covariances = tuple(np.array(c) for c in drifted)
+        covariances[k][axes, axes] += sigma**2 * np.eye(3)
+        verdicts = [gate.check(begin + 0.002 * n, there, covariances) for n in range(1, 40)]
+        return any(v.usable for v in verdicts), verdicts[-1].reason
+
+    usable, reason = taken(1.0, 1.1 * limit)
+    assert not usable and "jumped by 1.00 m" in reason and "less certain" in reason
+    assert taken(1.1, 0.9 * limit)[0]
+
+
+def test_gate_takes_a_jump_of_odometry_whose_velocity_has_no_covariance():
+    gate, none = OdometryGate(OdometryLimits(confirm=0.03)), (np.zeros((6, 6)), -np.eye(6))
+    gate.check(1.0, REST, none)
+    assert any(gate.check(1.0 + 0.002 * k, moved(REST, p=(1, 0, 1)), none).jumped for k in range(1, 20))
+
+
 def test_gate_lets_fast_flight_pass():
     gate = OdometryGate(OdometryLimits())
     for k in range(100):

@@ -198,6 +198,14 @@ def test_odometry_that_cannot_be_used_is_answered_bridged_and_then_descended_wit
     assert len(flight.motors) == count + 40 and flight.state is State.LANDING
 
 
+@pytest.mark.parametrize("variance, state", [(0.01, State.HOVERING), (1e4, State.LANDING)])
+def test_odometry_that_jumps_and_does_not_know_where_it_is_is_not_followed(variance, state):
+    flight = Flight().take_off()
+    flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=variance * np.eye(6))
+    assert flight.state is state and "position jumped" in flight.said
+    assert (flight.component.flight.maneuvers.belief[0] > 0.9) == (state is State.HOVERING)
+
+
 def test_odometry_in_another_frame_is_ignored():
     flight = Flight().take_off()
     count = len(flight.motors)
@@ -310,6 +318,9 @@ def too_long(flight):
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=NAN), {}, "start_time"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=1e12), {}, "start_time"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=-1e12), {}, "start_time"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=2.0**31 - 1.0), {}, "in the future"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=f.stamp * 1e-9 + 61.0), {}, "in the future"),
+    (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=f.stamp * 1e-9 - 1.0), {}, "in the past"),
     (lambda f: f.path((2, 0, 0.6), (3, 0, 0.6), 2.0), {}, "away"),
 ])
 def test_nonsense_on_trajectory_is_refused_and_said(make, changes, word):

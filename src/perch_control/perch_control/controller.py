@@ -116,7 +116,8 @@ class Controller(Component[ControllerParameters]):
         if not self._believed(state.stamp, "odometry"):
             return
         self._answered, self._silent = self._stamps.newest, False
-        self._answer(state.stamp, self.flight.step(seconds(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B)))
+        self._answer(state.stamp, self.flight.step(seconds(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B),
+                                                   (state.pose_covariance, state.twist_covariance)))
 
     def _believed(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is of the present; a time that has evidently begun anew is a new flight."""

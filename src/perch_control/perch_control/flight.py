@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from math import dist, inf
 
+import numpy as np
+
 from perch_core.vector3 import axes_of
 from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
@@ -201,19 +203,20 @@ class FlightController:
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
-    def step(self, stamp: float, sample: tuple[float, ...]) -> StepResult:
+    def step(self, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None) -> StepResult:
         """Answer one odometry sample: always with a command, also when disarmed or when the sample is refused.
 
         Args:
             stamp: of the sample [s].
             sample: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
+            covariances: its own, as `OdometryGate.check` takes them.
         """
         m = self.maneuvers
         if self._period.update(stamp):
             self.law.pace(self._period.value)
         # Odometry that repeats itself does not stop the time.
         dt = self._advance(stamp if stamp > m.now else max(m.now, self._imu_stamp))
-        verdict = self.gate.check(stamp, sample)
+        verdict = self.gate.check(stamp, sample, covariances)
         self._believe(verdict, sample, dt)
         self.odometry_age = m.now - self.gate.stamp if self.gate.stamp is not None else inf
         if m.flying and m.blind is None:

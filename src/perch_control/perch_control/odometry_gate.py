@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import acos, degrees, hypot, isfinite, sqrt
+from math import acos, degrees, hypot, isfinite, radians, sqrt
 from typing import NamedTuple
 
+import numpy as np
+
 from perch_core.config import quantity
+from perch_core.covariance import largest_sigma
 from perch_core.jit import compiled
 
 
@@ -21,7 +24,8 @@ class OdometryLimits:
     position_jump: float = quantity(0.25, unit="m", above=0.0, doc="largest step between two samples beyond the motion")
     velocity_jump: float = quantity(1.5, unit="m/s", above=0.0, doc="largest step between two samples")
     attitude_jump_deg: float = quantity(20.0, unit="deg", above=0.0, high=180.0, doc="largest step beyond the rotation")
-    confirm: float = quantity(0.03, unit="s", low=0.0, doc="a jump that stays for so long is the new truth: hover there")
+    confirm: float = quantity(0.03, unit="s", low=0.0, doc="a jump that stays for so long, and is as certain as what was before it to within the largest "
+                             "steps, is the new truth: hover there")
 
 
 class Verdict(NamedTuple):
@@ -39,14 +43,16 @@ class OdometryGate:
         self.limits = limits
         self.stamp: float | None = None     # of the last accepted sample [s]
         self.state: tuple[float, ...] = ()
+        self._covariances: tuple[np.ndarray, np.ndarray] | None = None  # of the last accepted sample
         self._candidate: tuple[float, float, tuple[float, ...]] | None = None  # first stamp, last stamp, state
 
-    def check(self, stamp: float, state: tuple[float, ...]) -> Verdict:
+    def check(self, stamp: float, state: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None) -> Verdict:
         """Judge one sample.
 
         Args:
             stamp: [s].
             state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
+            covariances: of pose and twist as in `OdometryState`, shapes (6, 6); None: nothing is said, a jump is believed.
         """
         if not isfinite(sum(state)):
             return Verdict(False, reason="odometry holds a value that is not finite")
@@ -56,21 +62,42 @@ class OdometryGate:
         if abs(n - 1.0) > 1e-2:
             return Verdict(False, reason=f"odometry quaternion has norm {n:.3f}, not 1")
         if self.stamp is None:
-            self.stamp, self.state = stamp, state
-            return Verdict(True)
+            return self._accept(stamp, state, covariances)
         if stamp <= self.stamp:
             return Verdict(False, reason=f"odometry stamp {stamp:.3f} s is not after {self.stamp:.3f} s")
         problem = self._step(self.stamp, self.state, stamp, state)
         if not problem:
-            self.stamp, self.state, self._candidate = stamp, state, None
-            return Verdict(True)
+            return self._accept(stamp, state, covariances)
         if self._candidate is None or self._step(self._candidate[1], self._candidate[2], stamp, state):
             self._candidate = (stamp, stamp, state)
         self._candidate = (self._candidate[0], stamp, state)
         if stamp - self._candidate[0] >= self.limits.confirm:
-            self.stamp, self.state, self._candidate = stamp, state, None
-            return Verdict(True, True, problem)
+            if doubt := self._doubt(covariances):
+                return Verdict(False, reason=f"{problem}, {doubt}")
+            return self._accept(stamp, state, covariances, problem)
         return Verdict(False, reason=problem)
+
+    def _accept(self, stamp: float, state: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None, jump: str = "") -> Verdict:
+        self.stamp, self.state, self._covariances, self._candidate = stamp, state, covariances, None
+        return Verdict(True, bool(jump), jump)
+
+    def _doubt(self, covariances: tuple[np.ndarray, np.ndarray] | None) -> str:
+        """What the odometry itself no longer knows where it has jumped to; empty: it is there.
+
+        The covariance that has been added since the last accepted sample counts, as VIO's own grows without end: a step as large as the
+        1 sigma that comes with it is no measurement of one.
+        """
+        if covariances is None:
+            return ""
+        before, limits = self._covariances or (np.zeros((6, 6)),) * 2, self.limits
+        parts = [("position", "m", 0, slice(0, 3), limits.position_jump), ("attitude", "rad", 0, slice(3, 6), radians(limits.attitude_jump_deg))]
+        if covariances[1][0, 0] >= 0.0 and before[1][0, 0] >= 0.0:
+            parts.append(("velocity", "m/s", 1, slice(0, 3), limits.velocity_jump))
+        for name, unit, k, s, limit in parts:
+            sigma = largest_sigma((covariances[k] - before[k])[s, s])
+            if sigma > limit:
+                return f"and its {name} is less certain by {sigma:.2g} {unit}"
+        return ""
 
     def _step(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
         """What is wrong with the step from one sample to the next; empty: nothing."""
