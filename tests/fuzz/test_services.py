@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from perch_core.values import PerchPlan, PerchPlanRequest
+from perch_core.values import PerchPlan, PerchPlanRequest, seconds
 from perch_core.vehicle import load_vehicle
 from perch_core.trajectory import rest_to_rest
 from perch_eval.fuzz.messages import Nonsense
@@ -37,6 +37,19 @@ def test_the_oracle_of_plans_knows_nonsense():
             judge_plan("plan_perch", request, plan, load_vehicle("snapdragon"))
     with pytest.raises(Nonsense, match="no typed refusal"):
         judge_plan("plan_perch", request, PerchPlan(success=False, message="planning failed: ValueError: x"), load_vehicle("snapdragon"))
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_plan_begins_when_it_was_asked_to_whatever_the_clock_says(late):
+    """In 2026 a clock says 1.8e9 s."""
+    level, start = np.array([0.0, 0.0, 0.0, 1.0]), 2_147_483_647 * 10**9
+    request = PerchPlanRequest(start=start, p=np.zeros(3), p_WS=np.array([1.0, 0.0, 0.0]), q_WS=level)
+    plan = PerchPlan(success=True, trajectory=rest_to_rest(np.zeros(3), np.array([1.0, 0.0, 0.0]), 0.0, 0.0, 8.0, start_time=seconds(start) + late))
+    if late:
+        with pytest.raises(Nonsense, match="starts at"):
+            judge_plan("plan_perch", request, plan, load_vehicle("snapdragon"))
+    else:
+        judge_plan("plan_perch", request, plan, load_vehicle("snapdragon"))
 
 
 @pytest.mark.parametrize("ways, counts", [

@@ -27,7 +27,8 @@ What is beyond these limits is nonsense whoever takes it, and is refused at the 
 * a **parameter** is refused by its own declaration: `python3 scripts/param.py describe /<node>` shows unit and range; files likewise.
 
 Not finite is outside every range. What depends on the present is judged by the node that knows it: stamps (far from the newest ones of
-their stream), frames, where a trajectory begins, what a vehicle can do.
+their stream), frames, what a vehicle can do, where and when a trajectory begins. A planner has no clock: its plan begins when the request
+says, and the controller refuses a trajectory that begins more than 60 s ahead, or longer ago than `start_late`.
 """
 
 

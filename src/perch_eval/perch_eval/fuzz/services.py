@@ -12,7 +12,7 @@ import random
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -25,7 +25,7 @@ from perch_core.isolated import IsolatedRunner
 from perch_core.ros import topics
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
-    Ask, ChooseLaw, MappedPowerline, PerchGoal, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest)
+    Ask, ChooseLaw, MappedPowerline, PerchGoal, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, seconds)
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_eval.fuzz import messages, sense
 from perch_eval.fuzz.messages import Nonsense
@@ -41,7 +41,8 @@ TASKS = {"plan_perch": "perching_planner", "plan_powerline": "powerline_planner"
 SHARES = ("plan_perch",) * 12 + ("plan_powerline",) + ("goal",) * 6 + ("set_controller",) * 2 + ("parameters",) * 6 + ("abort", "depart")
 FREE = {"plan_perch": ("current", "start_time"), "plan_powerline": ("start_time", "lines.0.covariance", "lines.0.direction_sigma",
                                                                               "lines.0.observations", "perch_pose")}
-"""Task -> fields that mean nothing in the requests here; a planner has no clock, so any time may be planned for."""
+"""Task -> fields that mean nothing in the requests here; a planner has no clock: any time may be planned for, and the controller
+refuses to fly what does not begin now."""
 
 
 @lru_cache(maxsize=None)
@@ -70,7 +71,9 @@ def judge_plan(task: str, request: Any, answer: Any, vehicle: Vehicle) -> None:
         if not answer.error_code or not answer.message or "failed: " in answer.message and "Error" in answer.message:
             raise Nonsense(f"no typed refusal: code {answer.error_code}, {answer.message!r}")
         return
-    for problem in sense.nonsense(answer.trajectory, math.inf, "trajectory"):
+    if not abs(answer.trajectory.start_time - seconds(request.start)) < 1e-6:
+        raise Nonsense(f"starts at {answer.trajectory.start_time} s, not at {seconds(request.start)} s")
+    for problem in sense.nonsense(replace(answer.trajectory, start_time=0.0), math.inf, "trajectory"):  # a time is as large as the clock's
         raise Nonsense(problem)
     (_judge_flat if task == "plan_perch" else _judge_sampled)(request, answer, vehicle)
     broken = [str(c) for c in answer.certificates if not c.holds]
