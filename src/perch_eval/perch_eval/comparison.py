@@ -66,10 +66,10 @@ def parser() -> argparse.ArgumentParser:
                      help="recording, or folder with flight.mcap and report.json")
     out.add_argument("--out", type=Path, default=Path("compare.html"), metavar="FILE",
                      help="page to write (default: %(default)s)")
-    out.add_argument("--names", nargs=2, metavar=("A", "B"), help="on the page (default: the paths)")
-    out.add_argument("--vehicle", default="", help="that flew (default: as the report says, or snapdragon)")
+    out.add_argument("--names", nargs=2, metavar=("A", "B"), help="names of the flights on the page (default: the paths)")
+    out.add_argument("--vehicle", default="", help="vehicle that flew (default: that of the report, or snapdragon)")
     out.add_argument("--namespace", nargs=2, default=("", ""), metavar=("A", "B"),
-                     help="of the vehicles, where several were recorded")
+                     help="namespaces of the vehicles, where several were recorded")
     return out
 
 

@@ -110,7 +110,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="surface_90", help="perch that is flown (default: %(default)s)")
     parser.add_argument("--runs", type=count, default=50, metavar="N", help="flights (default: %(default)s)")
-    parser.add_argument("--first-seed", type=count, default=100, metavar="N", help="of the seeds that follow each other (default: %(default)s)")
+    parser.add_argument("--first-seed", type=count, default=100, metavar="N", help="first of consecutive seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/consistency"), metavar="DIR", help="folder of results (default: %(default)s)")
     arguments = parser.parse_args()
     try:

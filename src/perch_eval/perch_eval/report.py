@@ -79,7 +79,7 @@ COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/
 
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
-    rows = [(t, f"mission orders {COMMANDS[c.command]}: {c.reason}") for t, c in flight.values("controller/command")]
+    rows = [(t, f"mission commands {COMMANDS[c.command]}: {c.reason}") for t, c in flight.values("controller/command")]
     for _, order in flight.values("trajectory"):
         kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[order.at_end]
         rows.append((order.trajectory.start_time, f"trajectory {order.id} ({kind}) starts, {order.trajectory.duration:.2f} s"))

@@ -1,4 +1,4 @@
-"""A pilot in the place of the mission: it is told what to order, and stops the motors where the surface is felt to carry the vehicle."""
+"""A pilot in the place of the mission: it sends the orders that it is given, and stops the motors when the IMU shows that the surface carries the vehicle."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class ScriptedPilot(Component[MissionParameters]):
     estimator_status = Input(EstimatorHealth, "estimator/status")
     trajectory = Output(TrajectoryOrder, "trajectory")
     command = Output(ControllerCommand, "controller/command")
-    feel = Wake(0.02)
+    check_contact = Wake(0.02)
 
     def __init__(self, config: MissionParameters) -> None:
         super().__init__(config)
-        self._adhesion, self._felt = AdhesionMonitor(config.mission.adhesion), []
+        self._adhesion, self._forces = AdhesionMonitor(config.mission.adhesion), []
         self._orders = 0
         self._target: Target | None = None
         self.state, self.message, self.flown = State.DISARMED, "", 0
@@ -56,7 +56,7 @@ class ScriptedPilot(Component[MissionParameters]):
 
     def on_imu(self, sample: ImuSample) -> None:
         """For the adhesion."""
-        self._felt.append(sample.f_B)
+        self._forces.append(sample.f_B)
 
     def on_odometry(self, state: OdometryState) -> None:
         """Where the vehicle believes to be."""
@@ -118,10 +118,10 @@ class ScriptedPilot(Component[MissionParameters]):
 
     # -- the contact -------------------------------------------------------------------------------------------------
 
-    def on_feel(self, now: int) -> None:
+    def on_check_contact(self, now: int) -> None:
         """What the mission does after a perch."""
-        self._adhesion.add(np.array(self._felt).reshape(-1, 3))
-        self._felt.clear()
+        self._adhesion.add(np.array(self._forces).reshape(-1, 3))
+        self._forces.clear()
         m = self.config.mission
         if self._target is None or not (-m.contact_early < self.time - self.contact_due < m.contact_time + 0.2) or self.state is not State.TRACKING:
             self._adhesion.reset()

@@ -110,7 +110,7 @@ def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
 
 def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
     out = Section("m_table_3", "[M] Table III: success rate",
-                  f"{_seeds(effort)}; a success is a vehicle that truly hangs on the pad at the end, and a mission that says so. "
+                  f"{_seeds(effort)}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
                   "95 % Wilson intervals.")
     for name, paper in SUCCESSES.items():
         rate = Rate(sum(r.cause == SUCCESS for r in groups[name]), len(groups[name]))

@@ -31,8 +31,8 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
     parser.add_argument("--recording", type=Path, help="MCAP file of a flight (default: fly in the simulator)")
     parser.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulated flight (default: %(default)s)")
-    parser.add_argument("--name", default="", help="of the identified vehicle (default: the vehicle's, _identified)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated flight (default: %(default)s)")
+    parser.add_argument("--name", default="", help="name of the identified vehicle (default: that of the vehicle with _identified)")
     parser.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (default: %(default)s)")
     return parser
 
@@ -65,6 +65,6 @@ def main() -> int:
         print(f"error: {error.filename or arguments.out}: {error.strerror}", file=sys.stderr)
         return 2
     print("\n".join(map(str, found)))
-    print(f"{'thrust against battery voltage':32s} not told: no flight holds the battery's voltage beside what its thrust was")
+    print(f"{'thrust against battery voltage':32s} not identified: no recording holds battery voltage and thrust together")
     print(f"written: {arguments.out / 'vehicle.yaml'}, {arguments.out / 'identify.png'}")
     return 1 if any(one.refused for one in found) else 0

@@ -46,7 +46,7 @@ class Found:
     refused: str = ""
 
     def __str__(self) -> str:
-        refused = f"   not told: {self.refused}" if self.refused else ""
+        refused = f"   not identified: {self.refused}" if self.refused else ""
         return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{refused}"
 
 

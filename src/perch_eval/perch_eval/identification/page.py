@@ -16,7 +16,7 @@ from perch_eval.identification.fit import Answer, Found  # noqa: E402
 
 
 def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str) -> str:
-    """A vehicle file that extends `base` by what was told; what was not stays as it is there, with the reason in a comment.
+    """A vehicle file that extends `base` by what was identified; all else stays as it is there, with the reason in a comment.
 
     Args:
         found: what was identified.
@@ -39,7 +39,7 @@ def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flig
         sigmas = "; ".join(f"{axis}+- {one.sigma:.2g} {one.unit}".rstrip() for axis, one in zip(axes, group) if not one.refused)
         text = f"[{', '.join(f'{x:.4g}' for x in new)}]" if isinstance(new, list) else f"{new:.5g}"
         indent = "  " if key.startswith("actuation.") else ""
-        lines += [f"{indent}# {field}: {axis}not told: {one.refused}" for axis, one in zip(axes, group) if one.refused]
+        lines += [f"{indent}# {field}: {axis}not identified: {one.refused}" for axis, one in zip(axes, group) if one.refused]
         if told:
             lines.append(f"{indent}{field}: {text}".ljust(45) + f"# {sigmas}")
     mine, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]

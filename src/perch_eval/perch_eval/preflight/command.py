@@ -28,8 +28,8 @@ def command_line() -> argparse.ArgumentParser:
     """The options."""
     parser = argparse.ArgumentParser(prog="preflight.py", description="Check a running vehicle before it flies.", epilog=EXAMPLES,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vehicle", required=True, help="its file, a name in config/vehicles or a file")
-    parser.add_argument("--namespace", default="", help="of its nodes")
+    parser.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
+    parser.add_argument("--namespace", default="", help="namespace of its nodes")
     parser.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
     parser.add_argument("--shake", choices=("down", "front"),
                         help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")

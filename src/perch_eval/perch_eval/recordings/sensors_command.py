@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = out.add_subparsers(dest="verb", required=True, metavar="import|check")
     read = verbs.add_parser("import",
-                            help="a sensor file of a calibration",
+                            help="make a sensor file from a calibration",
                             epilog=EXAMPLES,
                             formatter_class=argparse.RawDescriptionHelpFormatter)
     read.add_argument("kind", choices=("kalibr", "euroc"))
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
                       metavar="FILE",
                       help="kalibr: camchain-imucam.yaml [imu.yaml]; euroc: the recording's folder")
     read.add_argument("--out", type=Path, metavar="FILE", help="where to write (default: the terminal)")
-    read.add_argument("--name", help="of the sensors (default: of the file)")
+    read.add_argument("--name", help="name of the sensors (default: that of the file)")
     read.add_argument("--rename", nargs="+", default=[], metavar="OLD=NEW", help="names of the cameras, as cam0=down")
     read.add_argument("--imu-orientation",
                       nargs=4,
@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
                       default=(0.0, 0.0, 0.0, 1.0),
                       metavar=("X", "Y", "Z", "W"),
                       help="axes of the IMU in the body (forward, left, up), as a quaternion (default: the body has the IMU's axes)")
-    judge = verbs.add_parser("check", help="what would make perception fail on a recording")
+    judge = verbs.add_parser("check", help="find what would make perception fail on a recording")
     judge.add_argument("recording", type=Path, metavar="RECORDING")
     judge.add_argument("--sensors",
                        metavar="FILE",

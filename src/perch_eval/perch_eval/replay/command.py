@@ -42,9 +42,9 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--to", dest="end", type=float, metavar="S", help=f"end (default: {AFTER:g} s after the contact)")
     out.add_argument("--fps", type=float, default=15.0, help="frames per second (default: %(default)s)")
     out.add_argument("--speed", type=float, default=1.0, help="1: real time, 0.25: slow motion (default: %(default)s)")
-    out.add_argument("--instants", type=count, default=10, help="of a stroboscopic picture (default: %(default)s)")
-    out.add_argument("--vehicle", default="snapdragon", help="whose rotors are drawn (default: %(default)s)")
-    out.add_argument("--namespace", default="", help="of the vehicle, where several were recorded")
+    out.add_argument("--instants", type=count, default=10, help="instants in a stroboscopic picture (default: %(default)s)")
+    out.add_argument("--vehicle", default="snapdragon", help="vehicle that is drawn (default: %(default)s)")
+    out.add_argument("--namespace", default="", help="namespace of the vehicle, where several were recorded")
     return out
 
 
