@@ -28,7 +28,7 @@ from perch_core.component import Job, JobFailed, JobStopped
 
 MEMORY = 4 << 30
 """Address space of a job's process [byte]; with numpy, CasADi and compiled kernels 0.4 GiB of it are used before any work."""
-START_TIMEOUT = 120.0
+START_TIMEOUT = 300.0
 """[s]; a first start on a machine compiles."""
 COMMAND = (sys.executable, "-m", "perch_core.isolated_process")
 WAITING_MAX = 64

@@ -24,7 +24,7 @@ from perch_eval.ros.pilot import FlightResult, Pilot
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import Scenario, load_scenario
 
-READY_TIMEOUT = 180.0  # [s] compiled functions that a changed source invalidated are built while nodes start
+READY_TIMEOUT = 300.0  # [s] compiled functions that a changed source invalidated are built while nodes start
 EXAMPLES = """examples:
   python3 scripts/demo.py                                    perch on the wall of paper M, 1.7 m away
   python3 scripts/demo.py --scenario surface_60_far --seed 4 --out /tmp/flight

@@ -229,7 +229,7 @@ class Pilot:
         finally:
             self._node.destroy_client(client)
 
-    def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 5.0) -> None:
+    def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 30.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
         end, last = self._time + duration, time.monotonic() + patience
         while self._time < end and time.monotonic() < last:
