@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import wraps
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar, overload
 
 from perch_core.errors import PerchError
 from perch_core.values.limits import LIMITS, problem
@@ -81,6 +81,14 @@ class Output(_Port, Generic[V]):
     def __init__(self, value: type[V], channel: str) -> None:
         super().__init__(channel)
         self.value = value
+
+    if TYPE_CHECKING:  # an instance holds an emitter under the port's name
+
+        @overload
+        def __get__(self, instance: None, owner: type) -> Output[V]: ...
+        @overload
+        def __get__(self, instance: Component[Any], owner: type) -> Emitter[V]: ...
+        def __get__(self, instance: Component[Any] | None, owner: type) -> Output[V] | Emitter[V]: ...
 
 
 class Emitter(Generic[V]):
