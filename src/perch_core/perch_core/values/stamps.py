@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import overload
+
 import numpy as np
 
 NANOSECONDS = 1_000_000_000
 
 
+@overload
+def seconds(stamp: int) -> float: ...
+@overload
+def seconds(stamp: np.ndarray) -> np.ndarray: ...
 def seconds(stamp: int | np.ndarray) -> float | np.ndarray:
     """Nanoseconds in seconds."""
     return stamp // NANOSECONDS + 1e-9 * (stamp % NANOSECONDS)
