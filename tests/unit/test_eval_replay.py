@@ -118,7 +118,8 @@ def test_a_report_is_written(recorded, tmp_path):
     written = build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
     assert json.loads((tmp_path / "report.json").read_text())["flight_hash"] == written["flight_hash"] == recorded[1].digest(4.0)
     page = (tmp_path / "report.html").read_text()
-    for words in ("mission commands arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad", "front camera, 1.00 to 3.80 s", "data:image/webp"):
+    for words in ("mission commands arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad",
+                  "front camera, 1.00 to 3.80 s", "data:image/webp"):
         assert words in page
     assert written["real_time_factor"] == pytest.approx(1.5)
     assert "1.50: 3.00 s of simulated time in 2.00 s" in page

@@ -179,7 +179,7 @@ class Mission(Component[MissionParameters]):
             if self._map is not None and lines.stamp < self._map.stamp:
                 raise PerchError("it is older than the newest")
             for line in lines.lines:
-                line.segment  # noqa: B018: raises where it is none
+                _ = line.segment  # raises where it is none
         except PerchError as error:
             self.warn(f"powerlines refused: {error}", every=1.0)
             return

@@ -25,7 +25,8 @@ class MissionSettings:
     search_rise: float = quantity(0.25, unit="m", low=0.0, high=2.0, doc="height change of the search pattern")
     search_dwell: float = quantity(2.0, unit="s", above=0.0, high=30.0, doc="look this long at each place of the pattern")
     target_settle: float = quantity(0.5, unit="s", low=0.0, high=10.0, doc="observe the target this long before planning")
-    target_position_sigma: float = quantity(0.06, unit="m", above=0.0, high=1.0, doc="plan only on a target whose place relative to the vehicle is as certain as this")
+    target_position_sigma: float = quantity(0.06, unit="m", above=0.0, high=1.0,
+                                          doc="plan only on a target whose place relative to the vehicle is as certain as this")
     target_attitude_sigma_deg: float = quantity(5.0, unit="deg", above=0.0, high=45.0)
     inclination_tolerance_deg: float = quantity(15.0, unit="deg", above=0.0, high=90.0, doc="allowed difference from the hint")
     planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")

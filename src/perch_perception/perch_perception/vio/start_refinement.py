@@ -19,7 +19,6 @@ from perch_core.vehicle import GRAVITY
 from scipy.stats import chi2
 
 from perch_perception.vio import ekf
-from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, Bearings, residuals
 from perch_perception.vio.bearing import POSITION as BY_POSITION
 from perch_perception.vio.bearing import THETA as BY_THETA
@@ -144,7 +143,7 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
     variance = (config.filter.pixel_noise / mount.camera.fx) ** 2
     used = np.ones(len(sights), bool)
     while True:
-        end = _descend(s, lambda at_: _linearised(at_, steps, sights, used, sliding, variance, sigma), sigma, used)
+        end = _descend(s, lambda at_, used=used: _linearised(at_, steps, sights, used, sliding, variance, sigma), sigma, used)
         if end is None:
             return None
         s, here = end

@@ -160,8 +160,9 @@ class StageFunctions:
     Attributes:
         functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, 1/N, weights)`, `see(x, line, weights)`,
             `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint,
-            with x of 18 values (17 states, T) and u of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f
-            and then the nonzeros of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
+            with x of 18 values (17 states, T) and u of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the
+            Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f and then the nonzeros
+            of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
             `see_gauss_newton` is `see_hess` without the curvature of what is squared: never negative.
         jacobian, hessian: sparsity of these nonzeros by base name; the Hessian's is an upper triangle.
     """
