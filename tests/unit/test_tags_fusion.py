@@ -9,6 +9,7 @@ from perch_core.camera import CameraMount
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
+from perch_perception.sensor_file import tag_sigmas
 from perch_perception.tags import CalibrationSigma, fuse, solve_board, start_fusion, to_map
 from perch_perception.tags.fusion import RESTART_AFTER
 from scipy.stats import chi2
@@ -156,3 +157,8 @@ def test_odometry_that_has_drifted_for_an_hour_leaves_the_target_as_certain():
 def pixels_of(p_WB):
     p_WC, R_WC = MOUNT.pose(p_WB, np.eye(3))
     return MOUNT.camera.project((BOARD.corners_S @ R_WS.T + P_WS - p_WC) @ R_WC)[0]
+
+
+def test_calibration_is_as_good_as_the_sensor_file_says():
+    declared = dataclasses.asdict(tag_sigmas("snapdragon", "front", CalibrationSigma(1.0, 1.0, 1.0, 0.1)))
+    assert dataclasses.asdict(CALIBRATION) == pytest.approx(declared, rel=2e-3)

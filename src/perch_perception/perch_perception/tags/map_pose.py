@@ -25,16 +25,15 @@ SHARED = 8
 
 @dataclass(frozen=True)
 class CalibrationSigma:
-    """How well the camera is calibrated: 1-sigma of what stays the same from image to image.
+    """How well the camera is calibrated: 1 sigma of what stays the same from image to image.
 
-    The defaults are what a careful calibration leaves (0.3 %, 0.5 px, 0.5 deg about all axes together, 2 ms) when one that is off by
-    more than two sigma is repeated: 0.96 of that.
+    The defaults are those of config/sensors/snapdragon.yaml, what a careful calibration leaves.
     """
 
-    focal: float = config.quantity(0.0029, low=0.0, high=0.1, doc="each focal length, relative")
-    centre: float = config.quantity(0.48, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
-    rotation: float = config.quantity(0.277, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis of B")
-    time: float = config.quantity(0.0019, unit="s", low=0.0, high=0.05, doc="camera-IMU time offset")
+    focal: float = config.quantity(0.003, low=0.0, high=0.1, doc="each focal length, relative")
+    centre: float = config.quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
+    rotation: float = config.quantity(0.286, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis of B: 0.005 rad")
+    time: float = config.quantity(0.002, unit="s", low=0.0, high=0.05, doc="camera-IMU time offset")
 
     @property
     def lens(self) -> np.ndarray:
