@@ -20,7 +20,7 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
     inf = float("inf")
     table = (("N", *limits.thrust, mass, "bernstein"), ("m/s", -inf, limits.speed, 1.0, "bernstein"),
              ("m", *limits.height, 1.0, "bernstein"), ("m", limits.clearance, inf, 1.0, "bernstein"),
-             ("rad/s", -inf, limits.body_rate, 1.0, "bernstein"), ("N", *limits.rotor_thrust, 1.0, "dense"))
+             ("rad/s", -inf, limits.body_rate, 1.0, "bernstein"), ("N", *limits.rotor_thrust, 1.0, "interval"))
     out = []
     for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, results.tolist(), table):
         minimum, at_minimum, maximum, at_maximum, holds = row

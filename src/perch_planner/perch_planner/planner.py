@@ -27,7 +27,7 @@ class PerchPlan:
 
     Attributes:
         trajectory: flat outputs, degree 14, from time 0 to contact.
-        certificates: one for each limit; that of the rotors is sampled.
+        certificates: one for each limit.
         iterations: QPs solved.
         solve_time: wall-clock time [s].
         attempts: what was tried on the way, in order.
@@ -54,7 +54,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         vehicle: mass, thrust range, extension and perch offset.
 
     Returns:
-        A plan that keeps every limit, each with its proof; that of the single rotors is sampled.
+        A plan that keeps every limit, each with its proof.
 
     Raises:
         PerchRefusal: there is none, or none was found; with the violated constraint and its margin.

@@ -6,8 +6,8 @@ accelerations [M:eq9-13], and with Euler's equation [M:eq1] and the allocation [
 
     f = A^-1 (m |f|, J w' + w x J w).
 
-That is no polynomial, so it is *sampled*, the extrema refined by parabolas through the samples; the certificate says
-`dense`. It is smooth in acceleration, jerk and snap: its linearisation at the present plan bounds the next one.
+That is no polynomial, so it is sampled, the extrema refined by parabolas through the samples; `rotor_proof` proves what they promise.
+It is smooth in acceleration, jerk and snap: its linearisation at the present plan bounds the next one.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from perch_planner.judgement import Judgement, Question
 from perch_planner.linear_bounds import Bounds
 from perch_planner.plan_checks import BODY_RATE, HEIGHT, HOLDS, MAXIMUM, MINIMUM, SPEED
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
+from perch_planner.rotor_proof import prove_rotors
 from perch_planner.rotor_thrusts import linear_bounds, rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
@@ -122,6 +123,8 @@ class Search:
                 low, high = self.limits.rotor_thrust
                 thrusts, row = sampled(found.coefficients, yaw, durations, *self.rotors)
                 kept = low <= row[0] and row[2] <= high
+                if kept and found.holds:
+                    kept, row[0], row[2] = prove_rotors(found.coefficients, yaw, durations, row[0], row[2], low, high, *self.rotors)
                 results, turning = np.vstack([found.results, [*row, kept]]), turning or not kept
                 if not kept:
                     self.acted.add("rotor_margin")

@@ -24,7 +24,7 @@ class Certificate:
         lower_limit, upper_limit: required bounds, infinite where there is none.
         minimum, maximum: bounds of the quantity, infinite where none was asked for.
         time_of_minimum, time_of_maximum: times of the samples nearest to them [s]; nan: none.
-        method: bernstein: the bounds are proved; dense: they are those of samples, and no proof.
+        method: bernstein, sturm, interval: the bounds are proved; dense: they are those of samples, and no proof.
         holds: the limits are kept.
     """
 

@@ -71,7 +71,7 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
         out.data[f"shipped_{waypoints}"] = [found.solve_time for found in ours]
         shipped = Spread.of(1e3 * found.solve_time for found in ours)
         out.compare(f"what flies, {waypoints} waypoints", shipped.words(1.0, 2, "ms"), f"{paper_qp:g} ms", shipped.median <= paper_qp,
-                    f"{len(ours)} of {count} planned, from its own first durations; every limit proved, the single rotors sampled")
+                    f"{len(ours)} of {count} planned, from its own first durations; every limit proved, single rotors too")
     return out
 
 
