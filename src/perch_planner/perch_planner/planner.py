@@ -18,7 +18,7 @@ from perch_core.vehicle import Vehicle
 from perch_planner import refusals, relaxation
 from perch_planner.certificates import certificates
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
-from perch_planner.search import Attempt, Outcome, Search
+from perch_planner.search import Attempt, Search
 
 
 @dataclass(frozen=True, slots=True)

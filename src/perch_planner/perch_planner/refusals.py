@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from math import hypot, sqrt
 
-import numpy as np
-
 from perch_core.errors import PlanningRefusal
 from perch_core.jit import compiled
 from perch_core.values import Certificate

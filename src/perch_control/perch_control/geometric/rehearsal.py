@@ -2,8 +2,8 @@
 
 Near contact the thrust is low, and so is the moment that the rotors have without extra thrust: with their lag, or with a
 plan that asks for more, stopping the rotation pushes the vehicle away from the wall by up to 0.3 m/s, every time, in the
-same way. No feedback can undo that in the last tenth of a second, but it can be known beforehand: the flight is rehearsed with rotor lag and limits, and the reference is offset
-so that the *rehearsed* vehicle arrives as planned.
+same way. No feedback can undo that in the last tenth of a second, but it can be known beforehand: the flight is rehearsed with
+rotor lag and limits, and the reference is offset so that the *rehearsed* vehicle arrives as planned.
 """
 
 from __future__ import annotations
