@@ -65,7 +65,7 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
     """Build the packages that changed, or all of them in a new environment."""
     environment = done["environment"]
     fresh = done.get("built_with", environment) != environment
-    current = {folder: stamps.package_stamp(folder, environment) for folder in stamps.packages()}
+    current = {folder: stamps.package_stamp(folder, environment) for folder in stamps.packages(wanted)}
     stale = [folder for folder in current if not _is_built(folder, current[folder], done)]
     if stale:
         for folder in stale:
@@ -100,7 +100,7 @@ def _nothing_to_do(wanted: Platform, done: dict[str, str]) -> bool:
         return False
     return (INSTALL / "setup.bash").exists() and all(
         _is_built(folder, stamps.package_stamp(folder, environment), done)
-        for folder in stamps.packages()
+        for folder in stamps.packages(wanted)
     )
 
 

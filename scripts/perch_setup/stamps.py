@@ -44,9 +44,13 @@ def kernel_stamp(environment: str) -> str:
     return _digest(files, environment)
 
 
-def packages() -> list[Path]:
-    """The folders of all packages to build: those of ROS itself only where the sourced ROS lacks them."""
-    prefixes = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix and not prefix.startswith(str(ROOT))]
+def packages(wanted: Platform) -> list[Path]:
+    """The folders of all packages to build: those of ROS itself only where the sourced installation lacks them.
+
+    With our wheels nothing that is sourced counts: it may be another checkout of perch.
+    """
+    sourced = "" if wanted.uses_wheels else os.environ.get("AMENT_PREFIX_PATH", "")
+    prefixes = [Path(prefix) for prefix in sourced.split(os.pathsep) if prefix and not prefix.startswith(str(ROOT))]
     return sorted(file.parent for file in SOURCES.glob("*/package.xml")
                   if file.parent.name.startswith("perch_") or not any((prefix / "share" / file.parent.name).is_dir() for prefix in prefixes))
 

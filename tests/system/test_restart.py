@@ -18,12 +18,14 @@ def domain(ros_domain):
 
 
 def killed(flight: Rig, name: str):
-    """Kill a node and start it again; then it is there."""
+    """Kill a node and start it again; then it is there, and the pilot has discovered it."""
     gone, back = flight.said(f"lockstep: {name} is gone"), flight.said(f"lockstep: {name} is back")
+    process = flight.pilot.process(f"/{name}")
     flight.kill(name)
     yield lambda: flight.said(f"lockstep: {name} is gone") > gone
     flight.start(name)
     yield lambda: flight.said(f"lockstep: {name} is back") > back
+    yield lambda: flight.pilot.process(f"/{name}") != process
 
 
 def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):

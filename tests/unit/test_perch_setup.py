@@ -241,3 +241,12 @@ def test_equal_libraries_under_several_names_become_one_file(tmp_path):
     assert (tmp_path / "liba.so").samefile(tmp_path / "liba.so.3.7") and (tmp_path / "liba.so.3").read_text() == 1000 * "a"
     assert (tmp_path / "libb.so").read_text() == 1000 * "b" and not (tmp_path / "a.txt").samefile(tmp_path / "liba.so")
     assert len(list(tmp_path.iterdir())) == 5
+
+
+@pytest.mark.parametrize("platform, built", [(WHEELS, True), (INSTALLED, False)])
+def test_only_an_installation_of_ros_takes_the_place_of_a_package_of_ours(tmp_path, monkeypatch, platform, built):
+    """A shell in which another checkout is sourced has its `tf2_msgs`, which is not where this checkout looks for it."""
+    (tmp_path / "share" / "tf2_msgs").mkdir(parents=True)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    names = {folder.name for folder in stamps.packages(platform)}
+    assert ("tf2_msgs" in names) is built and {"perch_core", "perch_msgs"} <= names

@@ -145,6 +145,10 @@ class Pilot:
             self._silent = silent
         return news
 
+    def process(self, node: str) -> str | None:
+        """Where a node runs, as its newest diagnostics say; another process after a restart. None: it has not been heard."""
+        return self._process.get(node)
+
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
         self._spin(0.02)
