@@ -6,8 +6,8 @@ import inspect
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -54,11 +54,12 @@ class NodeOf:
         Raises:
             ConfigError: a parameter is refused.
         """
-        wiring, given = wiring or Wiring(), _given(self.name, kwargs, {"lockstep": bool, "type": str})
-        component = self.choose(given["type"]) if self.choose is not None and "type" in given else self.component
-        if given.get("lockstep"):
-            return resolved(self.lockstep)(self.name, component, wiring, **kwargs)
-        return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
+        with _given(self.name, kwargs, {"lockstep": bool, "type": str}) as given:
+            wiring = wiring or Wiring()
+            component = self.choose(given["type"]) if self.choose is not None and "type" in given else self.component
+            if given.get("lockstep"):
+                return resolved(self.lockstep)(self.name, component, wiring, **kwargs)
+            return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
 
     def main(self) -> None:
         """Entry point of the executable: run until SIGINT or SIGTERM; exit code 0, or 2 when the caller's parameters are refused."""
@@ -71,15 +72,20 @@ def node(name: str, component: type[Component], deadline: str = "", lockstep: st
     return NodeOf(name, component, deadline, lockstep, choose)
 
 
-def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> dict[str, Any]:
-    """Parameters that decide what the node is: their given values, read before there is one."""
+@contextmanager
+def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterator[dict[str, Any]]:
+    """Parameters that decide what the node is: their given values, read before there is one, from a node that lives until there is.
+
+    Without another node its end would be that of the process's participant, and Fast DDS may wait for ever where a participant ends
+    while it discovers others.
+    """
     probe = Node(name, enable_rosout=False, start_parameter_services=False, **{k: v for k, v in kwargs.items() if k != "wiring"})
     try:
         given = {key: parameter.value for key, parameter in probe._parameter_overrides.items() if key in kinds}
         for key, value in given.items():
             if not isinstance(value, kinds[key]):
                 raise ConfigError(name, key, f"{value!r} is not of type {kinds[key].__name__}")
-        return given
+        yield given
     finally:
         probe.destroy_node()
 
