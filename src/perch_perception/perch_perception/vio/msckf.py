@@ -117,14 +117,13 @@ class Msckf:
         tracks = [self.tracks.by_id[i] for i in s.landmarks]
         seen = Bearings(np.array([t.b_C[-1] for t in tracks]), np.array([t.shape[-1] for t in tracks]))
         now = self._residuals(clone.R_WB, clone.p_WB, np.array([k.X_W for k in s.landmarks.values()]), seen)
-        linear = self._residuals(clone.R_WB, clone.p_WB, np.array([k.X_linear for k in s.landmarks.values()]), seen)
         k = s.clone_at(len(s.clones) - 1)
         columns = np.concatenate([_CALIBRATION, np.arange(k, k + 6), np.arange(s.landmark_start, s.size)])
         H = np.zeros((m, 2, len(columns)))
-        H[:, :, : POINT.start] = linear.J[:, :, : POINT.start]
+        H[:, :, : POINT.start] = now.J[:, :, : POINT.start]
         for i in range(m):
             k = POINT.start + 3 * i
-            H[i, :, k : k + 3] = linear.J[i, :, POINT]
+            H[i, :, k : k + 3] = now.J[i, :, POINT]
         r = now.r
         self._let_slide(tracks, now.distance)
         P = s.P[np.ix_(columns, columns)]

@@ -44,32 +44,8 @@ def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> np.ndarray:
     P[12 + d, 12 + d] += imu.accel_bias_walk**2 * T
     P[:n, n:] = Phi @ P[:n, n:]
     P[n:, :n] = P[:n, n:].T
-    mean_R = R @ so3.exp(0.5 * so3.log(pre.dR))
-    gained, moved = v - s.v_WB, p - s.p_WB - s.v_WB * T
     s.p_WB, s.v_WB, s.R_WB = p, v, _orthonormal(R_end)
-    _expect_force(s, mean_R, T, gained, moved)
-    s.forces.append((T, mean_R.T @ (gained / T - _G)))
     return pre.w_end
-
-
-def _expect_force(s: State, mean_R: np.ndarray, T: float, gained: np.ndarray, moved: np.ndarray) -> None:
-    """Let the scale be told by the force that was expected in an interval T, instead of by the one that the IMU says it was.
-
-    With a scale that is wrong by s, what vision sees is wrong by s a T^2 / 2 against the IMU. Taken with the acceleration of this very
-    interval, a carries the noise n that the next residual carries, and every frame teaches a smaller scale, and counts as knowledge:
-    E[a r] = -E[n^2]. The mean force of the intervals before, turned as the body is now, has no part in it.
-
-    Args:
-        mean_R: R_WB in the middle of the interval, shape (3, 3).
-        gained, moved: what the velocity, and the position beyond v T, did in W, shape (3,).
-    """
-    scale = s.scale_error()
-    if scale is None or not s.forces:
-        return
-    a = _G + mean_R @ np.average([f_B for _, f_B in s.forces], axis=0, weights=[t for t, _ in s.forces])
-    beyond = np.zeros(s.size)
-    beyond[at.VELOCITY], beyond[at.POSITION] = gained - a * T, moved - 0.5 * a * T * T
-    s.carry_scale(beyond, scale)
 
 
 def _orthonormal(R: np.ndarray) -> np.ndarray:

@@ -29,7 +29,6 @@ def stop(filter: Msckf) -> None:
     """The vehicle has come to rest at the state's stamp: what its velocity was wrong by, it was wrong by before."""
     s = filter.state
     s.drop_clones(list(range(len(s.clones))))
-    s.forces.clear()
     filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, filter.config.rest.velocity**2)
 
 

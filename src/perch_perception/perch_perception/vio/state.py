@@ -9,67 +9,20 @@ position in W stay unobservable for the filter, as they are (docs/estimation.md)
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from perch_core import so3
 from perch_core.jit import compiled
 
+from perch_perception.vio import camera_frame
+
 THETA, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, LENS = slice(15, 18), slice(18, 21), 21, slice(22, 26)
 INERTIAL_SIZE, CORE_SIZE, CLONE_SIZE = 15, 26, 6
-_POSE = np.arange(CLONE_SIZE)
-_FORCES = 5  # propagations whose mean force tells the scale by the next one
-
-
-@compiled
-def _less_cross(out, a, s, w):
-    """Take s x w, w (3, n), off the rows of `out` from a on."""
-    x, y, z = s[0], s[1], s[2]
-    for c in range(out.shape[1]):
-        out[a, c] -= y * w[2, c] - z * w[1, c]
-        out[a + 1, c] -= z * w[0, c] - x * w[2, c]
-        out[a + 2, c] -= x * w[1, c] - y * w[0, c]
-
-
-@compiled
-def _carried(P, thetas, R, E, steps, v, points, onward):
-    """M P M^T for the M of `State.inject`.
-
-    Args:
-        P: covariance, shape (n, n).
-        thetas: where the poses' errors (theta, p) begin in it, the present one's first, shape (k,).
-        R: their attitudes before the step, shape (k, 3, 3); E: what these are turned by, R' = R E, shape (k, 3, 3).
-        steps: of their positions, shape (k, 3); v: of the velocity, shape (3,).
-        points: where errors of points begin, shape (m,); onward: their steps, shape (m, 3).
-    """
-    n = len(P)
-    out, other = P.copy(), np.empty((n, n))
-    w = np.empty((3, n))
-    for side in range(2):  # rows, then those of the transpose
-        for k in range(len(thetas) - 1, -1, -1):
-            a = thetas[k]
-            for i in range(3):
-                for c in range(n):
-                    w[i, c] = R[k, i, 0] * out[a, c] + R[k, i, 1] * out[a + 1, c] + R[k, i, 2] * out[a + 2, c]
-            _less_cross(out, a + 3, steps[k], w)
-            if k == 0:
-                _less_cross(out, 6, v, w)
-                for m in range(len(points)):
-                    _less_cross(out, points[m], onward[m], w)
-            for c in range(n):
-                x, y, z = out[a, c], out[a + 1, c], out[a + 2, c]
-                for i in range(3):
-                    out[a + i, c] = E[k, 0, i] * x + E[k, 1, i] * y + E[k, 2, i] * z
-        if side == 0:
-            other[:, :] = out.T
-            out, other = other, out
-    for r in range(n):
-        for c in range(r):
-            out[r, c] = out[c, r] = 0.5 * (out[r, c] + out[c, r])
-    return out
+_CAMERA = np.r_[THETA, POSITION, CAMERA_ROTATION, CAMERA_POSITION]  # what a point's place in the camera depends on
 
 
 @compiled
@@ -97,10 +50,9 @@ class Clone:
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), that at which it is linearised, refused observations in a row."""
+    """A point in the state: position in W (3,), refused observations in a row."""
 
     X_W: np.ndarray
-    X_linear: np.ndarray
     strikes: int = 0
 
 
@@ -120,7 +72,6 @@ class State:
     P: np.ndarray
     clones: list[Clone] = field(default_factory=list)
     landmarks: dict[int, Landmark] = field(default_factory=dict)
-    forces: deque[tuple[float, np.ndarray]] = field(default_factory=lambda: deque(maxlen=_FORCES))  # (T, mean of f_B), the last ones
 
     @property
     def size(self) -> int:
@@ -144,34 +95,61 @@ class State:
 
             theta := R'^T R theta,   dp := dp - s x (R theta),
 
-        likewise v and the points with the present theta, each clone with its own. Otherwise what nothing can see would be another
-        direction after each step, and the filter would learn of it by its own corrections.
-
-        A point is linearised where it is until its estimate has gone by more than 1 sigma from there; only then it is carried
-        along. Followed at each step, Jacobians are correlated with the noise that has moved the point, and distances shrink.
+        likewise v with the present theta, each clone with its own. Otherwise what nothing can see would be another direction after each
+        step, and the filter would learn of it by its own corrections. A point's error is left in place as the camera sees it, in direction
+        and log distance (`camera_frame`), and so is its place in the camera by the step: the camera's rotation on the body and a distance
+        are hardly seen either.
 
         The direction of a scale (`scale_error`) moves with the estimate as well, and is carried along.
         """
-        before = self._metric()
-        thetas = self.clone_at(np.arange(-1, len(self.clones)))
-        thetas[0] = 0
-        R = np.array([self.R_WB, *(c.R_WB for c in self.clones)])
-        poses = dx[thetas[:, None] + _POSE]
-        E, steps = so3.exp(poses[:, :3]), poses[:, 3:]
-        points, onward = self._move_points(dx)
-        self.P = _carried(self.P, thetas, R, E, steps, dx[VELOCITY], points, onward)
+        metric = self._metric()
+        carry = self._move(dx)
+        P = carry(np.ascontiguousarray(carry(self.P).T))
+        self.P = 0.5 * (P + P.T)
+        scale = self.scale_error()
+        if scale is not None:
+            carried = carry(metric[:, None])[:, 0]
+            self.carry_scale(self._metric() - carried, scale / (scale @ carried))
+
+    def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Move all estimates; returns what carries errors along, rows (size, n) to rows."""
+        start, marks = self.landmark_start, list(self.landmarks.values())
+        where = np.concatenate([[0], self.clone_at(np.arange(len(self.clones)))])[:, None] + np.arange(CLONE_SIZE)
+        R, steps = np.array([self.R_WB, *(c.R_WB for c in self.clones)]), dx[where]
+        E, E_BC = so3.exp(steps[:, :3]), so3.exp(dx[CAMERA_ROTATION])
+        poses = np.zeros((len(where), CLONE_SIZE, CLONE_SIZE))
+        poses[:, :3, :3], poses[:, 3:, 3:], poses[:, 3:, :3] = E.transpose(0, 2, 1), np.eye(3), -so3.hat(steps[:, 3:]) @ R
+        velocity = so3.hat(dx[VELOCITY]) @ self.R_WB
+        before = self._see(np.array([m.X_W for m in marks]).reshape(-1, 3))
+        X_C, S = camera_frame.moved(before.X_C, before.by_camera @ dx[_CAMERA] + dx[start:].reshape(-1, 3) @ before.R_CW.T)
+
         R = R @ E
         self.R_WB, self.p_WB, self.v_WB = R[0], self.p_WB + dx[POSITION], self.v_WB + dx[VELOCITY]
         for clone, R_WB, step in zip(self.clones, R[1:], steps[1:]):
-            clone.R_WB, clone.p_WB = R_WB, clone.p_WB + step
+            clone.R_WB, clone.p_WB = R_WB, clone.p_WB + step[3:]
         self.gyro_bias = self.gyro_bias + dx[GYRO_BIAS]
         self.accel_bias = self.accel_bias + dx[ACCEL_BIAS]
-        self.R_BC = self.R_BC @ so3.exp(dx[CAMERA_ROTATION])
+        self.R_BC = self.R_BC @ E_BC
         self.p_BC = self.p_BC + dx[CAMERA_POSITION]
         self.time_offset += float(dx[TIME_OFFSET])
-        scale = self.scale_error()
-        if scale is not None:
-            self.carry_scale(self._metric() - before, scale / (scale @ before))
+        X_W = self.p_WB + (self.p_BC + X_C @ self.R_BC.T) @ self.R_WB.T
+        for mark, X in zip(marks, X_W):
+            mark.X_W = X
+        by_camera, by_moved, by_point = camera_frame.carried(before, self._see(X_W), S)
+
+        def carry(rows: np.ndarray) -> np.ndarray:
+            out = rows.copy()
+            out[where] = poses @ rows[where]
+            out[VELOCITY] -= velocity @ rows[THETA]
+            out[CAMERA_ROTATION] = E_BC.T @ rows[CAMERA_ROTATION]
+            points = by_point @ rows[start:].reshape(len(marks), 3, rows.shape[1])
+            out[start:] = by_camera @ rows[_CAMERA] - by_moved @ out[_CAMERA] + points.reshape(3 * len(marks), rows.shape[1])
+            return out
+
+        return carry
+
+    def _see(self, X_W: np.ndarray) -> camera_frame.Seen:
+        return camera_frame.see(self.R_WB, self.p_WB, self.R_BC, self.p_BC, X_W)
 
     def scale_error(self) -> np.ndarray | None:
         """What all lengths are relatively too short by, s = scale^T dx: the mean over the landmarks of d ln |X - p|.
@@ -183,7 +161,7 @@ class State:
         """
         if len(self.landmarks) < 3:
             return None
-        rays = np.array([m.X_linear for m in self.landmarks.values()]) - self.p_WB
+        rays = np.array([m.X_W for m in self.landmarks.values()]) - self.p_WB
         part = rays / (rays**2).sum(axis=1, keepdims=True) / len(rays)
         out = np.zeros(self.size)
         out[self.landmark_start :], out[POSITION] = part.ravel(), -part.sum(axis=0)
@@ -194,29 +172,15 @@ class State:
         self.P = _gone_along(self.P, direction, scale)
 
     def _metric(self) -> np.ndarray:
-        """All that a scale stretches: positions, velocity and the points where they are linearised, shape (size,)."""
+        """All that a scale stretches: positions, velocity and points, shape (size,)."""
         out = np.zeros(self.size)
         out[POSITION], out[VELOCITY] = self.p_WB, self.v_WB
         poses = out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE)
         for pose, clone in zip(poses, self.clones):
             pose[3:] = clone.p_WB
         if self.landmarks:
-            out[self.landmark_start :] = np.concatenate([m.X_linear for m in self.landmarks.values()])
+            out[self.landmark_start :] = np.concatenate([m.X_W for m in self.landmarks.values()])
         return out
-
-    def _move_points(self, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Move the points; where those that have left their linearisation begin in the error, (m,), and by how much, (m, 3)."""
-        start, marks = self.landmark_start, list(self.landmarks.values())
-        if not marks:
-            return np.zeros(0, int), np.zeros((0, 3))
-        X = np.array([m.X_W for m in marks]) + dx[start:].reshape(-1, 3)
-        gone = X - np.array([m.X_linear for m in marks])
-        left = np.flatnonzero((gone**2).sum(axis=1) > np.diag(self.P)[start:].reshape(-1, 3).sum(axis=1))
-        for m, X_W in zip(marks, X):
-            m.X_W = X_W
-        for k in left.tolist():
-            marks[k].X_linear = marks[k].X_W
-        return start + 3 * left, gone[left]
 
     def add_landmark(self, number: int, X_W: np.ndarray, step: np.ndarray, cross: np.ndarray, own: np.ndarray) -> None:
         """Take a point into the state.
@@ -228,15 +192,15 @@ class State:
             cross: covariance of its error with the state's, shape (3, size).
             own: its covariance, shape (3, 3).
         """
-        scale = self.scale_error()
-        turned = so3.hat(step) @ self.R_WB  # as in `inject`
-        before = cross[:, THETA].copy()
-        cross = cross - turned @ self.P[THETA]
-        own = own - turned @ before.T - cross[:, THETA] @ turned.T
-        self.P = np.block([[self.P, cross.T], [cross, own]])
-        self.landmarks[number] = Landmark(X_W + step, X_W + step)
-        if scale is not None:
-            self.carry_scale(np.concatenate([np.zeros(len(scale)), step]), np.concatenate([scale, np.zeros(3)]))
+        before = self._see(X_W[None])
+        X_C, S = camera_frame.moved(before.X_C, (before.R_CW @ step)[None])
+        X_W = self.p_WB + self.R_WB @ (self.p_BC + self.R_BC @ X_C[0])
+        by_camera, by_moved, by_point = camera_frame.carried(before, self._see(X_W[None]), S)
+        by_camera, by_point = by_camera - by_moved, by_point[0]
+        moved = by_camera @ self.P[_CAMERA] + by_point @ cross
+        own = by_camera @ moved[:, _CAMERA].T + by_point @ (cross[:, _CAMERA] @ by_camera.T + own @ by_point.T)
+        self.P = np.block([[self.P, moved.T], [moved, own]])
+        self.landmarks[number] = Landmark(X_W)
 
     def add_clone(self, frame: int, w_WB_B: np.ndarray) -> None:
         """Copy the present pose into the window.
@@ -297,5 +261,5 @@ class State:
             N[k + 3 : k + 6, :3] = np.eye(3)
         for i, m in enumerate(self.landmarks.values()):
             k = self.landmark_start + 3 * i
-            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_linear)
+            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_W)
         return N
