@@ -4,12 +4,13 @@ Nothing here is rendered or flown. The truth is what the IMU's exact readings in
 filter's settings say, or as a mismatch says. With what is declared, the NEES of every part of the state is 1 per dimension.
 
     python -m perch_eval.recordings.simulated_tracks --draws 12
+    python -m perch_eval.recordings.simulated_tracks --time-inside 200
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -143,6 +144,7 @@ class Setting:
         pixels: true noise of the tracks over the declared.
         tail: degrees of freedom of a Student t in the place of the tracks' Gaussian, of the same scale; None: Gaussian.
         calibration: whether the camera's calibration is wrong as its priors say; else it is exact, and known to be.
+        calibrated: true errors of the calibration over those of its priors.
     """
 
     vio: VioConfig = field(default_factory=VioConfig)
@@ -151,6 +153,7 @@ class Setting:
     pixels: float = 1.0
     tail: float | None = None
     calibration: bool = False
+    calibrated: float = 1.0
     duration: float = 6.0
     imu_rate: float = 500.0
     frame_rate: float = 20.0
@@ -165,7 +168,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class End:
-    """Truth minus estimate of (theta, p, v, b_g, b_a) at the end, shape (15,), and its covariance as the filter believes, shape (15, 15)."""
+    """Truth minus estimate of (theta, p, v, b_g, b_a) at a frame, shape (15,), and its covariance as the filter believes, shape (15, 15)."""
 
     error: np.ndarray
     P: np.ndarray
@@ -177,7 +180,13 @@ class End:
 
 
 def fly(name: str, seed: int, setting: Setting) -> End:
-    """The filter along a motion, from a state that is wrong as its covariance says."""
+    """The filter at the end of a motion, from a state that is wrong as its covariance says."""
+    *_, end = frames(name, seed, setting)
+    return end
+
+
+def frames(name: str, seed: int, setting: Setting) -> Iterator[End]:
+    """The same at each frame."""
     rng = np.random.default_rng([seed, *name.encode()])
     config, mount = setting.believed, load_vehicle("snapdragon").mounts["down"]
     truth = Truth(name, rng, setting.imu_rate, setting.duration)
@@ -186,6 +195,7 @@ def fly(name: str, seed: int, setting: Setting) -> End:
     sigma = np.concatenate([_START, np.repeat([c.rotation / np.sqrt(3.0), c.translation], 3),
                             [c.time_offset, c.focal, c.focal, c.centre / camera.fx, c.centre / camera.fy]])
     e = rng.normal(size=at.CORE_SIZE) * sigma
+    e[at.INERTIAL_SIZE:] *= setting.calibrated
     offset = _OFFSET + e[at.TIME_OFFSET]
     fx, fy, cx, cy = e[at.LENS]
     real = replace(mount, R_BC=mount.R_BC @ so3.exp(e[at.CAMERA_ROTATION]), p_BC=mount.p_BC + e[at.CAMERA_POSITION], camera=replace(
@@ -203,10 +213,10 @@ def fly(name: str, seed: int, setting: Setting) -> End:
         exposed = round((stamp + s.time_offset) * 1e9)
         filter_.propagate(imu.run(s.stamp, exposed), exposed)
         filter_.add_frame(frame, ids, observe(camera, pixels))
-    t = s.stamp * 1e-9
-    (R, p, v), k = truth.at(t), truth.step(t)
-    error = np.concatenate([so3.log(s.R_WB.T @ R), p - s.p_WB, v - s.v_WB, gyro_bias[k] - s.gyro_bias, accel_bias[k] - s.accel_bias])
-    return End(error, s.P[:15, :15].copy())
+        t = s.stamp * 1e-9
+        (R, p, v), k = truth.at(t), truth.step(t)
+        error = np.concatenate([so3.log(s.R_WB.T @ R), p - s.p_WB, v - s.v_WB, gyro_bias[k] - s.gyro_bias, accel_bias[k] - s.accel_bias])
+        yield End(error, s.P[:15, :15].copy())
 
 
 def _readings(truth: Truth, setting: Setting, rng: np.random.Generator) -> tuple[ImuBuffer, np.ndarray, np.ndarray]:
@@ -237,13 +247,36 @@ SETTINGS = {
 }
 
 
+def mismatched(seed: int) -> Setting:
+    """IMU's noise, tracks' noise and calibration errors between 1/1.5 and 1.5 times the declared."""
+    imu, pixels, calibrated = 1.5 ** np.random.default_rng([seed, 1]).uniform(-1.0, 1.0, 3)
+    return Setting(calibration=True, imu=imu, pixels=pixels, calibrated=calibrated)
+
+
+def time_inside(draws: int, setting: Callable[[int], Setting], begin: float = 0.5) -> Iterator[str]:
+    """Rows of a table: for all states and each part the mean NEES over draws and frames, and the share of the frames from `begin` [s] on
+    at which the mean over the draws is within its 95 % bounds."""
+    motions = ("circle", "hand", "eight", "far")
+    flights = [list(frames(motions[seed % 4], seed, setting(seed))) for seed in range(draws)]
+    for name, part in ({"15 states": slice(0, 15)} | PARTS).items():
+        means = np.mean([[end.nees(part) for end in flight] for flight in flights], axis=0)[round(begin * Setting.frame_rate):]
+        low, high = bounds(draws, part.stop - part.start, 0.95)
+        yield f"| {name} | {means.mean():.2f} | {100 * np.mean((low < means) & (means < high)):.0f} % |"
+
+
 def main() -> None:
     """Print the NEES of every setting, pooled over the motions."""
     parser = argparse.ArgumentParser(description="NEES of VIO's filter on exact tracks with declared noise")
     parser.add_argument("--draws", type=int, default=13, help="of each motion")
     parser.add_argument("--motions", default="circle,hand,eight,far")
     parser.add_argument("--settings", default=",".join(str(k) for k in range(len(SETTINGS))), help="by number")
+    parser.add_argument("--time-inside", type=int, metavar="N", help="draws instead, as declared and under a mismatch")
     arguments = parser.parse_args()
+    if arguments.time_inside:
+        for name, choose in (("as declared", lambda _: Setting(calibration=True)), ("mismatched", mismatched)):
+            print(f"| {name}, n = {arguments.time_inside} | NEES | time inside |\n| --- | --- | --- |", flush=True)
+            print("\n".join(time_inside(arguments.time_inside, choose)), flush=True)
+        return
     motions = arguments.motions.split(",")
     print(f"| setting | n | {' | '.join(PARTS)} | position [mm] |\n|{' --- |' * (len(PARTS) + 3)}")
     for number in map(int, arguments.settings.split(",")):
