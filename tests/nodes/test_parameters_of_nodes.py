@@ -7,7 +7,7 @@ from system.scripts import run_script
 
 def test_a_parameter_is_described_before_and_after_a_refusal_alike(graph):
     def param(*arguments):
-        return run_script("param.py", *arguments)
+        return run_script("param.py", *arguments, "--spin-time", "60")
 
     name = "flight.odometry.timeout"
     described = param("describe", "/controller", name).stdout
