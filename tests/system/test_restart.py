@@ -31,14 +31,14 @@ def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
         def acts():
             yield "take_off"
             yield from killed(flight, "vio_model")
-            yield "searching"
-            yield from killed(flight, "estimator")
             process = flight.pilot.process("/mission")
             yield from killed(flight, "mission")
             yield lambda: flight.pilot.process("/mission") != process  # the pilot has discovered it
+            yield lambda: flight.controller == ControllerStatus.HOVERING
+            yield from killed(flight, "estimator")
 
-        above = replace(flight.scenario, mission=replace(flight.scenario.mission, takeoff_height=4.2, search_timeout=100.0), time_limit=200.0)
-        lost = flight.fly(acts(), above)  # from where it does not see the target
+        above = replace(flight.scenario, mission=replace(flight.scenario.mission, takeoff_height=3.0), time_limit=200.0)
+        lost = flight.fly(acts(), above)  # a climb that takes a while
         assert str(lost) in ("the mission was restarted: the goal is lost", "the mission has ended: the goal is lost"), lost
         result = flight.fly(iter(()))
         assert result.outcome == "perched", result.message
