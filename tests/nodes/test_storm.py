@@ -38,6 +38,7 @@ class Crowd:
 
     def close(self) -> None:
         """Leave the graph."""
+        self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()
 

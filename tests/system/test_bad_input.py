@@ -151,6 +151,7 @@ class Asker:
 
     def close(self) -> None:
         """Leave the graph."""
+        self._executor.shutdown()  # it holds the context, and so takes part in the graph
         close_nodes([self.node])
         self.caller.destroy_node()
         self._context.try_shutdown()
@@ -221,6 +222,7 @@ def test_the_mission_refuses_goals_that_are_none(asker):
         result = asker.result(handle.get_result_async()).result
         assert not result.success and result.error_code == Perch.Result.BAD_GOAL, (path, result)
         assert words in result.message, (path, result.message)
+    client.destroy()
 
 
 # -- a flight that is broken off -------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 from perch_core.errors import PerchError
 from perch_eval.domain import USABLE, reserved_domain
@@ -17,6 +19,15 @@ def test_reservations_differ_and_end(tmp_path):
             assert again == 6
     with reserved_domain([5, 6], tmp_path) as free:
         assert free == 5
+
+
+def test_a_domain_in_which_somebody_takes_part_is_not_given(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 7400 + 250 * 5 + 11))
+        with reserved_domain([5, 6], tmp_path) as domain:
+            assert domain == 6
+    with reserved_domain([5, 6], tmp_path) as domain:
+        assert domain == 5
 
 
 def test_domains_keep_below_the_ephemeral_ports():

@@ -10,6 +10,8 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import psutil
+
 from perch_core.errors import PerchError
 
 USABLE = range(43, 102)
@@ -20,7 +22,7 @@ _given: list[int] = []
 
 @contextlib.contextmanager
 def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None = None) -> Iterator[int]:
-    """A domain id that no other reservation on this machine holds.
+    """A domain id that no other reservation on this machine holds, and in which nobody takes part.
 
     The kernel gives it back when the process ends, however it ends.
 
@@ -39,10 +41,18 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
+            if participants(candidate):
+                continue
             _given.append(candidate)
             yield candidate
             return
     raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")
+
+
+def participants(domain: int) -> list[int]:
+    """UDP ports of a domain that are bound on this machine: 7400 + 250 domain, and the 249 after it (DDSI-RTPS 2.5, 9.6.2.3)."""
+    first = 7400 + 250 * domain
+    return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + 250})
 
 
 def free_domain() -> int:
