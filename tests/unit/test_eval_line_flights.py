@@ -1,5 +1,7 @@
 """Errors at the perching point of a flown powerline perch, against a flight whose errors are known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd, Contact, MappedPowerline, PowerlineMap, TrajectoryOrder, nanoseconds
 from perch_eval.campaign.results import RunResult
-from perch_eval.evaluation import powerline_flights
+from perch_eval.evaluation import kept, powerline_flights
 from perch_eval.evaluation.powerline import flown_sections
 from perch_eval.evaluation.powerline_flights import mapping_errors, perching_errors
 from perch_eval.evaluation.sections import FAILS, HOLDS, VACUOUS, Effort
@@ -105,8 +107,8 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
             handed.append(task)
             yield RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values)
 
-    monkeypatch.setattr(powerline_flights, "in_pool", pool)
-    monkeypatch.setattr(powerline_flights, "digest", lambda: "0123456789ab")
+    monkeypatch.setattr(kept, "in_pool", pool)
+    monkeypatch.setattr(kept, "digest", lambda: "0123456789ab")
     found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
     assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
         ("line_80_pa", True): [1, 2], ("line_80_pa", False): [], ("line_180", True): [1, 2], ("line_180", False): [1, 2]}
@@ -114,6 +116,8 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
     found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
     assert [r.seed for r in found["line_180", False]] == [1, 2, 3] and [r.seed for r in found["line_180", True]] == [1, 2, 3, 4, 5]
     assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
+    powerline_flights.flights(dataclasses.replace(effort(tmp_path, 1), fresh=True), ("line_80_pa", "line_180"))
+    assert len(handed) == 16, "unless it is asked for"
 
 
 @pytest.mark.parametrize("outcome, message, verdict", [("missed", "no adhesion; recovered to a hover", HOLDS),
@@ -124,7 +128,7 @@ def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outc
             end = ("perched", "perched", "") if task.run.values["grips"] else ("missed_pad", outcome, message)
             yield RunResult(task.run.number, task.run.seed, *end, task.run.values, {"perching_position_m": 0.01, "perching_tilt_deg": 1.0})
 
-    monkeypatch.setattr(powerline_flights, "in_pool", pool)
+    monkeypatch.setattr(kept, "in_pool", pool)
     [section] = flown_sections(effort(tmp_path, 1))
     rows = {row.name: row for row in section.rows}
     assert rows["180 deg, grip switched off: recoveries to a hover"].verdict == verdict

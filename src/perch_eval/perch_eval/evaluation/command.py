@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from perch_core.errors import ConfigError, PerchError
+from perch_core.registry import resolved
 from perch_eval.arguments import count, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
@@ -24,56 +25,16 @@ exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no cla
 2 the caller's mistake, 130 interrupted"""
 
 
-def _planning(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.planning_times import planning_sections
-
-    return planning_sections(effort)
-
-
-def _flights(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.perching import perching_sections
-
-    return perching_sections(effort)
+def _part(place: str) -> Part:
+    """A part whose module is imported when it is asked for."""
+    return lambda effort: resolved(f"perch_eval.evaluation.{place}")(effort)
 
 
-def _powerline(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.powerline import powerline_sections
-
-    return powerline_sections(effort)
-
-
-def _lines(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.powerline import flown_sections
-
-    return flown_sections(effort)
-
-
-def _inspection(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.inspection import inspection_sections
-
-    return inspection_sections(effort)
-
-
-def _cable(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.cable import cable_sections
-
-    return cable_sections(effort)
-
-
-def _faults(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.control import fault_sections
-
-    return fault_sections(effort)
-
-
-def _comparison(effort: Effort) -> list[Section]:
-    from perch_eval.evaluation.control import comparison_sections
-
-    return comparison_sections(effort)
-
-
-PARTS: dict[str, Part] = {"m_planning": _planning, "m_flights": _flights, "p_powerline": _powerline, "p_flights": _lines,
-                          "p_inspection": _inspection, "p_cable": _cable, "c_faults": _faults, "c_comparison": _comparison}
+PARTS: dict[str, Part] = {
+    "m_planning": _part("planning_times:planning_sections"), "m_flights": _part("perching:perching_sections"),
+    "p_powerline": _part("powerline:powerline_sections"), "p_flights": _part("powerline:flown_sections"),
+    "p_inspection": _part("inspection:inspection_sections"), "p_cable": _part("cable:cable_sections"),
+    "c_faults": _part("control:fault_sections"), "c_comparison": _part("control:comparison_sections")}
 FLIGHTS = {"seeds": "flights of each perch condition", "line-seeds": "flights of each powerline scenario", "layouts": "random layouts of the inspection"}
 QUICK = {"seeds": 5, "line-seeds": 1, "layouts": 3}
 FULL = {"seeds": 100, "line-seeds": 10, "layouts": 20}

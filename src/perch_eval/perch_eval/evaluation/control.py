@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from perch_eval.campaign.progress import Progress
 from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, Fault, fly_fault
 from perch_eval.evaluation.document import made_by
+from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.page import finite
-from perch_eval.revision import digest
 
 MOMENTS = 20                         # of each fault
 QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
@@ -32,7 +29,7 @@ ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 def fault_sections(effort: Effort) -> list[Section]:
     """Every fault at random moments; writes `faults.md` and `faults.json`."""
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
-    flown = _kept(effort, "faults", jobs, _faulted)
+    flown = computed(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
     out = Section("c_faults", "Faults in flight",
                   f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
                   "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth. "
@@ -68,7 +65,7 @@ def comparison_sections(effort: Effort) -> list[Section]:
     """All controllers on the same flights; writes `comparison.md` and `comparison.json`."""
     seeds = range(1, 1 + (FULL_SEEDS if effort.full else QUICK_SEEDS))
     jobs = [(c, k, m, seed) for seed in seeds for m in MANEUVERS for k in CONDITIONS for c in CONTROLLERS]
-    flown = _kept(effort, "comparison", jobs, _compared)
+    flown = computed(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in ("held", "perched"))
     offset = ", ".join(f"{x:g}" for x in LINE)
     out = Section("c_comparison", "Controllers compared on the same flights",
                   f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
@@ -129,27 +126,6 @@ def _faulted(job: tuple[str, int]) -> dict[str, Any]:
 def _compared(job: tuple[str, str, str, int]) -> dict[str, Any]:
     controller, condition, maneuver, seed = job
     return {"controller": controller, "condition": condition, "maneuver": maneuver, "seed": seed, **asdict(fly(*job))}
-
-
-def _kept(effort: Effort, name: str, jobs: list[tuple], carry_out: Callable[[tuple], dict[str, Any]]) -> list[dict[str, Any]]:
-    """The flights' figures; those of the same code that an earlier evaluation has flown are kept."""
-    effort.state.mkdir(parents=True, exist_ok=True)
-    file, code = effort.state / f"{name}.json", digest()
-    known: dict[str, dict[str, Any]] = {}
-    if file.exists() and not effort.fresh:
-        content = json.loads(file.read_text())
-        known = content["flights"] if content["digest"] == code else {}
-    open_jobs = [job for job in jobs if str(job) not in known]
-    progress = Progress(len(jobs), len(jobs) - len(open_jobs), what=f"{name} flights")
-    with ProcessPoolExecutor(effort.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for job, result in zip(open_jobs, pool.map(carry_out, open_jobs)):
-            known[str(job)] = finite(result)
-            temporary = file.with_suffix(".part")
-            temporary.write_text(json.dumps({"digest": code, "flights": known}))
-            temporary.replace(file)
-            progress.add(result.get("end", "held") in (*END_STATES, "held"))
-    progress.close()
-    return [known[str(job)] for job in jobs]
 
 
 def _write(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
-
 import numpy as np
 
-from perch_eval.campaign.progress import Progress
+from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.stand_ins import MAP_ERROR
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.layout import random_layout
-from perch_eval.revision import digest
 from perch_eval.statistics import Spread
 from perch_sim.scenario import load_scenario
 
@@ -63,7 +57,7 @@ def inspected(seed: int) -> dict[str, float]:
 
 def _layouts(effort: Effort) -> Section:
     count = effort.layouts
-    found = _flown(effort, count)
+    found = computed(effort, "inspections", range(1, count + 1), inspected, lambda r: r["collisions"] == 0)
     out = Section("p_inspection_layouts", "[P:VI-A] Inspection over random layouts",
                   f"{count} random layouts (seeds 1 to {count}) of three cables and six waypoints, in each of which the reference collides "
                   "twice; cores and error models as above. Without the line terms the same controller follows the reference.")
@@ -81,22 +75,3 @@ def _layouts(effort: Effort) -> Section:
              f"{100 * min(r['segment'] for r in found):.1f} % of the time in the worst layout", "always, but for brief instants")
     out.data = {"layouts": found}
     return out
-
-
-def _flown(effort: Effort, count: int) -> list[dict[str, float]]:
-    """The layouts' figures; those of the same code that an earlier evaluation has flown are kept."""
-    folder = Path(effort.state) / "inspection"
-    folder.mkdir(parents=True, exist_ok=True)
-    code = digest()
-    files = {seed: folder / f"{code}_{seed}.json" for seed in range(1, count + 1)}
-    known = [] if effort.fresh else [seed for seed, file in files.items() if file.exists()]
-    progress = Progress(count, len(known), what="inspections")
-    # Not forked: BLAS threads of the parent do not survive a fork.
-    with ProcessPoolExecutor(effort.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for result in pool.map(inspected, [seed for seed in files if seed not in known]):
-            temporary = files[result["seed"]].with_suffix(".part")
-            temporary.write_text(json.dumps(result))
-            temporary.replace(files[result["seed"]])
-            progress.add(result["collisions"] == 0)
-    progress.close()
-    return [json.loads(file.read_text()) for file in files.values()]

@@ -16,12 +16,10 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task
-from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.results import Results, ResultsError, RunResult
+from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
-from perch_eval.campaign.workers import in_pool
+from perch_eval.evaluation.kept import flown
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.revision import digest
 from perch_eval.statistics import Rate, Spread
 from perch_sim.scenario import load_scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -53,32 +51,7 @@ def _flights(effort: Effort) -> list[RunResult]:
     for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in CONDITIONS):
         mapping = scenario_mapping(name)
         tasks.append(Task(Run(number, seed, {"scenario": name}), mapping, "in_process", SENSING))
-    effort.state.mkdir(parents=True, exist_ok=True)
-    file = effort.state / "flights.sqlite"
-    if effort.fresh:
-        _remove(file)
-    code = digest()
-    try:
-        results = Results(file, "evaluation", code, resume=True)
-    except ResultsError:
-        _remove(file)
-        results = Results(file, "evaluation", code, resume=True)
-    try:
-        known = [r for r in results.all() if r.number < len(tasks)]
-        open_tasks = [t for t in tasks if t.run.number not in {r.number for r in known}]
-        progress = Progress(len(tasks), len(known), sum(r.cause == SUCCESS for r in known), "flights")
-        for result in in_pool(open_tasks, effort.jobs):
-            results.add(result)
-            progress.add(result.cause == SUCCESS)
-        progress.close()
-        return [r for r in results.all() if r.number < len(tasks)]
-    finally:
-        results.close()
-
-
-def _remove(file: Path) -> None:
-    for path in (file, Path(f"{file}-wal"), Path(f"{file}-shm")):
-        path.unlink(missing_ok=True)
+    return flown(effort, "flights", tasks)
 
 
 def _words(name: str) -> str:

@@ -13,14 +13,12 @@ from perch_core.values import AtEnd, TrajectoryOrder, seconds
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.causes import SUCCESS, cause_of
 from perch_eval.campaign.engines import Task, flatten
-from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.results import Results, RunResult
+from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run, scenario_of
-from perch_eval.campaign.workers import in_pool
+from perch_eval.evaluation.kept import flown
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
 from perch_eval.metrics import flight_metrics, touch_of
-from perch_eval.revision import digest
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -142,25 +140,13 @@ def recovered(run: RunResult) -> bool:
 
 def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], list[RunResult]]:
     """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
-    effort.state.mkdir(parents=True, exist_ok=True)
-    code = digest()
-    results = Results(effort.state / f"line_flights_{code}.sqlite", "line flights", code, resume=True)
-    try:
-        tasks = []
-        for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):
-            mapping: dict[str, Any] = scenario_mapping(case)
-            if not grips:
-                mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
-            tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))
-        known = {r.number for r in results.all()}
-        progress = Progress(len(tasks), len(known), what="line flights")
-        for result in in_pool([t for t in tasks if t.run.number not in known], effort.jobs):
-            results.add(result)
-            progress.add(result.cause == SUCCESS if result.values["grips"] else recovered(result))
-        progress.close()
-        found = [r for r in results.all() if r.seed in effort.seeds_on_lines]
-    finally:
-        results.close()
+    tasks = []
+    for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):
+        mapping: dict[str, Any] = scenario_mapping(case)
+        if not grips:
+            mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
+        tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))
+    found = flown(effort, "line_flights", tasks, lambda r: r.cause == SUCCESS if r.values["grips"] else recovered(r))
     return {(case, grips): [r for r in found if r.values == {"scenario": case, "grips": grips}] for case in cases for grips in (True, False)}
 
 
