@@ -19,7 +19,6 @@ from perch_core.values import (
 from perch_core.vehicle import load_vehicle
 from perch_eval.ros.definitions import message_class, message_definition
 from perch_eval.view.gate import allowed
-from perch_eval.view.layout import layout_json
 from perch_eval.view.scene import Path, map_markers, vehicle_markers, world_markers
 from perch_eval.viewer import CAMERAS, FAST, LOCAL, MARKERS, PASSING, RARE, ViewerParameters
 from perch_eval.viewer_node import MessageViewer
@@ -262,9 +261,8 @@ def test_no_handshake_ends_a_connection_and_nothing_else(show):
     Client(show.loop, show.viewer.server.port)
 
 
-def test_the_layout_is_the_generated_one_and_shows_what_is_served():
+def test_the_layout_shows_what_is_served():
     text = (config.config_dir() / "foxglove_layout.json").read_text()
-    assert text == layout_json(), "python3 -m perch_eval.view.layout > config/foxglove_layout.json"
     channels = (*FAST, *RARE, *PASSING, MARKERS, *(f"camera_{c}/image_raw/compressed" for c in CAMERAS))
     types = {f"/{channel.lstrip('/')}": topics.message_type(channel) for channel in channels}
     paths = re.findall(r'"(/[a-z_]+[^"]*)"', text)
