@@ -21,12 +21,10 @@ def command_line() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="|".join(HANDLERS))
     listing = commands.add_parser("list", help="the services of the graph")
     listing.add_argument("-t", "--show-types", action="store_true")
-    listing.add_argument("--include-hidden-services", action="store_true")
     call = commands.add_parser("call", help="send a request, print the response")
     call.add_argument("service")
     call.add_argument("type", help="as in perch_msgs/srv/PlanPerch")
     call.add_argument("values", nargs="?", default="", help="fields of the request in YAML")
-    call.add_argument("--timeout", type=float, default=30.0, metavar="S", help="for the response [s] (default: 30)")
     for command in commands.choices.values():
         add_spin_time(command)
     return top

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Look at topics, with the arguments of `ros2 topic`, on machines without the `ros2` command."""
+"""Look at topics, with arguments of `ros2 topic`, on machines without the `ros2` command."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import argparse
 import sys
 
 from ros_graph.commands import add_spin_time, count, main, parser, positive
-from ros_graph.qos_options import add_qos_options
 
 EXAMPLES = """examples:
   python3 scripts/topic.py list -t
@@ -18,7 +17,6 @@ EXAMPLES = """examples:
 """
 HANDLERS = {
     "list": "topics:list_topics",
-    "type": "topics:show_type",
     "info": "topics:show_info",
     "echo": "echo:echo",
     "hz": "rate:measure_rate",
@@ -33,10 +31,6 @@ def command_line() -> argparse.ArgumentParser:
 
     listing = commands.add_parser("list", help="the topics of the graph")
     listing.add_argument("-t", "--show-types", action="store_true")
-    listing.add_argument("-c", "--count-topics", action="store_true")
-    listing.add_argument("--include-hidden-topics", action="store_true")
-
-    commands.add_parser("type", help="a topic's type").add_argument("topic")
 
     info = commands.add_parser("info", help="a topic's type, publishers and subscribers")
     info.add_argument("topic")
@@ -46,21 +40,13 @@ def command_line() -> argparse.ArgumentParser:
     _add_topic(echo)
     echo.add_argument("--once", action="store_true", help="end after one message")
     echo.add_argument("-n", type=count, metavar="N", help="end after N messages")
-    echo.add_argument("--timeout", type=float, metavar="S", help="end after so long [s]; exit code 1 if nothing came")
     echo.add_argument("--field", metavar="PATH", help="only a part, as in pose.pose.position.x or rotor_speed[0]")
-    echo.add_argument("--csv", action="store_true", help="one line per message")
     echo.add_argument("--no-arr", action="store_true", help="do not print arrays")
-    echo.add_argument("--no-str", action="store_true", help="do not print strings")
-    echo.add_argument("--flow-style", action="store_true", help="short arrays on one line")
-    echo.add_argument("-f", "--full-length", action="store_true", help="print arrays and strings to their end")
-    echo.add_argument("-l", "--truncate-length", type=int, default=128, metavar="N", help="default: 128")
-    add_qos_options(echo)
 
     rate = commands.add_parser("hz", help="measure the rate")
     _add_topic(rate)
     rate.add_argument("-w", "--window", type=count, default=10_000, metavar="N", help="messages to average over")
     rate.add_argument("-n", type=count, metavar="N", help="end after N messages")
-    add_qos_options(rate)
 
     publish = commands.add_parser("pub", help="publish a message")
     publish.add_argument("topic")
@@ -68,9 +54,6 @@ def command_line() -> argparse.ArgumentParser:
     publish.add_argument("values", nargs="?", default="", help="fields in YAML, as in '{data: 1.0}'")
     publish.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ")
     publish.add_argument("-1", "--once", action="store_true")
-    publish.add_argument("-t", "--times", type=count, metavar="N")
-    publish.add_argument("-w", "--wait-matching-subscriptions", type=int, metavar="N")
-    add_qos_options(publish)
 
     for command in commands.choices.values():
         add_spin_time(command)

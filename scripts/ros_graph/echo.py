@@ -7,19 +7,12 @@ import sys
 from typing import Any
 
 from ros_graph.connection import visit
-from ros_graph.message_text import TextOptions, pick, to_csv, to_yaml
-from ros_graph.qos_options import chosen_qos
-from ros_graph.topics import message_class
+from ros_graph.message_text import pick, to_yaml
+from ros_graph.topics import message_class, qos_of
 
 
 def echo(arguments: argparse.Namespace) -> int:
-    """`topic.py echo`: 0 after the messages asked for, 1 where none came before the timeout."""
-    options = TextOptions(
-        arrays=not arguments.no_arr,
-        strings=not arguments.no_str,
-        length=None if arguments.full_length else arguments.truncate_length,
-        flow=arguments.flow_style,
-    )
+    """`topic.py echo`"""
     wanted = 1 if arguments.once else arguments.n
     shown = 0
     problem: list[Exception] = []
@@ -30,8 +23,7 @@ def echo(arguments: argparse.Namespace) -> int:
             return
         try:
             value = pick(message, arguments.field) if arguments.field else message
-            text = to_csv(value, options) if arguments.csv else to_yaml(value, options) + "---\n"
-            sys.stdout.write(text)
+            sys.stdout.write(to_yaml(value, not arguments.no_arr) + "---\n")
             sys.stdout.flush()
         except Exception as error:  # raised again below: here it would end in the executor
             problem.append(error)
@@ -40,9 +32,8 @@ def echo(arguments: argparse.Namespace) -> int:
     with visit() as graph:
         cls = message_class(graph, arguments.topic, arguments.type, arguments.spin_time)
         topic = graph.absolute(arguments.topic)
-        publishers = graph.node.get_publishers_info_by_topic(topic)
-        graph.node.create_subscription(cls, topic, show, chosen_qos(arguments, publishers))
-        ended = graph.spin_until(lambda: bool(problem) or (wanted is not None and shown >= wanted), arguments.timeout)
+        graph.node.create_subscription(cls, topic, show, qos_of(graph, topic))
+        graph.spin_until(lambda: bool(problem) or (wanted is not None and shown >= wanted))
     if problem:
         raise problem[0]
-    return 0 if ended or shown else 1
+    return 0

@@ -9,8 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from ros_graph.connection import visit
-from ros_graph.qos_options import chosen_qos
-from ros_graph.topics import message_class
+from ros_graph.topics import message_class, qos_of
 
 _REPORT_PERIOD_S = 1.0
 
@@ -28,9 +27,8 @@ def measure_rate(arguments: argparse.Namespace) -> int:
     with visit() as graph:
         cls = message_class(graph, arguments.topic, arguments.type, arguments.spin_time)
         topic = graph.absolute(arguments.topic)
-        publishers = graph.node.get_publishers_info_by_topic(topic)
         # raw: counting does not need the content of an image
-        graph.node.create_subscription(cls, topic, arrived, chosen_qos(arguments, publishers), raw=True)
+        graph.node.create_subscription(cls, topic, arrived, qos_of(graph, topic), raw=True)
         reported = 0
         while not (arguments.n is not None and count >= arguments.n):
             finished = graph.spin_until(

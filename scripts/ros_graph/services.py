@@ -17,7 +17,7 @@ def list_services(arguments: argparse.Namespace) -> int:
     with visit() as graph:
         services = graph.settle(graph.node.get_service_names_and_types, arguments.spin_time)
     for name, types in sorted(services):
-        if arguments.include_hidden_services or not hidden(name):
+        if not hidden(name):
             print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
     return 0
 
@@ -31,6 +31,6 @@ def call_service(arguments: argparse.Namespace) -> int:
         client = graph.node.create_client(cls, service)
         if not graph.spin_until(client.service_is_ready, arguments.spin_time):
             raise GraphError(f"service {service} does not exist with type {arguments.type}; 'service.py list -t' shows all")
-        response = graph.answer(client.call_async(request), service, arguments.timeout)
+        response = graph.answer(client.call_async(request), service, timeout=30.0)
     sys.stdout.write(to_yaml(response))
     return 0 if getattr(response, "success", True) else 1

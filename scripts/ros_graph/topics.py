@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
 from ros_graph.commands import GraphError
 from ros_graph.connection import Visit, hidden, visit
 from ros_graph.interfaces import interface
@@ -13,19 +15,9 @@ def list_topics(arguments: argparse.Namespace) -> int:
     """`topic.py list`"""
     with visit() as graph:
         topics = graph.settle(graph.node.get_topic_names_and_types, arguments.spin_time)
-        topics = [(name, types) for name, types in topics if arguments.include_hidden_topics or not hidden(name)]
-    if arguments.count_topics:
-        print(len(topics))
-        return 0
     for name, types in sorted(topics):
-        print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
-    return 0
-
-
-def show_type(arguments: argparse.Namespace) -> int:
-    """`topic.py type`"""
-    with visit() as graph:
-        print(topic_type(graph, arguments.topic, arguments.spin_time))
+        if not hidden(name):
+            print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
     return 0
 
 
@@ -66,6 +58,17 @@ def message_class(graph: Visit, topic: str, given: str | None, timeout: float) -
         GraphError: the topic or the type is not known.
     """
     return interface(given or topic_type(graph, topic, timeout), "msg")
+
+
+def qos_of(graph: Visit, topic: str) -> QoSProfile:
+    """QoS that hears all publishers of a topic."""
+    profiles = [endpoint.qos_profile for endpoint in graph.node.get_publishers_info_by_topic(topic)]
+    profile = QoSProfile(depth=10)
+    if any(p.reliability == ReliabilityPolicy.BEST_EFFORT for p in profiles):
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    if profiles and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles):
+        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return profile
 
 
 def _sides(graph: Visit, topic: str) -> dict[str, list[str]]:

@@ -46,7 +46,6 @@ def run(peer):
 
 def test_topics_are_listed_with_types(run):
     eventually(lambda: "/points [geometry_msgs/msg/PointStamped]" in run("topic.py", "list", "-t").stdout.splitlines())
-    assert run("topic.py", "type", "points").stdout == "geometry_msgs/msg/PointStamped\n"
 
 
 def test_echo_shows_messages_of_a_best_effort_publisher(run):
@@ -55,7 +54,7 @@ def test_echo_shows_messages_of_a_best_effort_publisher(run):
     assert result.returncode == 0 and end == "\n"
     assert yaml.safe_load(message)["header"]["frame_id"] == "map"
 
-    numbers = [float(line) for line in run("topic.py", "echo", "points", "-n", "3", "--csv", "--field", "point.x").stdout.split()]
+    numbers = [float(line) for line in run("topic.py", "echo", "points", "-n", "3", "--field", "point.x").stdout.split("---\n")[:-1]]
     assert len(numbers) == 3 and numbers == sorted(set(numbers))
 
 
