@@ -32,7 +32,7 @@ def main() -> int:
     parser.add_argument("--no-config", action="store_true", help="do not pass config/<node>.yaml")
     parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     arguments, for_node = parser.parse_known_args()
-    enter()
+    enter(*["view"] * (arguments.node == "viewer"))
     from perch_core.errors import PerchError
     from perch_eval.arguments import open_network
     from perch_eval.node_launch import NODES

@@ -9,11 +9,12 @@ from __future__ import annotations
 import argparse
 import sys
 
-from perch_setup import ROOT, SetupError, prepare
+from perch_setup import EXTRAS, ROOT, SetupError, prepare
 
 EXAMPLES = """examples:
   python3 scripts/setup.py            set up what is missing or out of date
   python3 scripts/setup.py --clean    start from nothing
+  python3 scripts/setup.py --all      with all extra packages, for a machine that will be without network
   source setup.bash                   afterwards: a shell in which perch works
 """
 
@@ -24,9 +25,11 @@ def main() -> int:
         description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--clean", action="store_true", help="remove .venv, build and install first")
+    parser.add_argument("--extra", action="append", default=[], choices=EXTRAS, help="packages that are otherwise installed by the script that needs them; repeatable")
+    parser.add_argument("--all", action="store_true", help="all of these")
     arguments = parser.parse_args()
     try:
-        platform = prepare(clean=arguments.clean)
+        platform = prepare(arguments.clean, EXTRAS if arguments.all else arguments.extra)
     except SetupError as error:
         print(f"perch: {error}", file=sys.stderr)
         return error.exit_code

@@ -69,7 +69,7 @@ def main() -> int:
         parser.error(f"--namespace {arguments.namespace}: must begin with '/', as in /quad1")
     if arguments.domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(arguments.domain)
-    enter()
+    enter(*["view"] * (arguments.view is not None or "viewer" in arguments.only))
     with quiet_on_interrupt():
         import ros_graph.connection  # noqa: F401  (what takes long, before anything is started)
         from perch_core.errors import PerchError

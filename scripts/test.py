@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from perch_setup import ROOT, enter
+from perch_setup import EXTRAS, ROOT, enter
 
 FLIGHTS = ("tests/system/", "tests/nodes/")
 WHOLE = ("tests/nodes/", "tests/recordings/")  # folders whose files share what is dear to make
@@ -40,7 +40,7 @@ def main() -> int:
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
     parser.add_argument("--beside", help=argparse.SUPPRESS)  # the file of `Share`, for the second process
     arguments, for_pytest = parser.parse_known_args()
-    enter()
+    enter(*EXTRAS)
     if arguments.quick:
         for_pytest = ["tests/unit", "-m", "quick", *for_pytest]
     return run_tests(arguments.fast, for_pytest, arguments.beside)

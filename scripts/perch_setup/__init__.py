@@ -5,11 +5,12 @@ Only the standard library is used here, because nothing else is installed when t
 
 from .enter import enter, leave_quietly_on_interrupt, quiet_on_interrupt, run
 from .errors import SetupError
-from .layout import ROOT
+from .layout import EXTRAS, ROOT
 from .machine import Platform, detect_platform
 from .prepare import prepare
 
 __all__ = [
+    "EXTRAS",
     "ROOT",
     "Platform",
     "SetupError",

@@ -17,17 +17,21 @@ from .prepare import prepare
 _ENTERED = "PERCH_ENTERED"
 """Process id of the script that was started again inside. An `exec` keeps the id; children have others."""
 INTERRUPTED = 130
+_HELP = {"-h", "--help"}
 
 
-def enter() -> None:
+def enter(*extras: str) -> None:
     """Set up if necessary, then start this script again with our Python and variables.
+
+    Args:
+        extras: packages that this script needs beside those of a flight; not for its `--help`.
 
     Returns only inside the environment. Prints one line and exits where set-up cannot be done.
     """
     if os.environ.get(_ENTERED) == str(os.getpid()) and sys.prefix == str(VENV):
         return
     try:
-        environment = variables(prepare())
+        environment = variables(prepare(extras=() if _HELP & set(sys.argv) else extras))
     except SetupError as error:
         sys.exit(_say(error))
     except KeyboardInterrupt:
@@ -39,9 +43,9 @@ def enter() -> None:
     os.execve(VENV_PYTHON, [str(VENV_PYTHON), *sys.argv], environment)
 
 
-def run(module: str) -> int:
-    """Set up if necessary, then do what a module's `main` does, with its options and its exit code."""
-    enter()
+def run(module: str, *extras: str) -> int:
+    """Set up if necessary, with extras, then do what a module's `main` does, with its options and its exit code."""
+    enter(*extras)
     with quiet_on_interrupt():
         main = importlib.import_module(module).main
     return main()

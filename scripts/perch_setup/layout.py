@@ -14,5 +14,7 @@ SOURCES = ROOT / "src"
 BUILD = ROOT / "build"
 INSTALL = ROOT / "install"
 REQUIREMENTS = ROOT / "requirements"
+EXTRAS = {lock.stem: lock for lock in sorted((REQUIREMENTS / "extras").glob("*.lock"))}
+"""Packages that a flight does without: name -> lock file. The script that needs them has them installed."""
 SETUP_BASH = ROOT / "setup.bash"
 VENV_PYTHON = VENV / "bin" / "python"

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 from . import stamps, virtualenv, workspace
 from .alone import alone
 from .environment import variables
-from .errors import SetupError
-from .layout import BUILD, INSTALL, ROOT, VENV, VENV_PYTHON
+from .errors import CALLERS_MISTAKE, SetupError
+from .layout import BUILD, EXTRAS, INSTALL, ROOT, VENV, VENV_PYTHON
 from .machine import Platform, check_python, check_tools, detect_platform, remember
 from .progress import Step
 
 
-def prepare(clean: bool = False) -> Platform:
+def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
     """Set up whatever is not: fast where nothing is to do, and safe to interrupt and repeat.
 
     Args:
         clean: start from nothing.
+        extras: packages to have beside those of a flight, names of `requirements/extras`.
 
     Returns:
         Where ROS comes from.
@@ -28,17 +30,18 @@ def prepare(clean: bool = False) -> Platform:
         SetupError: where the machine lacks something or a step fails.
     """
     wanted = detect_platform()
-    if not clean and _nothing_to_do(wanted, stamps.load()):
+    if not clean and _nothing_to_do(wanted, stamps.load(), extras):
         return wanted
     check_tools()
     with alone():
         done = {} if clean else stamps.load()
-        if _nothing_to_do(wanted, done):
+        if _nothing_to_do(wanted, done, extras):
             return wanted
         if clean:
             for folder in (VENV, BUILD, INSTALL):
                 shutil.rmtree(folder, ignore_errors=True)
         _install(wanted, done)
+        _install_extras(wanted, done, extras)
         _build(wanted, done)
         _warm_up(wanted, done)
     return wanted
@@ -54,11 +57,28 @@ def _install(wanted: Platform, done: dict[str, str]) -> None:
     if fresh:
         check_python(wanted)
     done.pop("environment", None)
+    for extra in EXTRAS if fresh else ():
+        done.pop(f"extra {extra}", None)
     stamps.save(done)
     virtualenv.install(wanted, fresh)
     remember(wanted)
     done.update(environment=environment, identity=identity)
     stamps.save(done)
+
+
+def _install_extras(wanted: Platform, done: dict[str, str], extras: Collection[str]) -> None:
+    """Install the locked packages of extras, unless they are."""
+    for extra in extras:
+        stamp = stamps.extra_stamp(extra, done["environment"])
+        if done.get(f"extra {extra}") == stamp:
+            continue
+        try:
+            virtualenv.install_extra(wanted, extra)
+        except SetupError as error:
+            raise SetupError(f"this needs the extra packages {extra!r}, which cannot be installed now. With network, "
+                             f"'python3 scripts/setup.py --extra {extra}' does it.\n{error}", CALLERS_MISTAKE) from None
+        done[f"extra {extra}"] = stamp
+        stamps.save(done)
 
 
 def _build(wanted: Platform, done: dict[str, str]) -> None:
@@ -93,10 +113,12 @@ def _warm_up(wanted: Platform, done: dict[str, str]) -> None:
     stamps.save(done)
 
 
-def _nothing_to_do(wanted: Platform, done: dict[str, str]) -> bool:
+def _nothing_to_do(wanted: Platform, done: dict[str, str], extras: Collection[str]) -> bool:
     """Whether every stamp is up to date and the folders are still there."""
     environment = stamps.environment_stamp(wanted)
     if done.get("environment") != environment or not virtualenv.usable() or done.get("warmed") != stamps.kernel_stamp(environment):
+        return False
+    if any(done.get(f"extra {extra}") != stamps.extra_stamp(extra, environment) for extra in extras):
         return False
     return (INSTALL / "setup.bash").exists() and all(
         _is_built(folder, stamps.package_stamp(folder, environment), done)

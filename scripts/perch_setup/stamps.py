@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Iterable
 
-from .layout import ROOT, SOURCES, STATE
+from .layout import EXTRAS, ROOT, SOURCES, STATE
 from .machine import Platform
 
 _FILE = STATE / "stamps.json"
@@ -20,8 +20,13 @@ def environment_stamp(wanted: Platform) -> str:
 
     The Python that runs this is not part of it: an environment keeps the one it was made with.
     """
-    mending = Path(__file__).with_name("wheel_paths.py")
-    return _digest((*wanted.locks, mending), wanted.ros, str(ROOT))
+    mending = (Path(__file__).with_name(name) for name in ("wheel_paths.py", "slim.py"))
+    return _digest((*wanted.locks, *mending), wanted.ros, str(ROOT))
+
+
+def extra_stamp(extra: str, environment: str) -> str:
+    """Changes whenever the packages of an extra have to be installed again."""
+    return _digest((EXTRAS[extra],), environment)
 
 
 def package_stamp(package: Path, environment: str) -> str:

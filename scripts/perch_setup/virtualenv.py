@@ -6,12 +6,13 @@ import os
 import re
 import shutil
 import sys
-from typing import Callable, Optional
+from pathlib import Path
+from typing import Callable, Mapping, Optional, Sequence
 
-from .copies import link_copies
-from .layout import STATE, VENV, VENV_PYTHON
+from .layout import EXTRAS, STATE, VENV, VENV_PYTHON
 from .machine import Platform
 from .progress import Step
+from .slim import slim
 from .wheel_paths import mend_wheels
 
 _UNFINISHED = STATE / "installing"
@@ -40,16 +41,37 @@ def install(wanted: Platform, fresh: bool) -> None:
             step.run([_base_python(), "-m", "venv", *sight, VENV], "venv", environment)
     total = sum(_pins(lock.read_text()) for lock in wanted.locks)
     with Step(f"installing {total} packages") as step:
-        arguments = [word for lock in wanted.locks for word in ("-r", str(lock))]
-        # The locks are complete, so pip has nothing to resolve; tests check that they fit together.
-        pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--no-compile", "--progress-bar", "off", "--no-input"]
-        quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
-        step.run([*pip, *quiet, *arguments], "pip", environment, _narrator(total))
+        _pip(step, environment, total, *wanted.locks)
         if wanted.uses_wheels:
             mend_wheels(VENV)
-        for packages in VENV.glob("lib/python3.*/site-packages/casadi"):  # 130 MB of 280
-            link_copies(packages)
     _UNFINISHED.unlink()
+
+
+def install_extra(wanted: Platform, extra: str) -> None:
+    """Install the packages of an extra into the virtual environment.
+
+    Raises:
+        SetupError: where pip fails, as it does without network.
+    """
+    unfinished = STATE / f"installing_{extra}"
+    again = ["--ignore-installed"] if unfinished.exists() else []  # a killed pip leaves packages that are none
+    unfinished.touch()
+    total = _pins(EXTRAS[extra].read_text())
+    with Step(f"installing {total} extra package{'s' * (total != 1)} ({extra})") as step:
+        _pip(step, _environment(wanted), total, EXTRAS[extra], options=again)
+    unfinished.unlink()
+
+
+def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, options: Sequence[str] = ()) -> None:
+    """Install so many packages of lock files, without what nobody uses.
+
+    The locks are complete, so pip has nothing to resolve; tests check that they fit together.
+    """
+    pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--no-compile", "--progress-bar", "off", "--no-input"]
+    quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
+    step.run([*pip, *quiet, *options, *(word for lock in locks for word in ("-r", str(lock)))], "pip", environment, _narrator(total))
+    for packages in VENV.glob("lib/python3.*/site-packages"):
+        slim(packages)
 
 
 def usable() -> bool:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
-from perch_setup import alone, copies, machine, progress, stamps, virtualenv, wheel_paths, workspace
+from perch_core.errors import PerchError
+from perch_eval import extras
+from perch_setup import alone, machine, progress, slim, stamps, virtualenv, wheel_paths, workspace
 from perch_setup.errors import SetupError
-from perch_setup.layout import REQUIREMENTS, ROOT
+from perch_setup.layout import EXTRAS, REQUIREMENTS, ROOT
 from perch_setup.machine import INSTALLED, WHEELS, check_python, check_tools, detect_platform
+
+
+prepare = importlib.import_module("perch_setup.prepare")  # the package has a function of this name
 
 
 def pins(name: str) -> dict[str, str]:
@@ -90,14 +97,18 @@ def test_each_missing_tool_is_named_with_its_apt_line(monkeypatch):
 
 
 def test_locks_pin_every_package_and_agree_with_each_other():
-    ros, python = pins("ros.lock"), pins("python.lock")
-    assert {name: (ros[name], python[name]) for name in ros.keys() & python.keys() if ros[name] != python[name]} == {}
+    for base in (["ros.lock", "python.lock"], ["python-ros-jazzy.lock"]):
+        together = Counter(set().union(*(pins(lock).items() for lock in [*base, *(f"extras/{extra}.lock" for extra in EXTRAS)])))
+        assert Counter(name for name, _ in together).most_common(1)[0][1] == 1
 
 
 @pytest.mark.parametrize("lock", ["python.lock", "python-ros-jazzy.lock"])
 def test_locks_hold_everything_that_perch_asks_for(lock):
-    asked = re.findall(r"^([a-z][a-z0-9-]*)", (REQUIREMENTS / "python.in").read_text(), re.MULTILINE)
-    assert set(asked) <= set(pins(lock))
+    flight, *extras = re.split(r"^# extra (\w+):.*\n", (REQUIREMENTS / "python.in").read_text(), flags=re.MULTILINE)
+    asked = {lock: flight} | {f"extras/{name}.lock": text for name, text in zip(extras[::2], extras[1::2])}
+    assert len(asked) == 1 + len(EXTRAS)
+    for name, text in asked.items():
+        assert set(re.findall(r"^([a-z][a-z0-9-]*)", text, re.MULTILINE)) <= set(pins(name))
 
 
 def test_the_lock_for_an_installation_leaves_ros_alone_and_fits_its_binaries():
@@ -189,6 +200,50 @@ def test_an_environment_that_is_killed_at_any_step_is_made_anew(environment, mon
     assert not virtualenv.usable()
 
 
+@pytest.fixture
+def pip(environment, tmp_path, monkeypatch) -> list[list[str]]:
+    """The command lines of pip, which does nothing."""
+    called: list[list[str]] = []
+    monkeypatch.setattr(stamps, "_FILE", tmp_path / "stamps.json")
+    monkeypatch.setattr(progress.Step, "run", lambda self, command, name, *_: called.append([str(word) for word in command]))
+    return called
+
+
+def test_an_extra_is_installed_once_and_again_in_a_new_environment(pip, monkeypatch):
+    done = {"environment": "1"}
+    for _ in range(2):
+        prepare._install_extras(WHEELS, done, ["view"])
+    assert len(pip) == 1 and pip[0][-1] == str(EXTRAS["view"])
+    monkeypatch.setattr(virtualenv, "usable", lambda: False)
+    monkeypatch.setattr(virtualenv, "install", lambda wanted, fresh: None)
+    monkeypatch.setattr(prepare, "remember", lambda wanted: None)
+    prepare._install(WHEELS, done)
+    prepare._install_extras(WHEELS, done, ["view"])
+    assert len(pip) == 2
+
+
+def test_an_extra_that_cannot_be_installed_is_named_with_the_command_and_then_repaired(pip, monkeypatch):
+    record = progress.Step.run
+
+    def offline(*_):
+        raise SetupError("no network", 1)
+
+    monkeypatch.setattr(progress.Step, "run", offline)
+    done = {"environment": "1"}
+    with pytest.raises(SetupError, match="scripts/setup.py --extra recordings'.*\n*no network") as error:
+        prepare._install_extras(WHEELS, done, ["recordings"])
+    assert error.value.exit_code == 2 and virtualenv.usable()  # flights go on
+    monkeypatch.setattr(progress.Step, "run", record)
+    prepare._install_extras(WHEELS, done, ["recordings"])
+    assert "--ignore-installed" in pip[0]  # what a killed pip left is no package
+
+
+def test_a_node_whose_extra_is_missing_says_which_command_installs_it(monkeypatch):
+    monkeypatch.setitem(extras.MODULES, "view", ("no_such_module",))
+    with pytest.raises(PerchError, match="scripts/setup.py --extra view"):
+        extras.require("view")
+
+
 def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
     # what CMake generated for a message that has gone stays linked into the typesupport of the others
     monkeypatch.setattr(workspace, "BUILD", tmp_path / "build")
@@ -237,10 +292,19 @@ def test_wheel_exports_lose_the_paths_of_the_machine_that_built_them():
 def test_equal_libraries_under_several_names_become_one_file(tmp_path):
     for name, text in {"libb.so": "b", "liba.so": "a", "liba.so.3": "a", "liba.so.3.7": "a", "a.txt": "a"}.items():
         (tmp_path / name).write_text(1000 * text)
-    assert [copies.link_copies(tmp_path) for _ in range(2)] == [2000, 0]
+    assert [slim.link_copies(tmp_path) for _ in range(2)] == [2000, 0]
     assert (tmp_path / "liba.so").samefile(tmp_path / "liba.so.3.7") and (tmp_path / "liba.so.3").read_text() == 1000 * "a"
     assert (tmp_path / "libb.so").read_text() == 1000 * "b" and not (tmp_path / "a.txt").samefile(tmp_path / "liba.so")
     assert len(list(tmp_path.iterdir())) == 5
+
+
+def test_what_nobody_uses_is_taken_out_of_the_packages(tmp_path):
+    for name in ("casadi/include/a.h", "casadi/libb.a", "casadi/libb.so", "scipy/stats/tests/test_c.py", "scipy/stats/d.py", "mine/tests/e.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for _ in range(2):
+        slim.slim(tmp_path)
+    assert sorted(file.name for file in tmp_path.rglob("*.*")) == ["d.py", "e.py", "libb.so"]
 
 
 @pytest.mark.parametrize("platform, built", [(WHEELS, True), (INSTALLED, False)])

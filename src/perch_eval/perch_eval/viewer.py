@@ -11,10 +11,10 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, Serialized
 from perch_core.vehicle import load_vehicle
 from perch_eval.messages_in import CAMERAS, Listener, listening
+from perch_eval.extras import require
 from perch_eval.recorder import jpeg
 from perch_eval.view.scene import (
     Path, map_markers, path_markers, plan_markers, target_markers, truth_markers, vehicle_markers, world_markers)
-from perch_eval.view.server import LiveServer
 from perch_sim.scenario import load_scenario
 
 FAST = ("odometry", "ground_truth/odometry", "imu/data_raw")
@@ -90,6 +90,9 @@ class Viewer(Listener[ViewerParameters]):
         self._looks: dict[str, Callable[[bytes, int], None]] = {
             "odometry": self._see_odometry, "ground_truth/odometry": self._see_truth, "trajectory": self._see_trajectory,
             "target/pose": self._see_target, "powerlines": self._see_lines, "controller/status": self._see_status}
+        require("view")
+        from perch_eval.view.server import LiveServer
+
         self.server = LiveServer(config.host, config.port, f"perch: {scenario.name}", config.origins)
 
     def warm_up(self) -> None:

@@ -14,6 +14,7 @@ from perch_core.errors import PerchError
 from perch_core.processes import end_with_parent
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.results import RunResult
+from perch_eval.extras import require
 
 END_LIMIT = 5  # of a worker that is told to end [s]
 ATTEMPTS = 3  # a run whose worker died so often is given up
@@ -96,6 +97,7 @@ def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
     Raises:
         PerchError: the scheduler does not answer.
     """
+    require("campaigns")
     from distributed import Client, as_completed
 
     try:

@@ -10,6 +10,7 @@ from perch_core.errors import PerchError
 from perch_core.ros.messages.sensing import compressed_value, image_value, imu_value
 from perch_core.sensors import Sensors
 from perch_core.values import CameraImage, ImuSample
+from perch_eval.extras import require
 from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError
 
 IMAGES = {"sensor_msgs/msg/Image": image_value, "sensor_msgs/msg/CompressedImage": compressed_value}
@@ -140,6 +141,7 @@ def _open(path: Path) -> Any:
     Raises:
         RecordingError: it is none, or is damaged.
     """
+    require("recordings")
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

@@ -1,15 +1,29 @@
-"""Makes one file of several equal ones: a wheel cannot hold links, so it has a library once for each of its names."""
+"""Takes away what wheels bring and nobody uses."""
 
 from __future__ import annotations
 
 import filecmp
 import os
+import shutil
 from itertools import groupby
 from pathlib import Path
 
+_UNUSED = ("casadi/include", "casadi/*.a", *(f"{name}/**/tests" for name in ("dask", "matplotlib", "numba", "numpy", "pandas", "scipy")))
+"""Headers and libraries to link with, and the libraries' own tests."""
+
+
+def slim(packages: Path) -> None:
+    """Make a `site-packages` smaller. Repeating it changes nothing."""
+    for path in [path for pattern in _UNUSED for path in packages.glob(pattern)]:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    link_copies(packages / "casadi")
+
 
 def link_copies(folder: Path, pattern: str = "*.so*") -> int:
-    """Replace equal files of a folder by links to one of them. Repeating it changes nothing.
+    """Replace equal files of a folder by links to one of them: a wheel cannot hold links, it has a library once for each of its names.
 
     A file system that knows no links keeps the copies.
 
