@@ -5,25 +5,47 @@ from __future__ import annotations
 import filecmp
 import os
 import shutil
+import subprocess
 from itertools import groupby
 from pathlib import Path
 
-_UNUSED = ("casadi/include", "casadi/*.a", *(f"{name}/**/tests" for name in ("dask", "matplotlib", "numba", "numpy", "pandas", "scipy")))
-"""Headers and libraries to link with, and the libraries' own tests."""
+_UNUSED = (
+    *(f"{name}/**/tests" for name in ("dask", "matplotlib", "numba", "numpy", "pandas", "scipy")),
+    *(f"casadi/{name}" for name in ("include", "*.a", "liblacemodelica*", "libcasadi_graphmodel_onnx*", "libantlr4*")),
+    *(f"casadi/lib*{name}*" for name in ("highs", "alpaqa", "uno", "Clp", "Cbc", "Cgl", "Osi", "CoinUtils", "bonmin")),
+)
+"""The libraries' own tests; of CasADi headers, importers and all solvers but those that perch calls (fatrop, ipopt) or that are small."""
+_WITH_SYMBOLS = ("llvmlite/**", "zstandard", "fontTools/**", "kiwisolver", "lz4/**", "yaml", ".")
+"""Folders whose libraries were published with a debugger's symbols. Only those that hold no libraries of their own beside them: `strip` may
+damage what the maker of such a wheel has patched."""
 
 
 def slim(packages: Path) -> None:
-    """Make a `site-packages` smaller. Repeating it changes nothing."""
+    """Make a `site-packages` smaller, by a third. Repeating it changes nothing."""
     for path in [path for pattern in _UNUSED for path in packages.glob(pattern)]:
         if path.is_dir():
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-    link_copies(packages / "casadi")
+    link_copies(packages, "**/*.so*")
+    for pattern in _WITH_SYMBOLS:
+        for library in packages.glob(f"{pattern}/*.so"):
+            strip(library)
+
+
+def strip(library: Path) -> None:
+    """Take a debugger's symbols out of a library, which may be in use."""
+    draft = library.with_name(f"{library.name}.stripped")
+    done = subprocess.run(["strip", "--strip-unneeded", "-o", draft, library], stderr=subprocess.DEVNULL, check=False).returncode == 0
+    if done and draft.stat().st_size < library.stat().st_size:
+        draft.chmod(library.stat().st_mode)
+        draft.replace(library)
+    else:
+        draft.unlink(missing_ok=True)
 
 
 def link_copies(folder: Path, pattern: str = "*.so*") -> int:
-    """Replace equal files of a folder by links to one of them: a wheel cannot hold links, it has a library once for each of its names.
+    """Replace equal files below a folder by links to one of them: wheels cannot hold links, nor share a library.
 
     A file system that knows no links keeps the copies.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import re
 import subprocess
@@ -305,6 +306,19 @@ def test_what_nobody_uses_is_taken_out_of_the_packages(tmp_path):
     for _ in range(2):
         slim.slim(tmp_path)
     assert sorted(file.name for file in tmp_path.rglob("*.*")) == ["d.py", "e.py", "libb.so"]
+
+
+def test_symbols_of_a_debugger_are_taken_out_and_the_library_still_works(tmp_path):
+    library = tmp_path / "lib.so"
+    (tmp_path / "lib.c").write_text("static int unseen(int x) { return x + 1; } int seen(int x) { return unseen(x); }")
+    subprocess.run(["g++", "-g", "-shared", "-fPIC", "-x", "c", "-o", library, tmp_path / "lib.c"], check=True)
+    (tmp_path / "none.so").write_text("no library")
+    before = library.stat()
+    for _ in range(2):
+        slim.slim(tmp_path)
+    assert library.stat().st_size < before.st_size and library.stat().st_mode == before.st_mode
+    assert ctypes.CDLL(str(library)).seen(1) == 2 and (tmp_path / "none.so").read_text() == "no library"
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize("platform, built", [(WHEELS, True), (INSTALLED, False)])
