@@ -3,16 +3,13 @@
     python3 scripts/bench.py powerline            1,000 random starts, some five minutes
     python3 scripts/bench.py powerline --quick    50 random starts
 
-Every plan is written to out/bench as it is made: a run that was interrupted goes on where it was, unless the sources have changed.
 Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
-from pathlib import Path
 
 import numpy as np
 from harness import Figure, figure
@@ -21,7 +18,6 @@ from perch_core import compiled
 from perch_core.errors import PlanningRefusal
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.progress import Progress
-from perch_eval.revision import digest
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PowerlineRequest
@@ -31,7 +27,6 @@ from perch_planner.powerline.visibility import visibility
 
 SOLVE_BARS = {"line_20": 60.0, "line_80": 60.0, "line_20_pa": 100.0, "line_80_pa": 100.0, "line_180": 110.0}  # [ms]
 PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # [s]
-STATE = Path(__file__).resolve().parents[1] / "out" / "bench"
 END_BARS = {"end_position": 1e-3, "end_tilt": 0.1, "end_speed": 0.02}
 
 
@@ -59,30 +54,17 @@ def figures(quick: bool) -> list[Figure]:
 
 
 def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
-    """What the planner says to so many random starts of each case; plans of the same sources are not made again."""
-    STATE.mkdir(parents=True, exist_ok=True)
-    path = STATE / f"powerline_{digest()}.jsonl"
-    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
-    known = {(one["case"], one["start"]): one for one in (json.loads(line) for line in lines if line.endswith("\n"))}
-    asked = [(case, k) for case in SOLVE_BARS for k in range(starts)]
-    already = [known[key] for key in asked if key in known]
-    progress = Progress(len(asked), len(already), sum(not one["refusal"] for one in already), what="starts")
-    planner = PowerlinePlanner(vehicle)
+    """What the planner says to so many random starts of each case."""
+    found, planner, progress = [], PowerlinePlanner(vehicle), Progress(len(SOLVE_BARS) * starts, what="starts")
     planner.warm_up()
-    with path.open("w") as file:
-        file.writelines(json.dumps(one) + "\n" for one in known.values())
-        for case in SOLVE_BARS:
-            setup, rng = problem.load(f"powerline_{case}"), np.random.default_rng(2026)
-            nominal = setup.request(vehicle)
-            for k in range(starts):
-                request = random_start(nominal, setup, vehicle, rng)  # drawn in any case: a start does not depend on what is known
-                if (case, k) not in known:
-                    known[case, k] = {"case": case, "start": k, **_answer(planner, request)}
-                    file.write(json.dumps(known[case, k]) + "\n")
-                    file.flush()
-                    progress.add(not known[case, k]["refusal"])
+    for case in SOLVE_BARS:
+        setup, rng = problem.load(f"powerline_{case}"), np.random.default_rng(2026)
+        nominal = setup.request(vehicle)
+        for _ in range(starts):
+            found.append({"case": case, **_answer(planner, random_start(nominal, setup, vehicle, rng))})
+            progress.add(not found[-1]["refusal"])
     progress.close()
-    return [known[key] for key in asked]
+    return found
 
 
 def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> dict:

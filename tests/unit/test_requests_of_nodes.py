@@ -8,7 +8,6 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from perch_core.component import Client, Component, Service, Unavailable  # noqa: E402
-from perch_core.ros import component_node  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.node import close_nodes  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
@@ -75,7 +74,7 @@ def test_a_request_waits_for_the_discovery_of_its_service(executor):
 
 
 def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
-    monkeypatch.setattr(component_node, "DISCOVERY", 0.1)
+    monkeypatch.setattr("perch_core.ros.asking.DISCOVERY", 0.1)
     asking = node(executor, Asking).component
     asking.plan_perch(REQUEST, 0)
     while not getattr(asking, "answers", []):

@@ -6,23 +6,25 @@ well conditioned, and the smallest and largest coefficient enclose the values: t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from math import comb
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 
 
 @lru_cache(maxsize=None)
-def binomials(n: int) -> np.ndarray:
+def binomials(n: int) -> Array:
     """Row n of Pascal's triangle, shape (n + 1,), read-only."""
     row = np.array([comb(n, i) for i in range(n + 1)], float)
     row.setflags(write=False)
     return row
 
 
-def basis(degree: int, s: np.ndarray | float) -> np.ndarray:
+def basis(degree: int, s: Array | Sequence[float] | float) -> Array:
     """Values of the basis polynomials of one degree.
 
     Args:
@@ -38,7 +40,7 @@ def basis(degree: int, s: np.ndarray | float) -> np.ndarray:
 
 
 @compiled
-def values_at(coefficients: np.ndarray, choose: np.ndarray, s: float) -> np.ndarray:
+def values_at(coefficients: Array, choose: Array, s: float) -> Array:
     """Values of several polynomials of one degree at one argument, in one pass.
 
     Args:
@@ -59,7 +61,7 @@ def values_at(coefficients: np.ndarray, choose: np.ndarray, s: float) -> np.ndar
     for i in range(degree, -1, -1):
         weights[i] *= power
         power *= 1.0 - s
-    out = np.zeros(coefficients.shape[:2])
+    out: Array = np.zeros(coefficients.shape[:2])
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             for i in range(degree + 1):
@@ -67,7 +69,7 @@ def values_at(coefficients: np.ndarray, choose: np.ndarray, s: float) -> np.ndar
     return out
 
 
-def evaluate(coefficients: np.ndarray, s: np.ndarray | float) -> np.ndarray:
+def evaluate(coefficients: Array, s: Array | float) -> Array:
     """Values of polynomials.
 
     Args:
@@ -81,7 +83,7 @@ def evaluate(coefficients: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     return np.tensordot(coefficients, basis(coefficients.shape[-1] - 1, s), axes=(-1, -1))
 
 
-def derivative(coefficients: np.ndarray, order: int = 1) -> np.ndarray:
+def derivative(coefficients: Array, order: int = 1) -> Array:
     """Coefficients of the derivative with respect to s, shape (..., max(degree - order, 0) + 1)."""
     coefficients = np.asarray(coefficients, float)
     for _ in range(order):
@@ -92,7 +94,7 @@ def derivative(coefficients: np.ndarray, order: int = 1) -> np.ndarray:
     return coefficients
 
 
-def integral(coefficients: np.ndarray) -> np.ndarray:
+def integral(coefficients: Array) -> Array:
     """Coefficients of the antiderivative that vanishes at s = 0, shape (..., degree + 2)."""
     coefficients = np.asarray(coefficients, float)
     sums = np.cumsum(coefficients, axis=-1) / coefficients.shape[-1]
@@ -100,7 +102,7 @@ def integral(coefficients: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=None)
-def elevation_matrix(degree: int, to_degree: int) -> np.ndarray:
+def elevation_matrix(degree: int, to_degree: int) -> Array:
     """Matrix E with `elevated = coefficients @ E.T`, shape (to_degree + 1, degree + 1), read-only.
 
     Each row is a convex combination, so that elevation never amplifies rounding.
@@ -114,13 +116,13 @@ def elevation_matrix(degree: int, to_degree: int) -> np.ndarray:
     return E
 
 
-def elevate(coefficients: np.ndarray, to_degree: int) -> np.ndarray:
+def elevate(coefficients: Array, to_degree: int) -> Array:
     """The same polynomials in a basis of a higher degree, shape (..., to_degree + 1)."""
     coefficients = np.asarray(coefficients, float)
     return coefficients @ elevation_matrix(coefficients.shape[-1] - 1, to_degree).T
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def product(a: Array, b: Array) -> Array:
     """Coefficients of the products a(s) b(s).
 
     Args:
@@ -140,7 +142,7 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=None)
-def power_matrix(degree: int) -> np.ndarray:
+def power_matrix(degree: int) -> Array:
     """Matrix M with `powers = coefficients @ M.T` for powers of s in ascending order, integers, read-only."""
     n = degree
     M = np.array([[(-1) ** (k - i) * comb(n, k) * comb(k, i) if i <= k else 0
@@ -149,7 +151,7 @@ def power_matrix(degree: int) -> np.ndarray:
     return M
 
 
-def to_powers(coefficients: np.ndarray) -> np.ndarray:
+def to_powers(coefficients: Array) -> Array:
     """Coefficients of ascending powers of s, shape as given. Loses about 0.5 * degree digits: not for bounds."""
     coefficients = np.asarray(coefficients, float)
     return coefficients @ power_matrix(coefficients.shape[-1] - 1).T

@@ -16,7 +16,9 @@ import numpy as np
 
 from perch_core import lens as kernels
 from perch_core import radtan
+from perch_core.arrays import Array
 from perch_core.errors import ConfigError
+from perch_core.jit import interpreted
 
 Region = tuple[slice, slice]  # rows and columns of an image
 
@@ -38,11 +40,11 @@ class _Camera:
                 raise ConfigError(type(self).__name__, name, f"{getattr(self, name)!r} is not > 0 px")
 
     @cached_property
-    def K(self) -> np.ndarray:
+    def K(self) -> Array:
         """Intrinsic matrix, shape (3, 3) [px]."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def contains(self, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def contains(self, pixels: Array, margin: float = 0.0) -> np.ndarray:
         """Whether pixels (..., 2) lie in the image, `margin` [px] inside its border; NaN does not. Shape (...)."""
         u, v = np.asarray(pixels)[..., 0], np.asarray(pixels)[..., 1]
         return ((u >= margin - 0.5) & (u <= self.width - 0.5 - margin)
@@ -68,7 +70,7 @@ class PinholeCamera(_Camera):
         """Largest angle from the optical axis at which a point is projected [rad]."""
         return math.pi / 2
 
-    def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, points_C: Array) -> tuple[Array, np.ndarray]:
         """Pixels of points in C.
 
         Args:
@@ -84,13 +86,14 @@ class PinholeCamera(_Camera):
         pixels = points_C[..., :2] / z[..., None] * (self.fx, self.fy) + (self.cx, self.cy)
         return np.where(valid[..., None], pixels, np.nan), valid
 
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+    def unproject(self, pixels: Array) -> Array:
         """Unit rays in C, shape (..., 3), of pixels (..., 2)."""
         plane = (np.asarray(pixels, dtype=float) - (self.cx, self.cy)) / (self.fx, self.fy)
         rays_C = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
-        return rays_C / np.linalg.norm(rays_C, axis=-1, keepdims=True)
+        lengths: Array = np.linalg.norm(rays_C, axis=-1, keepdims=True)
+        return rays_C / lengths
 
-    def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
+    def project_jacobian(self, points_C: Array) -> Array:
         """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
         points_C = np.asarray(points_C, dtype=float)
         x, y, z = np.moveaxis(np.where(points_C[..., 2:] > self.near, points_C, np.nan), -1, 0)
@@ -98,7 +101,7 @@ class PinholeCamera(_Camera):
         return np.stack([np.stack([self.fx / z, zero, -self.fx * x / z**2], -1),
                          np.stack([zero, self.fy / z, -self.fy * y / z**2], -1)], -2)
 
-    def shape_at(self, theta: np.ndarray) -> np.ndarray:
+    def shape_at(self, theta: Array) -> Array:
         """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""
         theta = np.asarray(theta, float) + 1e-9
         return np.column_stack([np.cos(theta) ** 2, np.tan(theta) / theta])
@@ -109,7 +112,11 @@ class _DistortedCamera(_Camera):
 
     _kernels: ClassVar[ModuleType]
 
-    def project(self, points_C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    @property
+    def lens(self) -> tuple[float, ...]:
+        raise NotImplementedError
+
+    def project(self, points_C: Array) -> tuple[Array, np.ndarray]:
         """Pixels of points in C.
 
         Args:
@@ -124,14 +131,14 @@ class _DistortedCamera(_Camera):
         self._kernels.project(self.lens, points, pixels, valid)
         return pixels.reshape(*shape, 2), valid.reshape(shape)
 
-    def unproject(self, pixels: np.ndarray) -> np.ndarray:
+    def unproject(self, pixels: Array) -> Array:
         """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
         rows, shape = _rows(pixels, 2)
         rays_C = np.empty((len(rows), 3))
         self._kernels.unproject(self.lens, rows, rays_C)
         return rays_C.reshape(*shape, 3)
 
-    def project_jacobian(self, points_C: np.ndarray) -> np.ndarray:
+    def project_jacobian(self, points_C: Array) -> Array:
         """Derivative of the pixel by the point, shape (..., 2, 3) [px/m]; NaN where `project` is not valid."""
         points, shape = _rows(points_C, 3)
         jacobian = np.empty((len(points), 2, 3))
@@ -154,7 +161,7 @@ class RadialTangentialCamera(_DistortedCamera):
 
     coefficients: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     near: float = 1e-3
-    _kernels = radtan
+    _kernels: ClassVar[ModuleType] = radtan
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,7 +175,7 @@ class RadialTangentialCamera(_DistortedCamera):
         return "plumb_bob" if len(self.coefficients) == 5 else "rational_polynomial"
 
     @cached_property
-    def distortion(self) -> np.ndarray:
+    def distortion(self) -> Array:
         """The coefficients, shape (5,) or (8,)."""
         return np.array(self.coefficients, dtype=float)
 
@@ -193,14 +200,14 @@ class RadialTangentialCamera(_DistortedCamera):
         k = (*self.coefficients, 0.0, 0.0, 0.0)[:8]
         return tuple(float(x) for x in (self.fx, self.fy, self.cx, self.cy, *k, self.max_radius, self.near))
 
-    def shape_at(self, theta: np.ndarray) -> np.ndarray:
+    def shape_at(self, theta: Array) -> Array:
         """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2).
 
         The tangential part, some 1e-3 of the radius, is left out.
         """
         theta = np.asarray(theta, float) + 1e-9
         out = np.tan(theta)
-        g, slope = radtan.gain.py_func(self.lens, out**2), radtan.gain_slope.py_func(self.lens, out**2)
+        g, slope = interpreted(radtan.gain)(self.lens, out**2), interpreted(radtan.gain_slope)(self.lens, out**2)
         return np.column_stack([np.cos(theta) ** 2 / (g + 2.0 * out**2 * slope), out * g / theta])
 
 
@@ -224,7 +231,7 @@ class EquidistantCamera(_DistortedCamera):
     coefficients: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     angle_limit: float = math.pi / 2
     model = "equidistant"
-    _kernels = kernels
+    _kernels: ClassVar[ModuleType] = kernels
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -235,7 +242,7 @@ class EquidistantCamera(_DistortedCamera):
             raise ConfigError("EquidistantCamera", "angle_limit", f"{self.angle_limit!r} is outside (0, pi] rad")
 
     @cached_property
-    def distortion(self) -> np.ndarray:
+    def distortion(self) -> Array:
         """k1..k4, shape (4,)."""
         return np.array(self.coefficients, dtype=float)
 
@@ -256,15 +263,15 @@ class EquidistantCamera(_DistortedCamera):
         """theta_d, the radius in the normalised image plane of a ray at the angle theta [rad]."""
         return kernels.radius(self.lens, float(theta))
 
-    def shape_at(self, theta: np.ndarray) -> np.ndarray:
+    def shape_at(self, theta: Array) -> Array:
         """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""
         theta = np.asarray(theta, float)
-        r = kernels.radius.py_func(self.lens, theta)
+        r = interpreted(kernels.radius)(self.lens, theta)
         ratio = np.divide(r, theta, out=np.ones_like(theta), where=theta > 1e-12)
-        return np.column_stack([1.0 / kernels.radius_slope.py_func(self.lens, theta), ratio])
+        return np.column_stack([1.0 / interpreted(kernels.radius_slope)(self.lens, theta), ratio])
 
 
-def _rows(array: np.ndarray, width: int) -> tuple[np.ndarray, tuple[int, ...]]:
+def _rows(array: Array, width: int) -> tuple[Array, tuple[int, ...]]:
     """Vectors of any leading shape one below the other, and that shape."""
     array = np.asarray(array, dtype=float)
     return np.ascontiguousarray(array).reshape(-1, width), array.shape[:-1]
@@ -272,13 +279,14 @@ def _rows(array: np.ndarray, width: int) -> tuple[np.ndarray, tuple[int, ...]]:
 
 def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:
     """Square roots of a polynomial's real positive roots."""
-    return [math.sqrt(root.real) for root in polynomial.trim(1e-300).roots() if abs(root.imag) < 1e-12 and root.real > 0]
+    roots: np.ndarray = polynomial.trim(1e-300).roots()
+    return [math.sqrt(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
 
 
 Camera = PinholeCamera | RadialTangentialCamera | EquidistantCamera
 
 
-def camera_of(model: str, width: int, height: int, K: np.ndarray, distortion: np.ndarray) -> Camera:
+def camera_of(model: str, width: int, height: int, K: Array, distortion: Array) -> Camera:
     """The camera of a calibration in the words of sensor_msgs/CameraInfo.
 
     Args:
@@ -297,17 +305,17 @@ def camera_of(model: str, width: int, height: int, K: np.ndarray, distortion: np
         raise ConfigError("camera_info", "d", f"{d.tolist()} is not finite")
     if not 0 < width <= 1 << 15 or not 0 < height <= 1 << 15:
         raise ConfigError("camera_info", "width", f"{width} x {height} px is no size of an image")
-    common = dict(width=int(width), height=int(height), fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]))
+    common = int(width), int(height), float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     counts = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
     if model not in counts:
         raise ConfigError("camera_info", "distortion_model", f"{model!r} is not one of {', '.join(filter(None, counts))}")
     if len(d) not in counts[model]:
         raise ConfigError("camera_info", "d", f"has {len(d)} coefficients, {model or 'no model'} has {counts[model][-1]}")
     if model == "equidistant":
-        return EquidistantCamera(**common, coefficients=tuple(d) or (0.0,) * 4)
+        return EquidistantCamera(*common, coefficients=tuple(d) or (0.0,) * 4)
     if not d.any():
-        return PinholeCamera(**common)
-    return RadialTangentialCamera(**common, coefficients=tuple(d) if len(d) != 4 else (*d, 0.0))
+        return PinholeCamera(*common)
+    return RadialTangentialCamera(*common, coefficients=tuple(d) if len(d) != 4 else (*d, 0.0))
 
 
 def camera_parameters(camera: Camera) -> tuple[str, tuple[float, ...]]:
@@ -339,8 +347,8 @@ class CameraMount:
 
     name: str
     camera: Camera
-    p_BC: np.ndarray
-    R_BC: np.ndarray
+    p_BC: Array
+    R_BC: Array
     rate: float = 30.0
     exposure: float = 3.5e-3
     exposure_max: float = 9.7e-3
@@ -363,12 +371,12 @@ class CameraMount:
             raise ConfigError("CameraMount", "transport_min",
                               f"{self.transport_min!r} is outside [0, {self.transport_max}] s")
 
-    def pose(self, p_WB: np.ndarray, R_WB: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pose(self, p_WB: Array, R_WB: Array) -> tuple[Array, np.ndarray]:
         """Pose of the camera in W: p_WC (..., 3) [m] and R_WC (..., 3, 3), from the body's."""
         return p_WB + (R_WB @ self.p_BC), R_WB @ self.R_BC
 
 
-def looking_along(forward_B: np.ndarray, up_B: np.ndarray) -> np.ndarray:
+def looking_along(forward_B: Array, up_B: Array) -> Array:
     """R_BC of a camera that looks along `forward_B` with the image's upper side towards `up_B`, shape (3, 3)."""
     z = np.asarray(forward_B, dtype=float) / np.linalg.norm(forward_B)
     y = -np.asarray(up_B, dtype=float)

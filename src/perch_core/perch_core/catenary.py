@@ -7,12 +7,13 @@ parameter a = H/w: horizontal tension over weight per length. Arc length is clos
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
 
+from perch_core.arrays import Array, Numbers
 from perch_core.errors import PerchError
 from perch_core.lines import Segment
 
@@ -29,10 +30,10 @@ class Catenary:
         down: unit vector of the load in W, shape (3,): gravity, or gravity and steady wind together.
     """
 
-    start: np.ndarray
-    end: np.ndarray
+    start: Array
+    end: Array
     parameter: float
-    down: np.ndarray = DOWN
+    down: Array = field(default_factory=lambda: np.array(DOWN))
 
     def __post_init__(self) -> None:
         for name in ("start", "end", "down"):
@@ -51,7 +52,7 @@ class Catenary:
             raise PerchError(f"cable: parameter {self.parameter:g} m is too small for a span of {self._span:g} m")
 
     @classmethod
-    def from_sag(cls, start: np.ndarray, end: np.ndarray, sag: float, down: np.ndarray = DOWN) -> Catenary:
+    def from_sag(cls, start: Array, end: Array, sag: float, down: Numbers = DOWN) -> Catenary:
         """The cable whose middle (of the span) hangs `sag` [m] below the chord.
 
         Raises:
@@ -59,6 +60,7 @@ class Catenary:
         """
         if not (math.isfinite(sag) and sag >= 0):
             raise PerchError(f"cable: sag {sag!r} is not a length >= 0 m")
+        down = np.array(down, float)
         straight = cls(start, end, math.inf, down)
         if sag < 1e-9:
             return straight
@@ -107,7 +109,7 @@ class Catenary:
             return float(np.linalg.norm(self.end - self.start))
         return math.hypot(self._rise, 2 * self.parameter * math.sinh(self._span / (2 * self.parameter)))
 
-    def _at(self, x: np.ndarray) -> np.ndarray:
+    def _at(self, x: Array) -> Array:
         """Points in W at distances x along the horizontal, (...) -> (..., 3)."""
         a, x0 = self.parameter, self._x0
         # cosh(p) - cosh(q) as a product: a is often a thousand times the sag
@@ -116,18 +118,18 @@ class Catenary:
         along = (chord - (chord @ self.down) * self.down) / self._span
         return self.start + x[..., None] * along - z[..., None] * self.down
 
-    def _x_of(self, s: np.ndarray) -> np.ndarray:
+    def _x_of(self, s: Array) -> Array:
         a, x0 = self.parameter, self._x0
         return x0 + a * np.arcsinh(s / a - math.sinh(x0 / a))
 
-    def point(self, s: np.ndarray | float) -> np.ndarray:
+    def point(self, s: Array | float) -> Array:
         """Points in W [m] at arc lengths s from the start [m]: shape (...) -> (..., 3)."""
         s = np.asarray(s, dtype=float)
         if self.straight:
             return self.start + (s / self.length)[..., None] * (self.end - self.start)
         return self._at(self._x_of(s))
 
-    def tangent(self, s: np.ndarray | float) -> np.ndarray:
+    def tangent(self, s: Array | float) -> Array:
         """Unit tangents in W at arc lengths s [m]: shape (...) -> (..., 3)."""
         s = np.asarray(s, dtype=float)
         if self.straight:
@@ -137,7 +139,7 @@ class Catenary:
         along = (chord - (chord @ self.down) * self.down) / self._span
         return np.cos(angle)[..., None] * along - np.sin(angle)[..., None] * self.down
 
-    def sample(self, count: int) -> np.ndarray:
+    def sample(self, count: int) -> Array:
         """`count` points in W from start to end, evenly spread along the cable [m], shape (count, 3)."""
         return self.point(np.linspace(0.0, self.length, count))
 
@@ -151,7 +153,7 @@ class SegmentFit:
         mean_error: mean distance along the pieces [m].
     """
 
-    vertices: np.ndarray
+    vertices: Array
     max_error: float
     mean_error: float
 

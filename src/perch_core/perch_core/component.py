@@ -56,7 +56,8 @@ class _Port:
 
     def handler(self, component: Component[Any]) -> Callable[..., Any]:
         """The bound method `on_<name>`."""
-        return getattr(component, f"on_{self.name}")
+        handler: Callable[..., Any] = getattr(component, f"on_{self.name}")
+        return handler
 
 
 class Input(_Port, Generic[V]):

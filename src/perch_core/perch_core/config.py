@@ -16,12 +16,15 @@ import typing
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from perch_core.errors import ConfigError
-from perch_core.yaml_text import parse_yaml, read_yaml  # noqa: F401 (used as config.parse_yaml)
+from perch_core.yaml_text import parse_yaml as parse_yaml, read_yaml as read_yaml
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 LARGEST = {"m": 1e4, "m/s": 100.0, "m/s^2": 1e3, "m/s^3": 1e5, "rad": 1e3, "rad/s": 1e4, "rad/s^2": 1e4, "deg": 360.0, "s": 3600.0, "Hz": 1e4,
            "kg": 50.0, "kg m^2": 10.0, "N": 1e3, "N/s": 1e5, "N s/m": 100.0, "N s^2/rad^2": 1e-2, "px": 1e4}
 """Greatest magnitude of a quantity of a unit where its field says nothing; far above what any vehicle here is or does."""
@@ -63,7 +66,7 @@ def part(cls: type, *, doc: str = "") -> Any:
     return field(default_factory=cls, metadata={"doc": doc})
 
 
-def check(source: str, key: str, item: Field, value: Any) -> None:
+def check(source: str, key: str, item: Field[Any], value: Any) -> None:
     """Refuse a number out of the declared range, or a word that is no option.
 
     Raises:
@@ -101,7 +104,7 @@ def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
             return None
         kind = next(arg for arg in typing.get_args(kind) if arg is not type(None))
         return _convert(kind, value, source, key)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         return from_mapping(kind, value, source, key)
     if origin is dict:
         if not isinstance(value, dict):
@@ -174,7 +177,7 @@ def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T
 
 
 @functools.cache
-def _hints(cls: type) -> dict[str, Any]:
+def _hints(cls: Any) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 

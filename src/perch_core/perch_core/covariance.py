@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core import so3
+from perch_core.arrays import Array
 
 
-def largest_sigma(covariance: np.ndarray) -> float:
+def largest_sigma(covariance: Array) -> float:
     """Standard deviation along the worst axis: the root of the largest eigenvalue, in the root of the covariance's unit.
 
     Args:
@@ -16,7 +17,7 @@ def largest_sigma(covariance: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance)[-1])))
 
 
-def drift(now: np.ndarray, before: np.ndarray, u_W: np.ndarray) -> np.ndarray:
+def drift(now: Array, before: Array, u_W: Array) -> Array:
     """What the odometry's drift since a sighting adds to the covariance of a place relative to the vehicle.
 
     The odometry's error is the sum of independent increments, e_t = e_s + w, so that cov(w) = P_t - P_s; what it is surer of than before
@@ -35,4 +36,5 @@ def drift(now: np.ndarray, before: np.ndarray, u_W: np.ndarray) -> np.ndarray:
     J = np.eye(6)
     J[:3, 3:] = -so3.hat(u_W)
     J = J @ vectors
-    return (J * np.clip(values, 0.0, None)) @ J.T
+    added: Array = (J * np.clip(values, 0.0, None)) @ J.T
+    return added

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot
 
+from perch_core.arrays import Numbers, Quaternion, Vector3, quaternion, vector3
 from perch_core.component import Component, Input, Output, Wake
 from perch_core.config import quantity, text
 from perch_core.urdf import BASE, fixed_frames, urdf
@@ -44,7 +44,7 @@ class Description(Component[DescriptionParameters]):
         self._vehicle = load_vehicle(config.vehicle)
         self._period = round(NANOSECONDS / config.rate)
         self._next = self._ahead = -1
-        self._target: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+        self._target: tuple[Vector3, Quaternion] | None = None
         self._told = False
 
     def on_start(self, now: int) -> None:
@@ -70,20 +70,20 @@ class Description(Component[DescriptionParameters]):
             return
         late = self._next >= 0 and state.stamp < self._next + self._period
         self._next = (self._next if late else state.stamp) + self._period
-        self.frames(StampedTransform(state.stamp, ODOM, BASE, tuple(state.p_WB), _unit(state.q_WB)))
+        self.frames(StampedTransform(state.stamp, ODOM, BASE, vector3(state.p_WB), _unit(state.q_WB)))
 
     def on_target(self, pose: TargetPose) -> None:
         """The target, whenever it is believed to be elsewhere."""
         if self._next >= 0 and pose.stamp > self._next + NANOSECONDS:
             self.warn(f"target/pose: stamp {pose.stamp} ns is ahead of the odometry: ignored", every=1.0)
             return
-        p, q = tuple(map(float, pose.p_WS)), _unit(pose.q_WS)
+        p, q = vector3(pose.p_WS), _unit(pose.q_WS)
         if (p, q) != self._target:
             self._target = p, q
             self.frames(StampedTransform(pose.stamp, MAP, TARGET, p, q))
 
 
-def _unit(q: Sequence[float]) -> tuple[float, ...]:
+def _unit(q: Numbers) -> Quaternion:
     """A quaternion whose norm is 1 but for rounding, normalised."""
     norm = hypot(*q)
-    return tuple(float(x) / norm for x in q) if abs(norm - 1.0) > 1e-9 else tuple(map(float, q))
+    return quaternion([float(x) / norm for x in q] if abs(norm - 1.0) > 1e-9 else q)

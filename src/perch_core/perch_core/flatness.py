@@ -7,6 +7,7 @@ from math import cos, sin
 
 import numpy as np
 
+from perch_core.arrays import Array, Numbers, Vector3
 from perch_core.errors import FreeFallError
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, dot, norm, scale
@@ -34,17 +35,17 @@ class FlatState:
         thrust_rate: its time derivative [N/s].
     """
 
-    p_WB: np.ndarray
-    R_WB: np.ndarray
-    v_WB: np.ndarray
-    w_WB_B: np.ndarray
-    dw_WB_B: np.ndarray
+    p_WB: Array
+    R_WB: Array
+    v_WB: Array
+    w_WB_B: Array
+    dw_WB_B: Array
     thrust: float
     thrust_rate: float
 
 
 @compiled
-def direction_derivatives(f, df, ddf):
+def direction_derivatives(f: Numbers, df: Numbers, ddf: Numbers) -> tuple[Vector3, Vector3, Vector3]:
     """Unit vector along f with its first and second derivative."""
     k = 1.0 / norm(f)
     u = scale(k, f)
@@ -56,7 +57,7 @@ def direction_derivatives(f, df, ddf):
 
 
 @compiled
-def heading_derivatives(yaw, yaw_rate, yaw_acc):
+def heading_derivatives(yaw: float, yaw_rate: float, yaw_acc: float) -> tuple[Vector3, Vector3, Vector3]:
     """b2_des = (-sin yaw, cos yaw, 0) with its first and second derivative. [M:eq12]"""
     sy, cy = sin(yaw), cos(yaw)
     return ((-sy, cy, 0.0), (-cy * yaw_rate, -sy * yaw_rate, 0.0),
@@ -64,7 +65,8 @@ def heading_derivatives(yaw, yaw_rate, yaw_acc):
 
 
 @compiled
-def commanded_frame(f, df, ddf, h, dh, ddh):
+def commanded_frame(f: Numbers, df: Numbers, ddf: Numbers, h: Numbers, dh: Numbers, ddh: Numbers
+                    ) -> tuple[Vector3, Vector3, Vector3, Vector3, Vector3]:
     """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [defines M:eq10, M:eq12, M:eq13]
 
     Args:
@@ -89,7 +91,7 @@ def commanded_frame(f, df, ddf, h, dh, ddh):
     return b1, b2, b3, (wx, wy, wz), (dwx, dwy, dwz)
 
 
-def attitude(b3_W: np.ndarray, yaw: float) -> np.ndarray:
+def attitude(b3_W: Array, yaw: float) -> Array:
     """Attitude from a thrust direction and a yaw angle. [M:eq12]
 
     `b1 = (b2_des x b3) / |b2_des x b3|`, `b2 = b3 x b1`, `b2_des = (-sin yaw, cos yaw, 0)`.
@@ -112,7 +114,7 @@ def attitude(b3_W: np.ndarray, yaw: float) -> np.ndarray:
     return np.array([b1, cross(b3, b1), b3]).T
 
 
-def flat_to_state(p, v, a, j, s, yaw: float, yaw_rate: float, yaw_acc: float, mass: float) -> FlatState:
+def flat_to_state(p: Numbers, v: Numbers, a: Numbers, j: Numbers, s: Numbers, yaw: float, yaw_rate: float, yaw_acc: float, mass: float) -> FlatState:
     """State, body rates, angular accelerations and thrust of the flat outputs. [M:eq9-13]
 
     Args:

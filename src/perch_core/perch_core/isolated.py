@@ -155,7 +155,7 @@ class IsolatedRunner:
                 self._do(self._tasks.popleft())
                 continue
             soonest = min((task.end for task in self._waiting()), default=inf)
-            pipes = [self._woken] if self._pipe is None else [self._woken, self._pipe]
+            pipes: list[socket.socket | Connection] = [self._woken] if self._pipe is None else [self._woken, self._pipe]
             heard = wait(pipes, None if soonest == inf else max(0.0, soonest - time.monotonic()))
             if self._woken in heard:
                 self._woken.recv(4096)
@@ -198,6 +198,7 @@ class IsolatedRunner:
 
     def _hear(self) -> None:
         """The supervisor says that it is ready, or why not; or it has ended: another is started, if this one was of use."""
+        assert self._pipe is not None
         try:
             answer = self._pipe.recv_bytes().decode()
         except (EOFError, OSError):
@@ -223,6 +224,7 @@ class IsolatedRunner:
             return
         if not task.future.running() and not task.future.set_running_or_notify_cancel():
             return
+        assert self._pipe is not None
         try:
             self._pipe.send_bytes(_HEADER.pack(left) + task.payload)
             if not self._pipe.poll(None if left == inf else left + _GRACE):

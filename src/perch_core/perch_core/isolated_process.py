@@ -67,7 +67,8 @@ def _fork(upstream: Connection, memory: int) -> tuple[int, Connection]:
     mine, theirs = Pipe()
     supervisor, pid = os.getpid(), os.fork()
     if pid == 0:
-        mine.close(), upstream.close()
+        mine.close()
+        upstream.close()
         _child(theirs, supervisor, memory)
     theirs.close()
     return pid, mine

@@ -11,16 +11,17 @@ import os
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, cast, overload
 
-Kernel = TypeVar("Kernel", bound=Callable)
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
+njit: Any = None
 try:
     if os.environ.get("PERCH_NUMBA") == "0":
         raise ImportError
     from numba import njit
 except ImportError:
-    njit = None
+    pass
 
 COMPILED = njit is not None
 
@@ -45,13 +46,17 @@ def _package(file: Path) -> Path:
     return folder
 
 
-def compiled(kernel: Kernel | None = None, *, nogil: bool = False) -> Kernel:
+@overload
+def compiled(kernel: Kernel) -> Kernel: ...
+@overload
+def compiled(*, nogil: bool) -> Callable[[Kernel], Kernel]: ...
+def compiled(kernel: Any = None, *, nogil: bool = False) -> Any:
     """Decorator: the kernel compiled by numba with an on-disk cache, or the kernel itself.
 
     With `nogil` it runs without the interpreter lock, which pays for kernels of milliseconds beside other threads.
 
-    Without `fastmath`: results must not depend on how a compiler groups a sum. The plain function stays reachable as
-    `.py_func` either way. A kernel may call kernels of its own package and of perch_core.
+    Without `fastmath`: results must not depend on how a compiler groups a sum. The plain function stays reachable, see
+    `interpreted`. A kernel may call kernels of its own package and of perch_core.
     """
     if kernel is None:
         return partial(compiled, nogil=nogil)
@@ -61,7 +66,13 @@ def compiled(kernel: Kernel | None = None, *, nogil: bool = False) -> Kernel:
     out = njit(cache=True, error_model="numpy", nogil=nogil)(kernel)
     # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
     # unseen. The hash of all sources with kernels takes the place of that file's date.
-    index = getattr(getattr(out, "_cache", None), "_cache_file", None)
+    index: Any = getattr(getattr(out, "_cache", None), "_cache_file", None)
     if hasattr(index, "_source_stamp"):
         index._source_stamp = _stamp(_package(Path(kernel.__code__.co_filename)))
     return out
+
+
+def interpreted(kernel: Kernel) -> Kernel:
+    """The plain function of a kernel."""
+    plain: Kernel = cast(Any, kernel).py_func
+    return plain

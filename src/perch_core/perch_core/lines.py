@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.components import (
     Scalar, Vector, add, components, cross, dot, function, rotate_back, scale, stack, subtract,
 )
@@ -31,8 +32,8 @@ class Segment:
         id: number under which the map knows it.
     """
 
-    centre: np.ndarray
-    direction: np.ndarray
+    centre: Array
+    direction: Array
     half_length: float
     radius: float
     id: int = 0
@@ -49,24 +50,25 @@ class Segment:
         object.__setattr__(self, "direction", direction / norm)
 
     @classmethod
-    def between(cls, start: np.ndarray, end: np.ndarray, radius: float, id: int = 0) -> Segment:
+    def between(cls, start: Array, end: Array, radius: float, id: int = 0) -> Segment:
         """The segment between two end points in W [m]."""
         start, end = np.asarray(start, float), np.asarray(end, float)
         return cls((start + end) / 2, end - start, float(np.linalg.norm(end - start)) / 2, radius, id)
 
     @property
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+    def ends(self) -> tuple[Array, Array]:
         """End points in W [m]."""
         return self.centre - self.half_length * self.direction, self.centre + self.half_length * self.direction
 
-    def closest_point(self, point: np.ndarray) -> np.ndarray:
+    def closest_point(self, point: Array) -> Array:
         """The point of the segment that is nearest to points in W, shapes (..., 3)."""
         along = (np.asarray(point, float) - self.centre) @ self.direction
         return self.centre + np.clip(along, -self.half_length, self.half_length)[..., None] * self.direction
 
-    def distance(self, point: np.ndarray) -> np.ndarray:
+    def distance(self, point: Array) -> Array:
         """Distance of points in W from the wire's axis [m], shapes (..., 3) -> (...)."""
-        return np.linalg.norm(np.asarray(point, float) - self.closest_point(point), axis=-1)
+        distances: Array = np.linalg.norm(np.asarray(point, float) - self.closest_point(point), axis=-1)
+        return distances
 
 
 def segment_distance(a: Segment, b: Segment) -> float:
@@ -145,7 +147,7 @@ def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half
     return line_clearance(o, l) + largest_eigenvalue * largest_eigenvalue * far
 
 
-def scaled_clearance(states_p: np.ndarray, states_q: np.ndarray, segment: Segment, body_radii: Vector) -> np.ndarray:
+def scaled_clearance(states_p: Array, states_q: Array, segment: Segment, body_radii: Vector) -> Array:
     """Distance of the finite segment in the scaled frame, minus 1: positive where nothing touches.
 
     The check of finished trajectories: it takes the segment's true ends instead of the fade-out of [P:eq6].
@@ -162,7 +164,8 @@ def scaled_clearance(states_p: np.ndarray, states_q: np.ndarray, segment: Segmen
     o, l = scaled_line(components(states_p), components(states_q), components(segment.centre),
                        components(segment.direction), radii)
     along = np.clip(-dot(o, l) / dot(l, l), -segment.half_length, segment.half_length)
-    return np.linalg.norm(stack(add(o, scale(along, l))), axis=-1) - 1
+    lengths: Array = np.linalg.norm(stack(add(o, scale(along, l))), axis=-1)
+    return lengths - 1
 
 
 def line_in_camera(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, p_BC: Vector, q_BC: Vector

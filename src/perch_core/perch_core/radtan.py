@@ -12,8 +12,14 @@ points. Beyond `r_max` the radius r g(r^2) falls again, and points would fold ba
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
+import numpy as np
+
+from perch_core.arrays import Array
 from perch_core.jit import compiled
+
+F = TypeVar("F", float, Array)  # the plain functions take arrays, too
 
 HALVINGS = 60       # of [0, r_max], for the radial part alone
 NEWTON_STEPS = 30   # with the tangential part, from there
@@ -21,13 +27,13 @@ RESIDUAL = 1e-13    # in the normalised image plane
 
 
 @compiled
-def gain(lens, t):
+def gain(lens: tuple[float, ...], t: F) -> F:
     """g(t)."""
     return (1.0 + t * (lens[4] + t * (lens[5] + t * lens[8]))) / (1.0 + t * (lens[9] + t * (lens[10] + t * lens[11])))
 
 
 @compiled
-def gain_slope(lens, t):
+def gain_slope(lens: tuple[float, ...], t: F) -> F:
     """d g / d t."""
     over, under = 1.0 + t * (lens[4] + t * (lens[5] + t * lens[8])), 1.0 + t * (lens[9] + t * (lens[10] + t * lens[11]))
     d_over, d_under = lens[4] + t * (2.0 * lens[5] + t * 3.0 * lens[8]), lens[9] + t * (2.0 * lens[10] + t * 3.0 * lens[11])
@@ -35,7 +41,7 @@ def gain_slope(lens, t):
 
 
 @compiled
-def _seen_at(lens, x, y):
+def _seen_at(lens: tuple[float, ...], x: float, y: float) -> tuple[float, float]:
     """x' and y'."""
     t, p1, p2 = x * x + y * y, lens[6], lens[7]
     g = gain(lens, t)
@@ -43,7 +49,7 @@ def _seen_at(lens, x, y):
 
 
 @compiled
-def _slopes(lens, x, y):
+def _slopes(lens: tuple[float, ...], x: float, y: float) -> tuple[float, float, float]:
     """d x'/d x, d x'/d y = d y'/d x, d y'/d y."""
     t, p1, p2 = x * x + y * y, lens[6], lens[7]
     g, s = gain(lens, t), 2.0 * gain_slope(lens, t)
@@ -52,7 +58,7 @@ def _slopes(lens, x, y):
 
 
 @compiled
-def _regular(lens, x, y):
+def _regular(lens: tuple[float, ...], x: float, y: float) -> bool:
     """Whether neighbours of a point are seen as neighbours, neither folded nor mirrored."""
     if not x * x + y * y <= lens[12] * lens[12]:
         return False
@@ -61,7 +67,7 @@ def _regular(lens, x, y):
 
 
 @compiled
-def project(lens, points, pixels, valid):
+def project(lens: tuple[float, ...], points: Array, pixels: Array, valid: np.ndarray) -> None:
     """Pixels (n, 2) of points (n, 3), and which are valid, (n,); NaN behind the camera and beyond `r_max`."""
     for n in range(points.shape[0]):
         z = points[n, 2]
@@ -74,7 +80,7 @@ def project(lens, points, pixels, valid):
 
 
 @compiled
-def _undistorted(lens, x_seen, y_seen):
+def _undistorted(lens: tuple[float, ...], x_seen: float, y_seen: float) -> tuple[float, float]:
     """The point (x, y) that is seen at (x', y'); NaN where none is."""
     seen = math.sqrt(x_seen * x_seen + y_seen * y_seen)
     if not seen < math.inf:
@@ -109,7 +115,7 @@ def _undistorted(lens, x_seen, y_seen):
 
 
 @compiled
-def unproject(lens, pixels, rays):
+def unproject(lens: tuple[float, ...], pixels: Array, rays: Array) -> None:
     """Unit rays (n, 3) of pixels (n, 2); NaN where the lens sees nothing."""
     for n in range(pixels.shape[0]):
         x, y = _undistorted(lens, (pixels[n, 0] - lens[2]) / lens[0], (pixels[n, 1] - lens[3]) / lens[1])
@@ -118,7 +124,7 @@ def unproject(lens, pixels, rays):
 
 
 @compiled
-def project_jacobian(lens, points, jacobian):
+def project_jacobian(lens: tuple[float, ...], points: Array, jacobian: Array) -> None:
     """Derivative of the pixel by the point, (n, 2, 3); NaN where `project` is not valid."""
     for n in range(points.shape[0]):
         z = points[n, 2]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_core.arrays import vector3
 from perch_core.components import Scalar, Vector, components, dot, matrix_of, stack
 from perch_core.vehicle import GRAVITY, Vehicle
 
@@ -39,7 +40,7 @@ class RotorModel:
     def of(cls, vehicle: Vehicle, gravity: float = GRAVITY) -> RotorModel:
         """The model of a vehicle; its allocation matrix without the first row is M of [P:eq2]."""
         torque = tuple(tuple(float(x) for x in row) for row in vehicle.allocation[1:])
-        return cls(float(vehicle.mass), tuple(float(j) for j in vehicle.inertia), torque, float(gravity))
+        return cls(float(vehicle.mass), vector3(vehicle.inertia), torque, float(gravity))
 
     @property
     def hover(self) -> float:

@@ -101,12 +101,12 @@ class ImuSensor:
     @property
     def accel_noise(self) -> float:
         """1 sigma of one sample [m/s^2]."""
-        return self.accel_noise_density * self.rate**0.5
+        return self.accel_noise_density * float(self.rate**0.5)
 
     @property
     def gyro_noise(self) -> float:
         """1 sigma of one sample [rad/s]."""
-        return self.gyro_noise_density * self.rate**0.5
+        return self.gyro_noise_density * float(self.rate**0.5)
 
     @cached_property
     def R_BI(self) -> np.ndarray:

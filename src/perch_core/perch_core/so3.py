@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array
+
 _SMALL = 1e-6  # below this angle the series are exact to double precision
 
 
-def hat(v: np.ndarray) -> np.ndarray:
+def hat(v: Array) -> Array:
     """Skew matrix with `hat(a) @ b = a x b`. [M:eq1]
 
     Args:
@@ -28,7 +30,7 @@ def hat(v: np.ndarray) -> np.ndarray:
     return out
 
 
-def _sinc_terms(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sinc_terms(angle: Array) -> tuple[Array, Array, Array]:
     """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, by series near zero."""
     small = angle < _SMALL
     a = np.where(small, 1.0, angle)
@@ -40,7 +42,7 @@ def _sinc_terms(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def exp(phi: np.ndarray) -> np.ndarray:
+def exp(phi: Array) -> Array:
     """Rotation matrix of a rotation vector (Rodrigues), shape (..., 3) [rad] -> (..., 3, 3)."""
     phi = np.asarray(phi, float)
     s, c, _ = _sinc_terms(np.linalg.norm(phi, axis=-1))
@@ -48,12 +50,12 @@ def exp(phi: np.ndarray) -> np.ndarray:
     return np.eye(3) + s[..., None, None] * K + c[..., None, None] * (K @ K)
 
 
-def log(R: np.ndarray) -> np.ndarray:
+def log(R: Array) -> Array:
     """Rotation vector of a rotation matrix, angle in [0, pi], shape (..., 3, 3) -> (..., 3) [rad]."""
     return quat_log(quat_from_matrix(R))
 
 
-def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def quat_multiply(a: Array, b: Array) -> Array:
     """Hamilton product `a * b` of quaternions xyzw, shapes (..., 4)."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
@@ -63,12 +65,12 @@ def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def quat_conjugate(q: np.ndarray) -> np.ndarray:
+def quat_conjugate(q: Array) -> Array:
     """Inverse of a unit quaternion xyzw, shape (..., 4)."""
-    return np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.array([-1.0, -1.0, -1.0, 1.0]) * q
 
 
-def quat_rotate(q_AB: np.ndarray, v_B: np.ndarray) -> np.ndarray:
+def quat_rotate(q_AB: Array, v_B: Array) -> Array:
     """Vector in A of a vector in B, shapes (..., 4) and (..., 3) -> (..., 3)."""
     q_AB, v_B = np.asarray(q_AB, float), np.asarray(v_B, float)
     u, w = q_AB[..., :3], q_AB[..., 3:]
@@ -76,7 +78,7 @@ def quat_rotate(q_AB: np.ndarray, v_B: np.ndarray) -> np.ndarray:
     return v_B + w * t + _cross(u, t)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _cross(a: Array, b: Array) -> Array:
     """`np.cross` of vectors, shapes (..., 3), in a fifth of its time: it looks at axes and dimensions for 30 us."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
@@ -86,7 +88,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def quat_to_matrix(q: np.ndarray) -> np.ndarray:
+def quat_to_matrix(q: Array) -> Array:
     """Rotation matrix of a unit quaternion xyzw, shape (..., 4) -> (..., 3, 3)."""
     q = np.asarray(q, float)
     # One quaternion in plain floats: 4 us, where arrays of single numbers take 40. The formula and its bits are the same.
@@ -99,7 +101,7 @@ def quat_to_matrix(q: np.ndarray) -> np.ndarray:
     return np.array(rows) if q.ndim == 1 else np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def quat_from_matrix(R: np.ndarray) -> np.ndarray:
+def quat_from_matrix(R: Array) -> Array:
     """Unit quaternion xyzw with w >= 0 of a rotation matrix, shape (..., 3, 3) -> (..., 4).
 
     Takes the best conditioned of Shepperd's four forms, so that it is exact at 180 degrees too.
@@ -118,10 +120,11 @@ def quat_from_matrix(R: np.ndarray) -> np.ndarray:
     best = np.argmax(np.diagonal(K, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(K, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., 3:] < 0, -q, q)
+    upper: Array = np.where(q[..., 3:] < 0, -q, q)
+    return upper
 
 
-def quat_exp(phi: np.ndarray) -> np.ndarray:
+def quat_exp(phi: Array) -> Array:
     """Unit quaternion xyzw of a rotation vector, shape (..., 3) [rad] -> (..., 4)."""
     phi = np.asarray(phi, float)
     angle = np.linalg.norm(phi, axis=-1, keepdims=True)
@@ -130,7 +133,7 @@ def quat_exp(phi: np.ndarray) -> np.ndarray:
     return np.concatenate([factor * phi, np.cos(0.5 * angle)], axis=-1)
 
 
-def quat_log(q: np.ndarray) -> np.ndarray:
+def quat_log(q: Array) -> Array:
     """Rotation vector of a unit quaternion xyzw, angle in [0, pi], shape (..., 4) -> (..., 3) [rad]."""
     q = np.asarray(q, float)
     q = np.where(q[..., 3:] < 0, -q, q)
@@ -140,13 +143,13 @@ def quat_log(q: np.ndarray) -> np.ndarray:
     return factor * q[..., :3]
 
 
-def quat_slerp(q0: np.ndarray, q1: np.ndarray, s: float | np.ndarray) -> np.ndarray:
+def quat_slerp(q0: Array, q1: Array, s: float | Array) -> Array:
     """Shortest-path interpolation between unit quaternions xyzw, s in [0, 1]."""
     step = quat_log(quat_multiply(quat_conjugate(q0), q1))
     return quat_multiply(q0, quat_exp(np.asarray(s, float)[..., None] * step))
 
 
-def yaw_of(R_WB: np.ndarray) -> np.ndarray:
+def yaw_of(R_WB: Array) -> Array:
     """Yaw with b2 parallel to (-sin yaw, cos yaw, 0) in the horizontal plane [rad]. [M:eq12]
 
     Taken from b2, not b1: a vehicle that pitches to 90 degrees keeps its b2, its b1 becomes vertical.
@@ -155,7 +158,8 @@ def yaw_of(R_WB: np.ndarray) -> np.ndarray:
     return np.arctan2(-R_WB[..., 0, 1], R_WB[..., 1, 1])
 
 
-def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_between(a: Array, b: Array) -> Array:
     """Angle between vectors, accurate near 0 and pi, shapes (..., 3) -> (...) [rad]."""
     a, b = np.asarray(a, float), np.asarray(b, float)
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+    angle: Array = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+    return angle

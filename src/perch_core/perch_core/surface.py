@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.errors import ConfigError
 
 
@@ -23,8 +24,8 @@ class PerchSurface:
         size: full extent along s1 and s2 [m].
     """
 
-    p_WS: np.ndarray
-    R_WS: np.ndarray
+    p_WS: Array
+    R_WS: Array
     size: tuple[float, float]
 
     def __post_init__(self) -> None:
@@ -38,7 +39,7 @@ class PerchSurface:
             raise ConfigError("PerchSurface", "size", f"{self.size!r} is not two extents > 0 m")
 
     @classmethod
-    def from_inclination(cls, p_WS: np.ndarray, inclination: float, heading: float = 0.0,
+    def from_inclination(cls, p_WS: Array, inclination: float, heading: float = 0.0,
                          size: tuple[float, float] = (0.6, 0.6)) -> PerchSurface:
         """The surface met when approaching along `heading`.
 
@@ -59,7 +60,7 @@ class PerchSurface:
         return cls(p_WS, np.stack([np.cross(s2, s3), s2, s3], axis=1), size)
 
     @property
-    def normal(self) -> np.ndarray:
+    def normal(self) -> Array:
         """s3, the outward unit normal in W, shape (3,)."""
         return self.R_WS[:, 2]
 
@@ -75,25 +76,26 @@ class PerchSurface:
         s2 = self.R_WS[:, 1]
         return float(np.arctan2(-s2[0], s2[1]))
 
-    def to_surface(self, points_W: np.ndarray) -> np.ndarray:
+    def to_surface(self, points_W: Array) -> Array:
         """Points of W in S: (..., 3) -> (..., 3) [m]; the third entry is the distance in front of the surface."""
         return (np.asarray(points_W, dtype=float) - self.p_WS) @ self.R_WS
 
-    def to_world(self, points_S: np.ndarray) -> np.ndarray:
+    def to_world(self, points_S: Array) -> Array:
         """Points of S in W: (..., 3) -> (..., 3) [m]."""
         return np.asarray(points_S, dtype=float) @ self.R_WS.T + self.p_WS
 
-    def distance(self, points_W: np.ndarray) -> np.ndarray:
+    def distance(self, points_W: Array) -> Array:
         """Signed distance of points (..., 3) from the plane [m], positive on the outer side; shape (...)."""
         return (np.asarray(points_W, dtype=float) - self.p_WS) @ self.normal
 
-    def covers(self, points_W: np.ndarray) -> np.ndarray:
+    def covers(self, points_W: Array) -> np.ndarray:
         """Whether points (..., 3), projected along s3, fall inside the rectangle; shape (...)."""
         points_S = self.to_surface(points_W)
-        return np.all(np.abs(points_S[..., :2]) <= np.array(self.size) / 2, axis=-1)
+        inside: np.ndarray = np.all(np.abs(points_S[..., :2]) <= np.array(self.size) / 2, axis=-1)
+        return inside
 
     @property
-    def corners_W(self) -> np.ndarray:
+    def corners_W(self) -> Array:
         """Corners in W [m], shape (4, 3): top left, top right, bottom right, bottom left, seen from outside, s1 up."""
         a, b = np.array(self.size) / 2
         return self.to_world(np.array([[a, b, 0.0], [a, -b, 0.0], [-a, -b, 0.0], [-a, b, 0.0]]))

@@ -15,6 +15,7 @@ from math import inf, isfinite
 import numpy as np
 
 from perch_core import bernstein, so3
+from perch_core.arrays import Array, Numbers
 
 _DERIVATIVES = 4  # a sample carries position up to snap
 
@@ -34,11 +35,11 @@ class FlatSample:
         yaw_acc: [rad/s^2].
     """
 
-    p: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    j: np.ndarray
-    s: np.ndarray
+    p: Array
+    v: Array
+    a: Array
+    j: Array
+    s: Array
     yaw: float
     yaw_rate: float
     yaw_acc: float
@@ -57,8 +58,8 @@ class FlatTrajectory:
         ValueError: wrong shapes, values that are not finite, or durations that are not positive.
     """
 
-    durations: np.ndarray
-    coefficients: np.ndarray
+    durations: Array
+    coefficients: Array
     start_time: float = 0.0
     _edges: list[float] = field(init=False, repr=False, compare=False)
 
@@ -78,7 +79,7 @@ class FlatTrajectory:
         object.__setattr__(self, "_edges", list(accumulate(times, initial=0.0)))
 
     @cached_property
-    def _tables(self) -> np.ndarray:
+    def _tables(self) -> Array:
         """All derivatives in the basis of one degree, so that a sample is one basis and one matrix product.
 
         Made by the first sample: a planner that only publishes its coefficients does not pay for it.
@@ -90,7 +91,7 @@ class FlatTrajectory:
         return tables
 
     @cached_property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
         """As kernels take it: derivatives (n, 5, 4, degree + 1), segment ends (n + 1,) and durations (n,) [s], binomials."""
         return self._tables, np.array(self._edges), np.array(self.durations), bernstein.binomials(self.degree)
 
@@ -102,7 +103,7 @@ class FlatTrajectory:
     @property
     def degree(self) -> int:
         """Polynomial degree of the segments."""
-        return self.coefficients.shape[-1] - 1
+        return int(self.coefficients.shape[-1]) - 1
 
     def locate(self, t: float) -> tuple[int, float]:
         """Segment index and local argument s in [0, 1] of a time [s]; the later segment at a joint."""
@@ -116,36 +117,37 @@ class FlatTrajectory:
         yaw = values[:, 3].tolist()
         return FlatSample(values[0, :3], values[1, :3], values[2, :3], values[3, :3], values[4, :3], *yaw[:3])
 
-    def values(self, t: float) -> np.ndarray:
+    def values(self, t: float) -> Array:
         """(x, y, z, yaw) and their derivatives up to the fourth, one per row, at one time [s]."""
         index, s = self.locate(t)
         return bernstein.values_at(self._tables[index], bernstein.binomials(self.degree), s)
 
-    def sample_many(self, times: np.ndarray) -> FlatSample:
+    def sample_many(self, times: Array) -> FlatSample:
         """Flat outputs at many times [s], shape (k,): every field gets the leading axis k."""
         places = [self.locate(float(t)) for t in times]
         rows = bernstein.basis(self.degree, [s for _, s in places])
         values = np.einsum("koda,ka->kod", self._tables[[i for i, _ in places]], rows)
         return FlatSample(*(values[:, order, :3] for order in range(5)), *(values[:, order, 3] for order in range(3)))
 
-    def derivative(self, t: float, order: int) -> np.ndarray:
+    def derivative(self, t: float, order: int) -> Array:
         """Derivative of any order of (x, y, z, yaw) at a time, shape (4,)."""
         index, s = self.locate(t)
         local = bernstein.derivative(self.coefficients[index], order)
-        return bernstein.evaluate(local, s) / self.durations[index] ** order
+        values: Array = bernstein.evaluate(local, s) / self.durations[index] ** order
+        return values
 
 
 @dataclass(frozen=True, slots=True)
 class StateSample:
     """Full state at one time; fields as in `SampledTrajectory` without the leading axis."""
 
-    p: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    w: np.ndarray
-    a: np.ndarray
-    dw: np.ndarray
-    rotor_thrust: np.ndarray
+    p: Array
+    q: Array
+    v: Array
+    w: Array
+    a: Array
+    dw: Array
+    rotor_thrust: Array
 
 
 @dataclass(frozen=True)
@@ -167,14 +169,14 @@ class SampledTrajectory:
         ValueError: wrong shapes, values that are not finite, or times that do not increase.
     """
 
-    times: np.ndarray
-    p: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    w: np.ndarray
-    a: np.ndarray
-    dw: np.ndarray
-    rotor_thrust: np.ndarray
+    times: Array
+    p: Array
+    q: Array
+    v: Array
+    w: Array
+    a: Array
+    dw: Array
+    rotor_thrust: Array
     start_time: float = 0.0
 
     def __post_init__(self) -> None:
@@ -200,14 +202,15 @@ class SampledTrajectory:
         k = min(max(int(np.searchsorted(self.times, t, side="right")) - 1, 0), len(self.times) - 2)
         u = float((t - self.times[k]) / (self.times[k + 1] - self.times[k]))
 
-        def between(values: np.ndarray) -> np.ndarray:
-            return (1.0 - u) * values[k] + u * values[k + 1]
+        def between(values: Array) -> Array:
+            mixed: Array = (1.0 - u) * values[k] + u * values[k + 1]
+            return mixed
 
         q = so3.quat_slerp(self.q[k], self.q[k + 1], u)
         return StateSample(between(self.p), q, between(self.v), between(self.w), between(self.a), between(self.dw),
                            between(self.rotor_thrust))
 
-    def rest_of(self, since: float, offset: np.ndarray) -> SampledTrajectory:
+    def rest_of(self, since: float, offset: Array) -> SampledTrajectory:
         """What is left of it from a sample on, moved.
 
         Args:
@@ -219,7 +222,7 @@ class SampledTrajectory:
                                  self.dw[k:], self.rotor_thrust[k:], self.start_time + float(self.times[k]))
 
 
-def rest_to_rest(p0, p1, yaw0: float, yaw1: float, duration: float, start_time: float = 0.0) -> FlatTrajectory:
+def rest_to_rest(p0: Numbers, p1: Numbers, yaw0: float, yaw1: float, duration: float, start_time: float = 0.0) -> FlatTrajectory:
     """Straight minimum-snap-like move between two hovers: degree 9, derivatives 1-4 vanish at both ends.
 
     Args:

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from perch_core import so3
+from perch_core.arrays import quaternion, vector3
 from perch_core.vehicle import Vehicle
 from perch_core.values import Transform
 
@@ -28,7 +29,7 @@ def optical_frame(camera: str) -> str:
 def fixed_frames(vehicle: Vehicle) -> tuple[Transform, ...]:
     """The frames that are fixed to the body: the IMU's and the cameras', in `base_link`, whose origin is the centre of mass."""
     imu = Transform(BASE, IMU, vehicle.imu.position, (0.0, 0.0, 0.0, 1.0))
-    cameras = (Transform(BASE, optical_frame(name), tuple(map(float, mount.p_BC)), tuple(map(float, so3.quat_from_matrix(mount.R_BC))))
+    cameras = (Transform(BASE, optical_frame(name), vector3(mount.p_BC), quaternion(so3.quat_from_matrix(mount.R_BC)))
                for name, mount in vehicle.mounts.items())
     return imu, *cameras
 

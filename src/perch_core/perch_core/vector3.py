@@ -7,47 +7,48 @@ from __future__ import annotations
 
 from math import cos, sin, sqrt
 
+from perch_core.arrays import Numbers, Quaternion, Vector3
 from perch_core.jit import compiled
 
 
 @compiled
-def dot(a, b):
+def dot(a: Numbers, b: Numbers) -> float:
     """Scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
-def cross(a, b):
+def cross(a: Numbers, b: Numbers) -> Vector3:
     """Vector product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @compiled
-def axpy(s, a, b):
+def axpy(s: float, a: Numbers, b: Numbers) -> Vector3:
     """`s a + b`."""
     return (s * a[0] + b[0], s * a[1] + b[1], s * a[2] + b[2])
 
 
 @compiled
-def scale(s, a):
+def scale(s: float, a: Numbers) -> Vector3:
     """`s a`."""
     return (s * a[0], s * a[1], s * a[2])
 
 
 @compiled
-def times(a, b):
+def times(a: Numbers, b: Numbers) -> Vector3:
     """Product by component, a diagonal matrix times a vector."""
     return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
 
 
 @compiled
-def norm(a):
+def norm(a: Numbers) -> float:
     """Euclidean length."""
     return sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 
 
 @compiled
-def limited(a, bound):
+def limited(a: Numbers, bound: float) -> Vector3:
     """The vector, shortened to a length of at most `bound`."""
     n = norm(a)
     if n > bound:
@@ -56,7 +57,7 @@ def limited(a, bound):
 
 
 @compiled
-def axes_of(q):
+def axes_of(q: Numbers) -> tuple[Vector3, Vector3, Vector3]:
     """Columns b1, b2, b3 of the rotation matrix of a unit quaternion xyzw."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     return (
@@ -67,7 +68,7 @@ def axes_of(q):
 
 
 @compiled
-def quaternion_product(a, b):
+def quaternion_product(a: Numbers, b: Numbers) -> Quaternion:
     """Hamilton product of quaternions xyzw."""
     return (
         a[3] * b[0] + b[3] * a[0] + a[1] * b[2] - a[2] * b[1],
@@ -78,7 +79,7 @@ def quaternion_product(a, b):
 
 
 @compiled
-def turned(q, phi):
+def turned(q: Numbers, phi: Numbers) -> Quaternion:
     """Unit quaternion of `q` followed by the rotation vector `phi` in the body's axes [rad]."""
     angle = norm(phi)
     k = 0.5 if angle < 1e-6 else sin(0.5 * angle) / angle
@@ -88,7 +89,7 @@ def turned(q, phi):
 
 
 @compiled
-def quaternion_of(b1, b2, b3):
+def quaternion_of(b1: Numbers, b2: Numbers, b3: Numbers) -> Quaternion:
     """Unit quaternion xyzw, w >= 0, of the rotation with columns b1, b2, b3: the best conditioned of Shepperd's forms."""
     trace = b1[0] + b2[1] + b3[2]
     if trace > 0.0:

@@ -22,7 +22,10 @@ ENTRIES = 2_000  # of a list or a mapping
 WHOLE = 2**63 - 1  # the largest whole number
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # libyaml's, where there is one, is ten times as fast
+_Safe: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's, where there is one, is ten times as fast
+
+
+class _Loader(_Safe):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}
 
 

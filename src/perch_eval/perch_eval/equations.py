@@ -7,12 +7,15 @@ or `[M:eq15]`. A tag may name several: `[P:eq3-7]`, `[M:eq2,12,13]`, `[M:alg1]`;
 
 from __future__ import annotations
 
+import argparse
 import ast
 import re
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+
+from perch_eval.revision import root
 
 TITLES = {
     "M": {"eq1": "rigid-body dynamics", "eq2": "geometric control: thrust and moment", "eq3": "piecewise polynomials",
@@ -175,9 +178,10 @@ def page(root: Path) -> str:
     return "\n".join(lines)
 
 
-def main(root: Path) -> int:
+def main() -> int:
     """Write docs/equations.md; 1 where it has an equation without the one definition that flies."""
-    (root / "docs" / "equations.md").write_text(page(root))
-    for line in (wrong := problems(root)):
+    argparse.ArgumentParser(prog="equations.py", description=__doc__, epilog="example:  python3 scripts/equations.py").parse_args()
+    (root() / "docs" / "equations.md").write_text(page(root()))
+    for line in (wrong := problems(root())):
         print(line, file=sys.stderr)
     return 1 if wrong else 0

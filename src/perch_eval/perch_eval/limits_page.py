@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
-from pathlib import Path
 
 from perch_core.component import Action, Component, Input, Service, ports
 from perch_core.isolated import WAITING_MAX
@@ -12,6 +12,7 @@ from perch_core.ros import topics
 from perch_core.ros.late_service import WAITING
 from perch_core.values import limits
 from perch_eval.in_process.parameters import COMPONENTS
+from perch_eval.revision import root
 
 _TEXT = """# What may enter
 
@@ -84,7 +85,8 @@ def _allowed(limit: object) -> str:
     return f"{limit}{each}{many}{', NaN: left to the node' if limit.optional else ''}"
 
 
-def main(root: Path) -> int:
+def main() -> int:
     """Write docs/limits.md."""
-    (root / "docs" / "limits.md").write_text(page())
+    argparse.ArgumentParser(prog="limits.py", description=__doc__, epilog="example:  python3 scripts/limits.py").parse_args()
+    (root() / "docs" / "limits.md").write_text(page())
     return 0

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from perch_core.component import Client, Component, Input, Service, Wake, ports
+from perch_core.ros.asking import connect_clients
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.intake import Intake
@@ -24,7 +25,7 @@ LOOK = 1.0  # between two looks for writers that are not heard [s]
 class ArrivalNode(ComponentNode):
     """One component, fed by its topics as they arrive."""
 
-    def __init__(self, name: str, component: type[Component], wiring: Wiring, deadline: str = "", **kwargs: Any) -> None:
+    def __init__(self, name: str, component: type[Component[Any]], wiring: Wiring, deadline: str = "", **kwargs: Any) -> None:
         """
         Args:
             name, component, wiring, kwargs: as in `ComponentNode`.
@@ -35,16 +36,16 @@ class ArrivalNode(ComponentNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._deadlines: Deadlines | None = None
         if deadline:
-            self._deadlines = Deadlines()
-            getattr(self.component, deadline).receivers.append(lambda value: self._deadlines.answered(value.stamp, time.monotonic_ns()))
+            self._deadlines = late = Deadlines()
+            getattr(self.component, deadline).receivers.append(lambda value: late.answered(value.stamp, time.monotonic_ns()))
 
     def connect(self) -> None:
-        """Take the inputs, offer the services. All nodes of the process are there by now."""
-        for port in ports(type(self.component), Input):
-            self._intake.add(port)
-        for port in ports(type(self.component), Wake):
-            self._wake(port)
-        self.connect_clients(self._deliver_answer)
+        """As in `ComponentNode`."""
+        for given in ports(type(self.component), Input):
+            self._intake.add(given)
+        for wake in ports(type(self.component), Wake):
+            self._wake(wake)
+        connect_clients(self, self.component, self._deliver_answer)
         self.serve()
         if self._intake.private:
             self.create_timer(LOOK, self._look_for_strangers, clock=self._steady)
@@ -62,13 +63,13 @@ class ArrivalNode(ComponentNode):
     def _look_for_strangers(self) -> None:
         """Topics of neighbours are handed on in the process: whoever else publishes them is not heard, and is named once."""
         for topic in sorted(self._intake.private):
-            writer = self.wiring.writer(topic)
+            writer = self.wiring.writer(topic) or ""
             for stranger in foreign_writers(self, topic, {writer}):
                 self.warn_once(f"{topic}: {stranger} publishes it, too, and is ignored: {writer} does in this process")
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
-    def request(self, port: Service, request: Any, reply: Callable[[Any], None]) -> None:
+    def request(self, port: Service[Any, Any], request: Any, reply: Callable[[Any], None]) -> None:
         """As it comes."""
         self.wiring.enter(self.guarded, port.name, port.handler(self.component), request, reply)
 
@@ -76,7 +77,7 @@ class ArrivalNode(ComponentNode):
         """As it comes."""
         self.wiring.enter(self.guarded, port.name, self.begin_goal, port, goal)
 
-    def _deliver_answer(self, port: Client, answer: Any) -> None:
+    def _deliver_answer(self, port: Client[Any, Any], answer: Any) -> None:
         self.wiring.enter(self.guarded, port.name, port.handler(self.component), answer)
 
     # -- people ------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import importlib
 import struct
 from collections.abc import Iterator
 from functools import lru_cache
+from typing import Any
 
 from perch_core.errors import PerchError
 from rosidl_parser.definition import AbstractString, Array, BasicType, NamespacedType
@@ -63,7 +64,7 @@ class Layout:
                 break
         return struct.Struct(form)
 
-    def unpack(self, data: bytes) -> list:
+    def unpack(self, data: bytes) -> list[Any]:
         """The content of a serialised message.
 
         Raises:
@@ -84,7 +85,8 @@ class Layout:
 
     def pack(self, *content: float | str | bytes) -> bytes:
         """A serialised message."""
-        values, lengths = [_LITTLE_ENDIAN, *content], []
+        values: list[Any] = [_LITTLE_ENDIAN, *content]
+        lengths = []
         for place in self._lengths:
             text = values[place].encode()
             lengths.append(len(text) + 1)
@@ -92,7 +94,7 @@ class Layout:
         return self._form(*lengths).pack(*values)
 
 
-def _fields(message: type) -> Iterator[tuple[str, int]]:
+def _fields(message: Any) -> Iterator[tuple[str, int]]:
     for slot in message.SLOT_TYPES:
         yield from _kinds(slot)
 

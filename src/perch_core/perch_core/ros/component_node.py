@@ -16,7 +16,7 @@ from typing import Any
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # one core per node, and the same sums in every flight; before numpy is imported
 
-from perch_core.component import Action, Client, Component, Diagnostics, Emitter, Job, LogLine, Output, Service, Unavailable, ports
+from perch_core.component import Action, Component, Diagnostics, Emitter, LogLine, Output, Service, ports
 from perch_core.errors import ConfigError, PerchError
 from perch_core.ros import topics
 from perch_core.ros.deadlines import durations_us
@@ -38,8 +38,6 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 LOUD = ("log", "diagnostics")  # outputs that are no topics of their own
 FEW = 300                      # calls whose durations are kept
 MOST_SAID = 100                # kinds of lines whose times are kept
-DISCOVERY = 5.0                # a node that has just been started may not have found the service that it asks yet [s]
-LOOK = 0.02                    # between two looks for it [s]
 HEARTBEAT = 1.0                # a node whose component has nothing to report says all the same so often that it is there [s]
 LONGEST = 300                  # characters of a line that is no error of this program
 _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
@@ -48,7 +46,7 @@ _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
 class ComponentNode(Node):
     """A component and its topics. Subclasses bring its inputs to it."""
 
-    def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
+    def __init__(self, name: str, component: type[Component[Any]], wiring: Wiring, **kwargs: Any) -> None:
         """
         Args:
             name: of the node.
@@ -67,7 +65,6 @@ class ComponentNode(Node):
         self._warned: set[str] = set()
         self._failures = 0
         self._goals: dict[str, ServedGoal] = {}
-        self._jobs: Jobs | None = None
         try:
             self._typed = Parameters(self, component.config_type, component.changeable, self._reconfigure)
             self.component = component(self._typed.value)
@@ -77,7 +74,7 @@ class ComponentNode(Node):
         if hasattr(self.component, "resolve"):
             self.component.resolve = self.resolve_topic_name
         self._jobs = Jobs(lambda work, *arguments: wiring.from_thread(self.guarded, "job", work, *arguments), self.component.preload())
-        self.component.work = self._work
+        self.component.work = self._jobs.submit
         self.component.log.receivers.append(self._log)
         self._diagnostics = self.create_publisher(topics.message_type("/diagnostics"), "/diagnostics", topics.topic("/diagnostics").qos.publish)
         self.component.diagnostics.receivers.append(self._publish_diagnostics)
@@ -132,7 +129,7 @@ class ComponentNode(Node):
     def _emitted(self, topic: str, publication: Publication) -> Callable[[Any], None]:
         return partial(self.wiring.emit, topic, publication)
 
-    def _asked(self, emitter: Emitter, topic: str, publication: Publication) -> Callable[[], bool]:
+    def _asked(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
         """Who takes values beside this host, a neighbour, or somebody outside."""
         return lambda: len(emitter.receivers) > 1 or self.wiring.read_here(topic) or publication.heard()
 
@@ -141,12 +138,12 @@ class ComponentNode(Node):
     def serve(self) -> None:
         """Offer the component's services and actions, when requests can be handled."""
         self._jobs.wait_ready()
-        for port in ports(type(self.component), Service):
-            self._serve(port)
-        for port in ports(type(self.component), Action):
-            self._take_goals(port)
+        for service in ports(type(self.component), Service):
+            self._serve(service)
+        for action in ports(type(self.component), Action):
+            self._take_goals(action)
 
-    def _serve(self, port: Service) -> None:
+    def _serve(self, port: Service[Any, Any]) -> None:
         channel = port.channel(self.component)
         row = topics.service(channel)
 
@@ -192,7 +189,7 @@ class ComponentNode(Node):
             self.get_logger().warning(f"{port.name}: goal rejected: {why}")
             goal.reject(why)
 
-    def request(self, port: Service, request: Any, reply: Callable[[Any], None]) -> None:
+    def request(self, port: Service[Any, Any], request: Any, reply: Callable[[Any], None]) -> None:
         """Bring a request to the component."""
         raise NotImplementedError
 
@@ -200,42 +197,9 @@ class ComponentNode(Node):
         """Bring a goal to the component."""
         raise NotImplementedError
 
-    def connect_clients(self, deliver: Callable[[Client, Any], None]) -> None:
-        """Make the component's clients; `deliver(port, answer)` takes each answer on the executor's thread."""
-        for port in ports(type(self.component), Client):
-            row = topics.service(port.channel(self.component))
-            client = self.create_client(row.type, port.channel(self.component))
-            setattr(self.component, port.name, self._asker(port, row, client, deliver))
-
-    def _asker(self, port: Client, row: topics.ServiceRow, client: Any, deliver: Callable[[Client, Any], None]) -> Callable[[Any, int], None]:
-        def send(request: Any) -> None:
-            future = client.call_async(row.request_message(request))
-            future.add_done_callback(lambda done: deliver(port, _answer(row, done)))
-
-        def ask(request: Any, due: int) -> None:
-            if client.service_is_ready():
-                send(request)
-                return
-            end = time.monotonic() + DISCOVERY
-
-            def look() -> None:
-                ready = client.service_is_ready()
-                if not ready and time.monotonic() < end:
-                    return
-                self.destroy_timer(timer)
-                if ready:
-                    send(request)
-                else:
-                    deliver(port, Unavailable(f"service {client.srv_name} is not there"))
-
-            timer = self.create_timer(LOOK, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-        return ask
-
-    # -- jobs --------------------------------------------------------------------------------------------------------
-
-    def _work(self, job: Job) -> None:
-        self._jobs.submit(job)
+    def connect(self) -> None:
+        """Take the inputs, offer the services. All nodes of the process are there by now."""
+        raise NotImplementedError
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
@@ -318,17 +282,5 @@ class ComponentNode(Node):
 
     def close(self) -> None:
         """Free what the component and its jobs hold."""
-        if self._jobs is not None:
-            self._jobs.close()
+        self._jobs.close()
         self.component.close()
-
-
-def _answer(row: topics.ServiceRow, future: Any) -> Any:
-    """The value of a finished call."""
-    response = future.result()
-    if response is None:
-        return Unavailable(f"{row.channel} failed: {future.exception()}")
-    try:
-        return row.answer_value(response)
-    except PerchError as error:
-        return Unavailable(f"{row.channel} answered nonsense: {error}")

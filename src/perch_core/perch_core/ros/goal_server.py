@@ -57,7 +57,7 @@ class ServedGoal:
     @property
     def cancel_requested(self) -> bool:
         """Whoever sent it wants it to end."""
-        return self._handle.is_cancel_requested
+        return bool(self._handle.is_cancel_requested)
 
     def feedback(self, value: Any) -> None:
         """Tell whoever sent it how it goes."""

@@ -32,7 +32,7 @@ class Intake:
         self._lazy: list[tuple[Subscription, Callable[[bytes], None]]] = []
         self.private: set[str] = set()
 
-    def add(self, port: Input) -> None:
+    def add(self, port: Input[Any]) -> None:
         """Take an input from its topic."""
         node, channel = self._node, port.channel(self._node.component)
         try:
@@ -47,6 +47,7 @@ class Intake:
             self._wiring.add_reader(resolved, self._local(port, row, channel, resolved, handler))
             return
         profile = row.qos.subscribe
+        receive: Callable[[bytes], None]
         if port.value is Serialized:
             receive, profile = partial(self._receive_raw, row, resolved, handler), qos.kept(row.qos)
         else:
@@ -71,7 +72,7 @@ class Intake:
                     receive(taken[0])
 
     @staticmethod
-    def _local(port: Input, row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _local(port: Input[Any], row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None]) -> Callable[[Any], None]:
         if port.value is not Serialized:
             return handler
         return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 from perch_core.component import Job
 from perch_core.errors import PerchError
@@ -44,7 +45,7 @@ class Jobs:
             future = self._thread.submit(job.function, *job.arguments)
         future.add_done_callback(lambda done: self._done(job, done))
 
-    def _done(self, job: Job, future: Future) -> None:
+    def _done(self, job: Job, future: Future[Any]) -> None:
         if future.cancelled():
             return
         error = future.exception()

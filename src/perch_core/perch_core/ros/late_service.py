@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -30,7 +30,7 @@ class LateService:
         """
         self._take = take
         self._requests: dict[int, Any] = {}  # by the identity of the empty response that stands for the answer
-        self._service = node.create_service(srv_type, name, self._receive, qos_profile=QoSProfile(depth=WAITING))
+        self._service = cast(Any, node.create_service(srv_type, name, self._receive, qos_profile=QoSProfile(depth=WAITING)))
         self._send = self._service.send_response
         self._service.send_response = self._keep_header
 

@@ -21,6 +21,7 @@ from perch_core.ros.arrival import ArrivalNode
 from perch_core.ros.priority import priority
 from perch_core.ros.wiring import Wiring
 from rclpy.clock import Clock, ClockType
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -43,10 +44,10 @@ class NodeOf:
     """
 
     name: str
-    component: type[Component]
+    component: type[Component[Any]]
     deadline: str = ""
     lockstep: str = LOCKSTEP
-    choose: Callable[[str], type[Component]] | None = None
+    choose: Callable[[str], type[Component[Any]]] | None = None
 
     def create(self, wiring: Wiring | None = None, **kwargs: Any) -> ComponentNode:
         """The node, of the host that the parameter `lockstep` asks for. `kwargs` go to `rclpy.node.Node`.
@@ -58,7 +59,8 @@ class NodeOf:
             wiring = wiring or Wiring()
             component = self.choose(given["type"]) if self.choose is not None and "type" in given else self.component
             if given.get("lockstep"):
-                return resolved(self.lockstep)(self.name, component, wiring, **kwargs)
+                lockstep: type[ComponentNode] = resolved(self.lockstep)
+                return lockstep(self.name, component, wiring, **kwargs)
             return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
 
     def main(self) -> None:
@@ -66,8 +68,8 @@ class NodeOf:
         run(lambda wiring: [self.create(wiring)], None)
 
 
-def node(name: str, component: type[Component], deadline: str = "", lockstep: str = LOCKSTEP,
-         choose: Callable[[str], type[Component]] | None = None) -> NodeOf:
+def node(name: str, component: type[Component[Any]], deadline: str = "", lockstep: str = LOCKSTEP,
+         choose: Callable[[str], type[Component[Any]]] | None = None) -> NodeOf:
     """A node file is `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
     return NodeOf(name, component, deadline, lockstep, choose)
 
@@ -113,7 +115,7 @@ class StopSignal:
         return self._set
 
 
-def spin_until_stopped(executor: EventsExecutor, stop: StopSignal) -> None:
+def spin_until_stopped(executor: Executor, stop: StopSignal) -> None:
     """Run callbacks until the signal.
 
     EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6, and spin_once() starts anew for every message, which
@@ -141,7 +143,7 @@ def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
         one.wiring.run_on(executor)
 
 
-def close_nodes(nodes: Sequence[Node]) -> None:
+def close_nodes(nodes: Sequence[ComponentNode]) -> None:
     """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
     with ExitStack() as endings:
         for one in nodes:

@@ -7,7 +7,7 @@ import typing
 from array import array
 from collections.abc import Callable
 from dataclasses import Field, fields, is_dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from perch_core import config
 from perch_core.errors import ConfigError
@@ -15,19 +15,22 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 HOST = "lockstep"  # parameters of the host, beside the component's own
 _FOREIGN = ("use_sim_time", "start_type_description_service", "qos_overrides.", HOST)
 
 
-def _leaves(cls: type, prefix: str = "") -> dict[str, tuple[Field, Any]]:
+def _leaves(cls: type[DataclassInstance], prefix: str = "") -> dict[str, tuple[Field[Any], Any]]:
     """Dotted name -> field and type of every parameter of a configuration class."""
     hints = typing.get_type_hints(cls)
-    out: dict[str, tuple[Field, Any]] = {}
+    out: dict[str, tuple[Field[Any], Any]] = {}
     for item in fields(cls):
         name, kind = f"{prefix}{item.name}", hints[item.name]
-        if is_dataclass(kind):
+        if isinstance(kind, type) and is_dataclass(kind):
             out.update(_leaves(kind, f"{name}."))
         else:
             out[name] = item, kind
@@ -50,13 +53,14 @@ def _numeric(kind: Any) -> bool:
     return kind in (float, int) or any(map(_numeric, typing.get_args(kind)))
 
 
-def descriptor(item: Field, kind: Any, read_only: bool) -> ParameterDescriptor:
+def descriptor(item: Field[Any], kind: Any, read_only: bool) -> ParameterDescriptor:
     """What `ros2 param describe` shows: meaning, unit, range, options.
 
     Ranges of lists stand in the description only: ROS has none for them. An exclusive bound becomes the next number above it.
     """
     meta = item.metadata
-    low, high, above = (meta.get(key) for key in ("low", "high", "above"))
+    bound: Callable[[str], Any] = meta.get
+    low, high, above = bound("low"), bound("high"), bound("above")
     optional = type(None) in typing.get_args(kind)
     out = ParameterDescriptor(description=meta.get("doc", ""), read_only=read_only, dynamic_typing=optional)
     unit = f"[{meta['unit']}]" if meta.get("unit") else ""

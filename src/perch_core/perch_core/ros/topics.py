@@ -57,7 +57,7 @@ class Topic:
         """
 
     channel: str
-    message: type
+    message: Any
     qos: Qos
     to_message: Convert
     to_value: Convert
@@ -80,7 +80,7 @@ class Topic:
     @property
     def latched(self) -> bool:
         """Whether who comes late gets messages that were published before."""
-        return self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        return bool(self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 TOPICS = (
@@ -122,6 +122,10 @@ TOPICS = (
 )
 
 
+def _no_client(_: Any) -> Any:
+    raise PerchError("nobody here asks for this service")
+
+
 @dataclass(frozen=True)
 class ServiceRow:
     """A service: its type; server: request to value, answer to message; client: request to message, answer to value."""
@@ -130,8 +134,8 @@ class ServiceRow:
     type: Any
     request_value: Convert
     answer_message: Convert
-    request_message: Convert | None = None
-    answer_value: Convert | None = None
+    request_message: Convert = _no_client
+    answer_value: Convert = _no_client
 
 
 SERVICES = (
@@ -193,7 +197,7 @@ def action(channel: str) -> ActionRow:
     return next(row for row in ACTIONS if row.channel == channel)
 
 
-def message_type(channel: str) -> type:
+def message_type(channel: str) -> Any:
     """Type of a channel's messages."""
     return topic(channel).message
 
@@ -222,11 +226,11 @@ def decode(channel: str, data: bytes) -> Any:
 _BEGIN = struct.Struct("<iI")  # of a stamp, after four bytes of encapsulation
 
 
-def stamp_of(message: type, data: bytes) -> int:
+def stamp_of(message: Any, data: bytes) -> int:
     """Stamp of a serialised message that begins with a header, or is a clock [ns]; 0 for others."""
     if message is Clock or "header" in message.get_fields_and_field_types():
         sec, nanosec = _BEGIN.unpack_from(data, 4)
-        return sec * NANOSECONDS + nanosec
+        return int(sec * NANOSECONDS + nanosec)
     return 0
 
 

@@ -7,6 +7,7 @@ frames, where the vehicle is) or on a vehicle is judged by who knows that. docs/
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot, inf, isfinite, pi
 from typing import Any
@@ -300,7 +301,7 @@ def _motors(command: MotorCommand) -> bool:
     return 0.0 <= a <= 1e4 and 0.0 <= b <= 1e4 and 0.0 <= c <= 1e4 and 0.0 <= d <= 1e4
 
 
-def _below(v: tuple[float, float, float], square: float) -> bool:
+def _below(v: tuple[float, ...], square: float) -> bool:
     return v[0] * v[0] + v[1] * v[1] + v[2] * v[2] < square
 
 
@@ -309,5 +310,5 @@ def _variances(covariance: np.ndarray) -> bool:
     return len(entries) == 36 and hypot(*entries) < VARIANCE_MAX and min(entries[::7]) >= 0.0
 
 
-_QUICK = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors}
+_QUICK: dict[type, Callable[[Any], bool]] = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors}
 """Shorter ways to the answer that all is well, a microsecond or two each."""

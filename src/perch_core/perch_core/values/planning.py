@@ -108,7 +108,7 @@ class PerchPlan:
     success: bool
     error_code: int = 0
     message: str = ""
-    trajectory: FlatTrajectory | None = None
+    trajectory: FlatTrajectory | SampledTrajectory | None = None
     contact_time: float = 0.0
     certificates: tuple[Certificate, ...] = ()
     iterations: int = 0
@@ -163,7 +163,7 @@ class PowerlinePlan:
     success: bool
     error_code: int = 0
     message: str = ""
-    trajectory: SampledTrajectory | None = None
+    trajectory: FlatTrajectory | SampledTrajectory | None = None
     at_end: int = 0
     contact_time: float = 0.0
     recovery_start: float = -1.0

@@ -56,12 +56,11 @@ class Msckf:
         self.sliding = Sliding(config.filter, focal_length)
         self._gate = ekf.Gate(config.filter.gate_probability)
         self._used: set[int] = set()  # features whose information is in the state already
-        self.w_WB_B = np.zeros(3)
 
     def propagate(self, rows: np.ndarray, stamp: int) -> None:
         """Move the inertial state along IMU steps (m, 9) to a stamp [ns]."""
         if len(rows):
-            self.w_WB_B = propagate(self.state, rows, self.config.imu)
+            propagate(self.state, rows, self.config.imu)
         self.state.stamp = stamp
 
     def add_frame(self, frame: int, ids: np.ndarray, bearings: Bearings) -> FrameReport:
@@ -73,7 +72,7 @@ class Msckf:
             bearings: their bearings.
         """
         report, s = FrameReport(), self.state
-        s.add_clone(frame, self.w_WB_B)
+        s.add_clone(frame)
         ended = {i: t for i, t in self.tracks.take_ended(ids).items() if i not in s.landmarks}
         self.tracks.observe(frame, ids, bearings)
         self._update_landmarks(report)

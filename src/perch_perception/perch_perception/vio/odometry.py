@@ -334,7 +334,7 @@ class VisualInertialOdometry:
 
     def _estimate(self) -> VioPoseEstimate:
         s = self.filter.state
-        return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), self.filter.w_WB_B.copy(), s.gyro_bias.copy(),
+        return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), s.w_WB_B.copy(), s.gyro_bias.copy(),
                                s.accel_bias.copy(), s.P[np.ix_(_INERTIAL, _INERTIAL)])
 
 

@@ -14,12 +14,8 @@ from perch_perception.vio.state import State
 _G = np.array([0.0, 0.0, -GRAVITY])
 
 
-def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> np.ndarray:
-    """Move the inertial part of a state along IMU steps (m, 9), m > 0; its stamp is left to the caller.
-
-    Returns:
-        Angular velocity in B at the end, bias removed [rad/s], shape (3,).
-    """
+def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> None:
+    """Move the inertial part of a state along IMU steps (m, 9), m > 0; its stamp is left to the caller."""
     pre = preintegrate(rows, s.gyro_bias, s.accel_bias)
     T, R = pre.duration, s.R_WB
     p = s.p_WB + s.v_WB * T + 0.5 * _G * T * T + R @ pre.dp
@@ -44,8 +40,7 @@ def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> np.ndarray:
     P[12 + d, 12 + d] += imu.accel_bias_walk**2 * T
     P[:n, n:] = Phi @ P[:n, n:]
     P[n:, :n] = P[:n, n:].T
-    s.p_WB, s.v_WB, s.R_WB = p, v, _orthonormal(R_end)
-    return pre.w_end
+    s.p_WB, s.v_WB, s.R_WB, s.w_WB_B = p, v, _orthonormal(R_end), pre.w_end
 
 
 def _orthonormal(R: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
     """
     s, imu = filter.state, filter.config.imu
     T = float(steps[:, DT].sum())
-    s.v_WB = np.zeros(3)
+    s.v_WB, s.w_WB_B = np.zeros(3), np.zeros(3)
     s.P[at.VELOCITY, :] = s.P[:, at.VELOCITY] = 0.0
     s.P[at.VELOCITY, at.VELOCITY] = filter.config.rest.velocity**2 * np.eye(3)
     s.P[_BIASES, _BIASES] += np.repeat([imu.gyro_bias_walk**2 * T, imu.accel_bias_walk**2 * T], 3)

@@ -58,7 +58,7 @@ class Landmark:
 
 @dataclass
 class State:
-    """Owned by one `Msckf`; every change goes through it."""
+    """Owned by one `Msckf`; every change goes through it. `w_WB_B` is the newest angular velocity, bias removed [rad/s], shape (3,)."""
 
     stamp: int
     R_WB: np.ndarray
@@ -70,6 +70,7 @@ class State:
     p_BC: np.ndarray
     time_offset: float
     P: np.ndarray
+    w_WB_B: np.ndarray = field(default_factory=lambda: np.zeros(3))
     clones: list[Clone] = field(default_factory=list)
     landmarks: dict[int, Landmark] = field(default_factory=dict)
 
@@ -102,14 +103,14 @@ class State:
 
         The direction of a scale (`scale_error`) moves with the estimate as well, and is carried along.
         """
-        metric = self._metric()
+        direction = self.scale_direction()
         carry = self._move(dx)
         P = carry(np.ascontiguousarray(carry(self.P).T))
         self.P = 0.5 * (P + P.T)
         scale = self.scale_error()
         if scale is not None:
-            carried = carry(metric[:, None])[:, 0]
-            self.carry_scale(self._metric() - carried, scale / (scale @ carried))
+            carried = carry(direction[:, None])[:, 0]
+            self.P = _gone_along(self.P, self.scale_direction() - carried, scale / (scale @ carried))
 
     def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Move all estimates; returns what carries errors along, rows (size, n) to rows."""
@@ -128,6 +129,7 @@ class State:
         for clone, R_WB, step in zip(self.clones, R[1:], steps[1:]):
             clone.R_WB, clone.p_WB = R_WB, clone.p_WB + step[3:]
         self.gyro_bias = self.gyro_bias + dx[GYRO_BIAS]
+        self.w_WB_B = self.w_WB_B - dx[GYRO_BIAS]
         self.accel_bias = self.accel_bias + dx[ACCEL_BIAS]
         self.R_BC = self.R_BC @ E_BC
         self.p_BC = self.p_BC + dx[CAMERA_POSITION]
@@ -152,32 +154,31 @@ class State:
         return camera_frame.see(self.R_WB, self.p_WB, self.R_BC, self.p_BC, X_W)
 
     def scale_error(self) -> np.ndarray | None:
-        """What all lengths are relatively too short by, s = scale^T dx: the mean over the landmarks of d ln |X - p|.
+        """What all lengths are relatively too short by, s = scale^T dx: the mean over the landmarks of d ln |X_C|.
 
-        Vision alone does not see it: N_s = (.. p_k - p, v, X - p ..), scale^T N_s = 1. It is blind to position and yaw.
+        A camera alone does not see a scale of its own path c = p + R p_BC and of the points, N_s = (.. c_k, v + R (w x p_BC), X ..),
+        scale^T N_s = 1 but for the origin. A scale of the body's path it sees as soon as it is not in the body's centre, by p_BC / |X_C|.
+        It is blind to position and yaw.
 
         Returns:
             Shape (size,); None with fewer than three landmarks.
         """
         if len(self.landmarks) < 3:
             return None
-        rays = np.array([m.X_W for m in self.landmarks.values()]) - self.p_WB
-        part = rays / (rays**2).sum(axis=1, keepdims=True) / len(rays)
+        seen = self._see(np.array([m.X_W for m in self.landmarks.values()]))
+        by_X_C = seen.X_C / (seen.X_C**2).sum(axis=1, keepdims=True) / len(seen.X_C)
         out = np.zeros(self.size)
-        out[self.landmark_start :], out[POSITION] = part.ravel(), -part.sum(axis=0)
+        out[_CAMERA] = np.einsum("mi,mij->j", by_X_C, seen.by_camera)
+        out[self.landmark_start :] = (by_X_C @ seen.R_CW).ravel()
         return out
 
-    def carry_scale(self, direction: np.ndarray, scale: np.ndarray) -> None:
-        """Let what a wrong scale does to the state go by `direction`, shape (size,): dx := dx + direction (scale^T dx)."""
-        self.P = _gone_along(self.P, direction, scale)
-
-    def _metric(self) -> np.ndarray:
-        """All that a scale stretches: positions, velocity and points, shape (size,)."""
+    def scale_direction(self) -> np.ndarray:
+        """What a scale of the camera's path and of the points does to the state (`scale_error`), shape (size,)."""
         out = np.zeros(self.size)
-        out[POSITION], out[VELOCITY] = self.p_WB, self.v_WB
-        poses = out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE)
-        for pose, clone in zip(poses, self.clones):
-            pose[3:] = clone.p_WB
+        out[POSITION] = self.p_WB + self.R_WB @ self.p_BC
+        out[VELOCITY] = self.v_WB + self.R_WB @ np.cross(self.w_WB_B, self.p_BC)
+        for pose, clone in zip(out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE), self.clones):
+            pose[3:] = clone.p_WB + clone.R_WB @ self.p_BC
         if self.landmarks:
             out[self.landmark_start :] = np.concatenate([m.X_W for m in self.landmarks.values()])
         return out
@@ -202,20 +203,19 @@ class State:
         self.P = np.block([[self.P, moved.T], [moved, own]])
         self.landmarks[number] = Landmark(X_W)
 
-    def add_clone(self, frame: int, w_WB_B: np.ndarray) -> None:
+    def add_clone(self, frame: int) -> None:
         """Copy the present pose into the window.
 
         The pose belongs to stamp + time_offset: an error of the offset moves it along the motion, so that tracks tell
         the offset.
 
         Args:
-            frame: number of the frame.
-            w_WB_B: angular velocity in B [rad/s], shape (3,).
+            frame: its number.
         """
         n, at = self.size, self.landmark_start
         J = np.zeros((CLONE_SIZE, n))
         J[:3, THETA] = J[3:, POSITION] = np.eye(3)
-        J[:3, TIME_OFFSET], J[3:, TIME_OFFSET] = w_WB_B, self.v_WB
+        J[:3, TIME_OFFSET], J[3:, TIME_OFFSET] = self.w_WB_B, self.v_WB
         JP = J @ self.P
         P, before, new, after = np.empty((n + 6, n + 6)), slice(0, at), slice(at, at + 6), slice(at + 6, n + 6)
         for rows, old in ((before, slice(0, at)), (after, slice(at, n))):

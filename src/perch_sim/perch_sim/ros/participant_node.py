@@ -17,6 +17,7 @@ from typing import Any
 from perch_core.component import Client, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
+from perch_core.ros.asking import connect_clients
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
@@ -62,7 +63,7 @@ class ParticipantNode(ComponentNode):
     def connect(self) -> None:
         """Join the vehicle of this process, or greet that of another."""
         asks = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
-        self.connect_clients(self._deliver_answer)
+        connect_clients(self, self.component, self._deliver_answer)
         self._asking = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
         for port in self._client_ports():  # the participant's own, which keep the time of answers
             setattr(self.component, port.name, asks[port.channel(self.component)])

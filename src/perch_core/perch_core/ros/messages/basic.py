@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import Header
 
+from perch_core.arrays import Numbers
 from perch_core.values import NANOSECONDS
 
 
@@ -20,7 +19,7 @@ def to_stamp(time: int | float) -> Time:
 
 def stamp_value(stamp: Time) -> int:
     """Stamp in whole nanoseconds."""
-    return stamp.sec * NANOSECONDS + stamp.nanosec
+    return int(stamp.sec * NANOSECONDS + stamp.nanosec)
 
 
 def header(stamp: int, frame: str) -> Header:
@@ -38,22 +37,22 @@ def quaternion_floats(q: Quaternion) -> tuple[float, float, float, float]:
     return (q.x, q.y, q.z, q.w)
 
 
-def to_vector(v: Sequence[float]) -> Vector3:
+def to_vector(v: Numbers) -> Vector3:
     """3 numbers as a vector."""
     return Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))
 
 
-def to_point(p: Sequence[float]) -> Point:
+def to_point(p: Numbers) -> Point:
     """3 numbers as a point."""
     return Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))
 
 
-def to_quaternion(q: Sequence[float]) -> Quaternion:
+def to_quaternion(q: Numbers) -> Quaternion:
     """4 numbers, xyzw, as a quaternion."""
     return Quaternion(x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
 
 
-def to_pose(p: Sequence[float], q: Sequence[float]) -> Pose:
+def to_pose(p: Numbers, q: Numbers) -> Pose:
     """Position and quaternion xyzw as a pose."""
     return Pose(position=to_point(p), orientation=to_quaternion(q))
 
@@ -63,6 +62,6 @@ def flat(matrix: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(matrix, dtype=float).ravel()
 
 
-def square(values: Sequence[float], n: int) -> np.ndarray:
+def square(values: Numbers, n: int) -> np.ndarray:
     """`n` * `n` numbers, row by row, as a matrix."""
     return np.array(values, dtype=float).reshape(n, n)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Point, Pose, Vector3
 from perch_core.ros.messages.basic import floats, quaternion_floats, stamp_value, to_point, to_pose, to_stamp, to_vector
 from perch_core.ros.messages.flight import trajectory_message, trajectory_value
 from perch_core.ros.messages.perching import powerline_message, powerline_value
@@ -16,7 +16,7 @@ from perch_msgs.srv import PlanPerch, PlanPowerline
 OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
 
 
-def _array(v) -> np.ndarray:
+def _array(v: Vector3 | Point) -> np.ndarray:
     return np.array(floats(v))
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from perch_core.ros import qos
 from perch_core.ros.messages.sensing import stamped_transform_message, stamped_transform_value, transform_message, transform_value
 from tf2_msgs.msg import TFMessage
 
+if TYPE_CHECKING:
+    from perch_core.ros.topics import Topic
 
-def topics() -> tuple:
+
+def topics() -> tuple[Topic, ...]:
     """The rows of `/tf` and `/tf_static`: one transform per value."""
     from perch_core.ros.topics import Topic
 
