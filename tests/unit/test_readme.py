@@ -74,7 +74,7 @@ def test_commands_are_accepted(command, monkeypatch):
         script.command_line().parse_args(arguments)
         return
     if not hasattr(script, "main"):  # it is that of a module
-        (module,) = re.findall(r'run\("([\w.]+)"\)', (ROOT / path).read_text())
+        (module,) = re.findall(r'run\("([\w.]+)"', (ROOT / path).read_text())
         assert callable(importlib.import_module(module).main)
         return
     monkeypatch.setattr(script, "enter", stop_at_the_door)
