@@ -25,7 +25,8 @@ def main() -> int:
         description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--clean", action="store_true", help="remove .venv, build and install first")
-    parser.add_argument("--extra", action="append", default=[], choices=EXTRAS, help="packages that are otherwise installed by the script that needs them; repeatable")
+    parser.add_argument("--extra", action="append", default=[], choices=EXTRAS,
+                        help="packages that are otherwise installed by the script that needs them; repeatable")
     parser.add_argument("--all", action="store_true", help="all of these")
     arguments = parser.parse_args()
     try:
