@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
+from perch_core.camera import Camera, CameraMount, EquidistantCamera, PinholeCamera
 from perch_core.config import LARGEST, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import extended_mapping
@@ -48,10 +48,8 @@ class CameraConfig:
 
     def mount(self, name: str) -> CameraMount:
         """The camera with its place on the body."""
-        common = dict(width=self.width, height=self.height, fx=self.focal[0], fy=self.focal[1],
-                      cx=self.centre[0], cy=self.centre[1])
-        camera = (EquidistantCamera(**common, coefficients=self.distortion) if self.model == "equidistant"
-                  else PinholeCamera(**common))
+        common = self.width, self.height, *self.focal, *self.centre
+        camera: Camera = EquidistantCamera(*common, coefficients=self.distortion) if self.model == "equidistant" else PinholeCamera(*common)
         return CameraMount(
             name=name, camera=camera, p_BC=np.array(self.position),
             R_BC=so3.quat_to_matrix(np.array(self.orientation) / np.linalg.norm(self.orientation)),
