@@ -135,6 +135,20 @@ def levelled(vehicle: str, axis: int, tilt: float, rate: float) -> float:
         body.loop.close()
 
 
+def held_without_wire(watched: float = 1.5) -> float:
+    """How long the firmware goes on turning the body as it was told last, from when the wire is cut, at most `watched` [s]."""
+    body = Body(load_vehicle(SCENARIO.vehicle))
+    try:
+        body.hover()
+        body.found(np.array([1.0, 0.0, 0.0]), 0.0, 2.0)
+        begin, body.loop.severed = body.time, True
+        while body.plant.w[0] > 1.0 and body.time < begin + watched:
+            body.step(True, (2.0, 0.0, 0.0))
+        return body.time - begin
+    finally:
+        body.loop.close()
+
+
 def taken_over(at: float) -> float:
     """From the pilot's switch to the first cycle in which the motors stand, as his arming switch is off [s]."""
     loop, kept = begun()
@@ -175,5 +189,6 @@ def figures(quick: bool) -> list[Figure]:
                  for vehicle in (SCENARIO.vehicle, "rpg_betaflight") for axis in ((1,) if quick else (0, 1))]
         out.append(figure(f"level within {LEVEL:g} deg, from {tilt:g} deg and {rate:g} rad/s", "s", times, 0.3, "max <="))
     out.append(figure("descent or motors off", "s", [one.down for one in long if np.isfinite(one.down)], 1.0, "max <="))
+    out.append(figure("last command held by the firmware, wire cut", "s", [held_without_wire()], 0.05, "max <="))
     out.append(figure("pilot takes over", "s", [taken_over(at) for name, at in when.items() if name != "perched"], 0.05, "max <="))
     return out

@@ -20,8 +20,8 @@ exit code: 0 nothing found, 1 something found, 2 wrong arguments"""
 
 
 def main() -> int:
-    """Hunt inputs of one kind; the kinds are the modules of perch_eval.fuzz."""
-    kinds = sorted(path.stem for path in (ROOT / "src" / "perch_eval" / "perch_eval" / "fuzz").glob("*.py") if "\ndef run(" in path.read_text())
+    """Hunt inputs of one kind; the kinds are modules of tests/fuzzing."""
+    kinds = sorted(path.stem for path in (ROOT / "tests" / "fuzzing").glob("*.py") if "\ndef run(" in path.read_text())
     parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", choices=kinds, help="of inputs")
     parser.add_argument("--minutes", type=float, default=1.0, help="of hunting (default: %(default)g)")
@@ -32,10 +32,11 @@ def main() -> int:
     if not 0.0 < arguments.minutes <= 1e5:
         parser.error(f"--minutes {arguments.minutes} is outside (0, 100000]")
     enter()
+    sys.path.append(str(ROOT / "tests"))
     with quiet_on_interrupt():
-        from perch_eval.fuzz.report import Report
+        from fuzzing.report import Report
 
-        hunt = importlib.import_module(f"perch_eval.fuzz.{arguments.kind}")
+        hunt = importlib.import_module(f"fuzzing.{arguments.kind}")
     report = Report(arguments.kind, arguments.minutes, arguments.cases)
     try:
         hunt.run(arguments.minutes, arguments.seed, report)

@@ -28,12 +28,14 @@ class KeptLoop(FirmwareLoop):
     Attributes:
         radio: the pilot's channels [us]: sticks, arming, level, hand-over to the companion computer.
         cut: commands do not reach the keeper.
+        severed: nothing reaches the firmware's serial port.
         heard: time of the last command that has reached it [s].
         aimed: what the motors aim at, (4,) [rad/s].
     """
 
     def __init__(self, vehicle: Vehicle, settings: WatchdogSettings = WatchdogSettings()) -> None:
         super().__init__(vehicle)
+        self.severed = False
         self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
         self.watchdog = Watchdog(settings, self.sticks.carrying(1.0), self.sticks.carrying(settings.descent))
         self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -44,7 +46,7 @@ class KeptLoop(FirmwareLoop):
         self.aimed = np.zeros(4)
 
     def command(self, now, armed, rates, thrust):
-        if not (self.cut or self._killed):
+        if not (self.cut or self._killed or self.severed):
             self.heard = now / NANOSECONDS
             self._node.send(b"C" + COMMAND.pack(armed, *self.sticks.channels(rates, thrust)))
 
@@ -59,6 +61,8 @@ class KeptLoop(FirmwareLoop):
 
     def channels(self, now):
         self._time = now
+        if self.severed:
+            return tuple(self.radio)
         spoken = now >= self._keeper._due
         self._keeper.work(0.0)
         if spoken:  # a frame counts from the cycle on that follows its answer

@@ -27,7 +27,7 @@ from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import OdometryState, seconds
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.in_process import Loop as FlightLoop
-from perch_eval.in_process.stand_ins import TruthEstimator
+from closed_loop.truth import TruthEstimator
 from perch_sim.lockstep import Task
 
 PERIOD = 0.002

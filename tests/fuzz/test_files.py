@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from perch_eval.fuzz.files import Nonsense, judge, kinds, mutated
+from fuzzing.files import Nonsense, judge, kinds, mutated
 
 CASES = sorted((Path(__file__).parent / "cases" / "files").glob("*.yaml"))
 FILES = [(kind, file) for kind, files in kinds().items() for file in files]

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from perch_core.values import ImuSample
-from perch_eval.fuzz import messages
-from perch_eval.fuzz.messages import Nonsense, Spoilt, drawn, hunt, play, replay
-from perch_eval.fuzz.spoiled import Way
+from fuzzing import messages
+from fuzzing.messages import Nonsense, Spoilt, drawn, hunt, play, replay
+from fuzzing.spoiled import Way
 
 CASES = sorted((Path(__file__).parent / "cases" / "messages").glob("*.json"))
 PLAYERS = [("surface", name) for name in ("estimator", "controller", "mission", "vehicle", "description", "vio_model")]

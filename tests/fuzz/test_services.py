@@ -10,9 +10,9 @@ import pytest
 from perch_core.values import PerchPlan, PerchPlanRequest, seconds
 from perch_core.vehicle import load_vehicle
 from perch_core.trajectory import rest_to_rest
-from perch_eval.fuzz.messages import Nonsense
-from perch_eval.fuzz.services import ask, good, judge_plan, replay
-from perch_eval.fuzz.spoiled import Way, in_effect, spoilt
+from fuzzing.messages import Nonsense
+from fuzzing.services import ask, good, judge_plan, replay
+from fuzzing.spoiled import Way, in_effect, spoilt
 
 CASES = sorted((Path(__file__).parent / "cases" / "services").glob("*.json"))
 

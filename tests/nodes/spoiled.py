@@ -1,5 +1,5 @@
-"""Messages that are wrong in one respect each, made from good ones: see `perch_eval.fuzz.spoiled`."""
+"""Messages that are wrong in one respect each, made from good ones: see `fuzzing.spoiled`."""
 
-from perch_eval.fuzz.spoiled import kinds
+from fuzzing.spoiled import kinds
 
 __all__ = ["kinds"]

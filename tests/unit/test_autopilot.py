@@ -7,12 +7,14 @@ import pty
 import socket
 import struct
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, msp
+from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import differences, load_configuration
 from perch_autopilot.keeper import KeeperLink
 from perch_autopilot.rates import RateCurve, Sticks, rate_curves
@@ -20,7 +22,7 @@ from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
 from perch_autopilot.wire import Wire, WireError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Battery, load_vehicle
 from scipy.spatial.transform import Rotation
 
 VEHICLE = load_vehicle("betaflight")
@@ -121,6 +123,79 @@ def test_throttle_gives_the_thrust(thrust):
     speed = VEHICLE.speed_min + share * (VEHICLE.speed_max - VEHICLE.speed_min)
     least, most = (4 * VEHICLE.thrust_coefficient * limit**2 for limit in (VEHICLE.speed_min, VEHICLE.speed_max))
     assert 4 * VEHICLE.thrust_coefficient * speed**2 == pytest.approx(min(max(thrust * VEHICLE.mass, least), most))
+
+
+@given(thrust=st.floats(5.0, 11.0), voltage=st.floats(13.0, 17.0), exponent=st.floats(0.5, 3.0))
+def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
+    battery = Battery(reference=16.0, exponent=exponent, range=(13.6, 16.8))
+    sticks = Sticks(replace(VEHICLE, actuation=replace(VEHICLE.actuation, battery=battery)), (RateCurve(400, 900, 0),) * 3)
+    full = sticks.throttle(thrust)
+    sticks.measured(voltage)
+    share = (min(max(voltage, 13.6), 16.8) / 16.0) ** exponent  # of the thrust at the same throttle
+    throttle = sticks.throttle(thrust * share)
+    assert 0.0 < throttle < 1.0 and throttle == pytest.approx(full)
+    assert sticks.fits(voltage) == (13.6 <= voltage <= 16.8)
+
+
+class Desk:
+    """In the keeper's place: an autopilot that says who it is, and which battery it has."""
+
+    voltage = 16.0
+
+    def __init__(self, address, settings, hover, descent) -> None:
+        self.throttles, self._said, self._parser, self.closed = (hover, descent), b"", msp.Parser(), False
+
+    def request(self, data: bytes) -> None:
+        known = {msp.FC_VARIANT: b"BTFL", msp.FC_VERSION: bytes((4, 6, 0)),
+                 msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * Desk.voltage))}
+        for frame in self._parser.feed(data.replace(b"$M<", b"$M>")):  # requests have the form of answers
+            self._said += answer(frame.command, known[frame.command]) if frame.command in known else b""
+
+    def receive(self, timeout: float = 0.0):
+        said, self._said = self._said, b""
+        return said, []
+
+    def carrying(self, hover: int, descent: int) -> None:
+        self.throttles = hover, descent
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def flown_on(tmp_path, monkeypatch):
+    """The node of a vehicle with a battery curve, on a desk with a voltage."""
+    monkeypatch.setattr("perch_autopilot.betaflight.KeeperLink", Desk)
+    file = tmp_path / "mine.yaml"
+    file.write_text("name: mine\nextends: betaflight\nactuation:\n  type: rates_and_thrust\n"
+                    "  battery: {reference: 16.0, exponent: 1.8, range: [13.6, 16.8]}\n")
+
+    def make(voltage: float) -> Betaflight:
+        monkeypatch.setattr(Desk, "voltage", voltage)
+        return Betaflight(BetaflightParameters(vehicle=str(file)))
+
+    return make
+
+
+@pytest.mark.parametrize("voltage", [0.0, 12.1, 22.0])
+def test_a_battery_without_a_thrust_curve_is_refused(voltage, flown_on):
+    with pytest.raises(msp.MspError, match=f"the battery has {voltage:g} V: the thrust curve of .*mine.yaml .* 13.6 to 16.8 V"):
+        flown_on(voltage)
+
+
+def test_hover_and_descent_without_commands_follow_the_battery(flown_on, monkeypatch):
+    node = flown_on(16.0)
+    full = node._link.throttles
+    assert full[0] > full[1]
+    monkeypatch.setattr(Desk, "voltage", 14.0)
+    for k in range(60):
+        node.on_poll(k * 10_000_000)
+    empty = node._link.throttles
+    assert all(now > then for now, then in zip(empty, full))
+    dog = Watchdog(WatchdogSettings(arming=0.0), *full)
+    dog.command(1.0, True, (1500, 1500, 1500, 1500))
+    dog.carrying(*empty)
+    assert (dog.channels(1.1)[2], dog.channels(1.6)[2]) == empty
 
 
 # -- axes ------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from closed_loop.kept_loop import Body
 from perch_core import config
 from perch_core.component import Output, ports
 from perch_core.values import RatesThrust
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.identification import command
 from perch_eval.in_process import fly
 from perch_sim.scenario import load_scenario
@@ -351,3 +351,27 @@ def test_the_pilot_has_the_vehicle_within_50_ms_of_his_switch(body, tilt):
     for _ in range(50):
         body.step(False)                                        # whatever the companion says
     assert VEHICLE.speed_min <= body.loop.aimed.min() and body.loop.aimed.mean() < 1.2 * VEHICLE.speed_min
+
+
+# -- what is the firmware's own ------------------------------------------------------------------------------------------
+
+def test_a_firmware_whose_wire_is_cut_holds_the_last_command(body):
+    """Why docs/howto/real_vehicle.md sends the pilot: its failsafe knows the age of the radio's frames, not of those by MSP."""
+    body.found((1, 0, 0), 0.0, 2.0)
+    last, body.loop.severed = body.time, True
+    while body.time < last + 1.0:
+        body.step(True)
+        assert body.plant.w[0] == pytest.approx(2.0, abs=0.2)
+
+
+@pytest.mark.parametrize("battery, share", [(Battery(), 0.85**2), (Battery(reference=16.0, range=(12.0, 17.0)), 1.0)])
+def test_the_thrust_stays_where_the_throttle_follows_the_battery(battery, share):
+    vehicle = replace(VEHICLE, actuation=replace(VEHICLE.actuation, battery=battery))
+    loop, level, got = started(lambda: FirmwareLoop(vehicle, 0.85)), np.r_[np.zeros(6), 1.0, np.zeros(6)], []
+    try:
+        for k in range(300):
+            loop.command(0, True, STILL, 9.81)
+            got.append(vehicle.thrust_coefficient * np.sum(loop.speeds(0, level, np.zeros(4), Reading(STILL))**2) / vehicle.mass)
+    finally:
+        loop.close()
+    assert got[-1] == pytest.approx(9.81 * share, rel=0.02)

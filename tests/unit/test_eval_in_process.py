@@ -8,7 +8,7 @@ from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval.in_process import Sensing, arrange, fly
 from perch_eval.in_process.flights import perch
-from perch_eval.in_process.stand_ins import TruthEstimator
+from closed_loop.truth import TruthEstimator
 from perch_eval.metrics import flight_metrics
 from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_sim.scenario import load_scenario

@@ -8,11 +8,11 @@ import pytest
 from perch_core import config
 from perch_core.errors import PerchError
 from perch_core.values import ImuSample, RatesThrust
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Battery, load_vehicle
 from perch_eval import loop_plots
 from perch_eval.flight import Flight
-from perch_eval.identification import command
-from perch_eval.identification.fit import identify
+from perch_eval.identification import command, page
+from perch_eval.identification.fit import Found, battery, identify
 from perch_eval.identification.record import Record, record_of
 
 VEHICLE = load_vehicle("snapdragon_rates")
@@ -138,3 +138,48 @@ def test_the_report_shows_the_loop_where_rates_are_taken(monkeypatch):
     drawn = loop_plots.inner_loop_figure(Flight({"rates_thrust_command": sent, "imu/data_raw": imu}), VEHICLE)
     assert base64.b64decode(drawn).startswith(b"\x89PNG") and len(drawn) > 20_000
     assert loop_plots.inner_loop_figure(Flight({"imu/data_raw": imu}), VEHICLE) == ""
+
+
+# -- the battery: one flight at each voltage -------------------------------------------------------------------------------
+
+VOLTAGES = (16.4, 15.6, 14.8, 14.0)
+
+
+def gains(*factors, sigma=0.004, refused=""):
+    return [Found("actuation.thrust_gain", factor, sigma, "", refused) for factor in factors]
+
+
+@pytest.mark.parametrize("flown", [0.0, 1.5])
+def test_the_exponent_of_the_battery_is_found(flown):
+    noise = 1.0 + 0.004 * np.random.default_rng(1).standard_normal(4)
+    told = gains(*(0.97 * noise * (np.array(VOLTAGES) / 16.4) ** (1.7 - flown)))
+    one = battery(VOLTAGES, told, flown)
+    assert not one.refused and abs(one.value - 1.7) < 3.0 * one.sigma and one.sigma < 0.1
+
+
+@pytest.mark.parametrize("voltages, factors, sigma, words", [
+    (VOLTAGES, (1.0, 0.93, 0.99, 0.7), 0.004, "misses the thrust"), ((16.4, 16.0), (1.0, 0.95), 0.004, "are 2 % apart"),
+    ((16.4, 16.4), (1.0, 1.0), 0.004, "apart"), (VOLTAGES, (1.0, 0.99, 1.02, 0.995), 0.004, "exponent of"),
+    (VOLTAGES, (1.0, 0.9, 0.81, 0.73), 0.2, "standard deviation")])
+def test_a_battery_curve_that_does_not_fit_is_refused(voltages, factors, sigma, words):
+    assert words in battery(voltages, gains(*factors, sigma=sigma)).refused
+
+
+def test_a_gain_that_is_not_told_leaves_the_battery_untold():
+    assert battery(VOLTAGES, gains(1.0, 0.9, 0.81, 0.73, refused="too small")).refused == "too small"
+
+
+def test_the_battery_is_written_where_the_vehicle_file_has_it(tmp_path):
+    found = [Found("actuation.thrust_gain", 0.98, 0.01, ""), battery(VOLTAGES, gains(*((np.array(VOLTAGES) / 16.4) ** 1.7)))]
+    (tmp_path / "one.yaml").write_text(page.entries(found, VEHICLE, "snapdragon_rates", "one", "a test", VOLTAGES))
+    assert load_vehicle(tmp_path / "one.yaml").actuation.battery == Battery(reference=16.4, exponent=1.7, range=(14.0, 16.4))
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["--voltage", "16"], "two and more"), (["--voltage", "16", "-3"], "two and more"), (["--voltage", "16", "14"], "has none"),
+    (["--voltage", "16", "14", "--recording", "/no/file"], "1 files, and 2 voltages")])
+def test_voltages_that_are_none_are_one_line(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", *arguments])
+    assert command.main() == 2
+    line = capsys.readouterr().err
+    assert words in line and line.count("\n") == 1

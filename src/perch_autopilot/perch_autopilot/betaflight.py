@@ -50,13 +50,12 @@ class Betaflight(Component[BetaflightParameters]):
         Raises:
             ConfigError: there is no such vehicle or configuration.
             WireError: the wire cannot be opened.
-            MspError: nobody answers, or another firmware than this was written for.
+            MspError: nobody answers, another firmware than this was written for, or a battery for which the vehicle has no thrust curve.
         """
         super().__init__(config)
         vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        hover, descent = self._sticks.carrying(1.0), self._sticks.carrying(config.watchdog.descent)
-        self._link, self._parser = KeeperLink(config.wire, config.watchdog, hover, descent), msp.Parser()
+        self._link, self._parser = KeeperLink(config.wire, config.watchdog, *self._carrying()), msp.Parser()
         try:
             self.version = self._greet()
         except BaseException:
@@ -70,15 +69,22 @@ class Betaflight(Component[BetaflightParameters]):
         self._wanted = False
         self._answered, self._diagnosed = 0, 0
 
+    def _carrying(self) -> tuple[int, int]:
+        """Throttles of hover and descent [us]."""
+        return self._sticks.carrying(1.0), self._sticks.carrying(self.config.watchdog.descent)
+
     def _greet(self) -> msp.Version:
-        """Who is at the other end."""
+        """Who is at the other end, with which battery."""
+        wanted = [msp.FC_VARIANT, msp.FC_VERSION, *([msp.ANALOG] if self._sticks.battery.reference else [])]
         answers: dict[int, msp.Frame] = {}
         last = time.monotonic() + _HANDSHAKE
         while time.monotonic() < last:
-            self._link.request(msp.request(msp.FC_VARIANT) + msp.request(msp.FC_VERSION))
+            self._link.request(b"".join(map(msp.request, wanted)))
             for frame in self._parser.feed(self._link.receive(0.2)[0]):
                 answers[frame.command] = frame
-            if {msp.FC_VARIANT, msp.FC_VERSION} <= answers.keys():
+            if answers.keys() >= set(wanted):
+                if msp.ANALOG in wanted:
+                    self._take_battery(msp.battery(answers[msp.ANALOG]).voltage)
                 return msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
         noise = f"; {self._parser.skipped} bytes came that are no MSP: is the baud rate right?" if self._parser.skipped else ""
         raise msp.MspError(f"{self.config.wire}: no autopilot answers within {_HANDSHAKE:g} s{noise}")
@@ -129,8 +135,18 @@ class Betaflight(Component[BetaflightParameters]):
                 self._attitude = msp.attitude(frame)
             elif frame.command == msp.ANALOG:
                 self._battery = msp.battery(frame)
+                self._take_battery(self._battery.voltage)
         except msp.MspError as error:
             self.warn(str(error), every=1.0)
+
+    def _take_battery(self, voltage: float) -> None:
+        if self._sticks.battery.reference:
+            self._sticks.measured(voltage)
+            self._link.carrying(*self._carrying())
+            if not self._sticks.fits(voltage):
+                low, high = self._sticks.battery.range
+                raise msp.MspError(f"the battery has {voltage:g} V: the thrust curve of {self.config.vehicle} (actuation.battery) is of "
+                                   f"{low:g} to {high:g} V")
 
     def _judge_arming(self, now: int) -> None:
         """Say why it does not arm."""

@@ -4,7 +4,7 @@ Betaflight before 2026.6 holds the last MSP command for ever. So commands go thr
 rate whatever happens, and what it says when nobody commands any more is the `Watchdog`'s. It ends when nobody commands and the
 motors are off.
 
-    node -> keeper   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot
+    node -> keeper   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot       b"H" hover, descent: throttles
     keeper -> node   b"D" bytes: from the autopilot          b"M" text: what the watchdog does now
 """
 
@@ -27,7 +27,7 @@ from perch_autopilot import msp
 from perch_autopilot.watchdog import Mode, Watchdog, WatchdogSettings
 from perch_autopilot.wire import Wire, WireError
 
-COMMAND = struct.Struct("<?4H")
+COMMAND, THROTTLES = struct.Struct("<?4H"), struct.Struct("<2H")
 _REOPEN = 0.2   # from one attempt to open a wire that has ended to the next [s]
 _FAREWELL = 10  # frames with the motors off before it ends
 
@@ -109,6 +109,8 @@ class Keeper:
             self._watchdog.command(self._clock(), armed, tuple(sticks))
         elif word[:1] == b"R":
             self._send(word[1:])
+        elif word[:1] == b"H" and len(word) == 1 + THROTTLES.size:
+            self._watchdog.carrying(*THROTTLES.unpack_from(word, 1))
 
     def _pass_on(self) -> None:
         try:
@@ -158,6 +160,10 @@ class KeeperLink:
     def command(self, armed: bool, sticks: tuple[int, int, int, int]) -> None:
         """What the autopilot shall do, until a command is stale."""
         self._send(b"C" + COMMAND.pack(armed, *sticks))
+
+    def carrying(self, hover: int, descent: int) -> None:
+        """Throttles of hover and descent [us] from now on."""
+        self._send(b"H" + THROTTLES.pack(hover, descent))
 
     def request(self, data: bytes) -> None:
         """Bytes for the autopilot beside the commands."""

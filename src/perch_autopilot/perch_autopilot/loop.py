@@ -41,10 +41,11 @@ class FirmwareLoop:
 
     watches = True
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, voltage_factor: float = 1.0) -> None:
         """
         Args:
             vehicle: whose rotors it drives; `actuation.firmware` names the configuration.
+            voltage_factor: of the battery / that of the vehicle's thrust curve; motors turn in proportion to it.
 
         Raises:
             FirmwareError: the firmware is not there, or does not arm.
@@ -52,6 +53,8 @@ class FirmwareLoop:
         """
         loaded = load_configuration(vehicle.actuation.firmware)
         self.sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
+        self.sticks.measured(voltage_factor * vehicle.actuation.battery.reference)
+        self._voltage_factor = voltage_factor
         self.watchdog = Watchdog(_WATCHDOG, self.sticks.carrying(1.0), self.sticks.carrying(_WATCHDOG.descent))
         self._low, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self._idle = float(loaded.settings.get("motor_idle", 550)) * 1e-4  # motors of an armed vehicle with the throttle down
@@ -90,7 +93,8 @@ class FirmwareLoop:
         motors = np.array(self.sitl.step(sample.gyro, sample.accel, (x[6], x[3], x[4], x[5]), self.channels(now / NANOSECONDS)))
         turn = motors > 0.5 * self._idle
         self._turning = bool(turn.all())
-        return np.where(turn, self._low + self._span * np.clip((motors - self._idle) / (1.0 - self._idle), 0.0, 1.0), 0.0)
+        throttle = np.clip((motors - self._idle) / (1.0 - self._idle), 0.0, 1.0)
+        return np.where(turn, self._voltage_factor * (self._low + self._span * throttle), 0.0)
 
     def channels(self, now: float) -> Sequence[int]:
         """What the firmware's receiver has at a time [s], pulse widths [us]."""

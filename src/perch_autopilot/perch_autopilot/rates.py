@@ -59,7 +59,11 @@ def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
 
 
 class Sticks:
-    """Channels of body rates and thrust, in Betaflight's order AETR: roll, pitch, throttle, yaw, then switches."""
+    """Channels of body rates and thrust, in Betaflight's order AETR: roll, pitch, throttle, yaw, then switches.
+
+    Attributes:
+        battery: how the thrust changes with the voltage.
+    """
 
     def __init__(self, vehicle: Vehicle, curves: tuple[RateCurve, ...]) -> None:
         """
@@ -69,10 +73,22 @@ class Sticks:
         """
         self._curves, self._mass, self._coefficient = curves, vehicle.mass, vehicle.thrust_coefficient
         self._idle, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
+        self.battery, self._share = vehicle.actuation.battery, 1.0
+
+    def fits(self, voltage: float) -> bool:
+        """Whether the thrust at a battery's voltage [V] is known."""
+        low, high = self.battery.range
+        return not self.battery.reference or low <= voltage <= high
+
+    def measured(self, voltage: float) -> None:
+        """Take the battery's voltage [V]; beyond the range of its curve the nearest end of that counts."""
+        if self.battery.reference:
+            low, high = self.battery.range
+            self._share = (min(max(voltage, low), high) / self.battery.reference) ** self.battery.exponent
 
     def throttle(self, thrust: float) -> float:
         """Throttle 0..1 at which the four rotors together give a thrust per mass [m/s^2]: their speed is linear in it."""
-        speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient))
+        speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient * self._share))
         return min(max((speed - self._idle) / self._span, 0.0), 1.0)
 
     def carrying(self, share: float) -> int:

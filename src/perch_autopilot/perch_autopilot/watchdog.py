@@ -47,11 +47,16 @@ class Watchdog:
             settings: times.
             hover, descent: throttle that carries the weight, and that of the descent [us].
         """
-        self._settings, self._hover, self._descent = settings, hover, descent
+        self._settings = settings
+        self.carrying(hover, descent)
         self.mode = Mode.DISARMED
         self._sticks: Channels = CENTRED
         self._wanted, self._came, self._since = False, 0.0, 0.0
         self._locked = False  # motors were taken away: only a command to disarm allows the next to arm
+
+    def carrying(self, hover: int, descent: int) -> None:
+        """Take other throttles of hover and descent [us], as the battery empties."""
+        self._hover, self._descent = hover, descent
 
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
         """Take a command.

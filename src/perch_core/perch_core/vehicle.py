@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
+from perch_core.camera import Camera, CameraMount, EquidistantCamera, PinholeCamera
 from perch_core.config import LARGEST, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import extended_mapping
@@ -48,10 +48,8 @@ class CameraConfig:
 
     def mount(self, name: str) -> CameraMount:
         """The camera with its place on the body."""
-        common = dict(width=self.width, height=self.height, fx=self.focal[0], fy=self.focal[1],
-                      cx=self.centre[0], cy=self.centre[1])
-        camera = (EquidistantCamera(**common, coefficients=self.distortion) if self.model == "equidistant"
-                  else PinholeCamera(**common))
+        common = self.width, self.height, *self.focal, *self.centre
+        camera: Camera = EquidistantCamera(*common, coefficients=self.distortion) if self.model == "equidistant" else PinholeCamera(*common)
         return CameraMount(
             name=name, camera=camera, p_BC=np.array(self.position),
             R_BC=so3.quat_to_matrix(np.array(self.orientation) / np.linalg.norm(self.orientation)),
@@ -78,6 +76,19 @@ class ImuConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Battery:
+    """How the thrust at a throttle changes with the battery: thrust at `reference` (voltage / reference)^exponent."""
+
+    reference: float = quantity(0.0, unit="V", low=0.0, high=100.0, doc="at which the thrust curve holds; 0: the voltage is not looked at")
+    exponent: float = quantity(2.0, low=0.5, high=4.0, doc="2: rotor speed proportional to voltage")
+    range: tuple[float, float] = quantity((0.0, 100.0), unit="V", low=0.0, high=100.0, doc="between which it was identified")
+
+    def __post_init__(self) -> None:
+        if self.reference and not self.range[0] <= self.reference <= self.range[1]:
+            raise ConfigError("", "actuation.battery.reference", f"{self.reference:g} V is outside its range {list(self.range)} V")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Actuation:
     """What the vehicle takes from the controller, and how what stands between that and the rotors answers.
 
@@ -93,6 +104,7 @@ class Actuation:
     thrust_lag: float = quantity(0.03, unit="s", above=0.0, high=1.0)
     thrust_gain: float = quantity(1.0, unit="-", above=0.1, high=10.0, doc="thrust that is reached / commanded")
     attitude_lag: float = quantity(0.08, unit="s", above=0.0, high=1.0)
+    battery: Battery = part(Battery)
     firmware: str = text("", doc="in simulation: Betaflight's own, set to config/autopilot/<name>.txt, is the inner loop; empty: an ideal one")
 
     def __post_init__(self) -> None:

@@ -16,6 +16,7 @@ from math import cos, sin, sqrt
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_planner.bounds import (
     cross,
@@ -37,7 +38,7 @@ _PARTS = len(_SIZES)
 
 
 @compiled
-def _elevate(coefficients, size):
+def _elevate(coefficients: Array, size: int) -> Array:
     """The same polynomial with `size` coefficients."""
     out = coefficients
     while len(out) < size:
@@ -52,7 +53,7 @@ def _elevate(coefficients, size):
 
 
 @compiled
-def rate_parts(force, force2, jerk, yaw, duration):
+def rate_parts(force: Array, force2: Array, jerk: Array, yaw: Array, duration: float) -> Array:
     """Bernstein coefficients of what the body rate consists of.
 
     Args:
@@ -84,7 +85,7 @@ def rate_parts(force, force2, jerk, yaw, duration):
 
 
 @compiled
-def rate_coarse_bound(force, force2, jerk, yaw, duration):
+def rate_coarse_bound(force: Array, force2: Array, jerk: Array, yaw: Array, duration: float) -> float:
     """A quick upper bound of |omega| on a segment from |x| <= |f| |j|; infinite where it is of no use.
 
     Args:
@@ -109,7 +110,7 @@ def rate_coarse_bound(force, force2, jerk, yaw, duration):
 
 
 @compiled
-def spin_rate(f_x, f_y, f_z, x_x, x_y, yaw, yaw_rate):
+def spin_rate(f_x: float, f_y: float, f_z: float, x_x: float, x_y: float, yaw: float, yaw_rate: float) -> float:
     """w_z for components of f and x = f x j [rad/s]; large where f lies along b2_des, which leaves b3 without a heading."""
     specific = sqrt(max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12))
     d_x, d_y = -sin(yaw), cos(yaw)
@@ -119,21 +120,22 @@ def spin_rate(f_x, f_y, f_z, x_x, x_y, yaw, yaw_rate):
 
 
 @compiled
-def _squared_rate(parts):
+def _squared_rate(parts: Array) -> float:
     """|omega|^2 where the parts begin."""
     spin = spin_rate(parts[3, 0], parts[4, 0], parts[5, 0], parts[6, 0], parts[7, 0], parts[9, 0], parts[10, 0])
-    return parts[1, 0] / max(parts[0, 0], 1e-60) + spin * spin
+    tilt: float = parts[1, 0] / max(parts[0, 0], 1e-60)
+    return tilt + spin * spin
 
 
 @compiled
-def _interval_product(a, b, c, d):
+def _interval_product(a: float, b: float, c: float, d: float) -> tuple[float, float]:
     """Enclosure of x y for x in [a, b], y in [c, d]."""
     p, q, r, t = a * c, a * d, b * c, b * d
     return min(min(p, q), min(r, t)), max(max(p, q), max(r, t))
 
 
 @compiled
-def _along(parts, row, size, dx, dy, slack):
+def _along(parts: Array, row: int, size: int, dx: float, dy: float, slack: float) -> tuple[float, float]:
     """Enclosure of d . v for the vector polynomial at `row`, d within an arc whose effect is at most `slack`."""
     low, high = np.inf, -np.inf
     for k in range(size):
@@ -143,7 +145,7 @@ def _along(parts, row, size, dx, dy, slack):
 
 
 @compiled
-def _spin_bound(parts):
+def _spin_bound(parts: Array) -> float:
     """Upper bound of |w_z| over the interval of the parts; infinite where the enclosure is too wide."""
     low, high = smallest(parts[9, :15]), largest(parts[9, :15])
     middle, reach = 0.5 * (low + high), 0.5 * (high - low)
@@ -154,7 +156,7 @@ def _spin_bound(parts):
     shortest, longest = sqrt(least), sqrt(most)
     lean_low, lean_high = _along(parts, 3, 13, dx, dy, reach * longest)
     turn_low, turn_high = _along(parts, 6, 24, dx, dy, reach * sqrt(max(largest(parts[1]), 0.0)))
-    across = least - max(lean_low * lean_low, lean_high * lean_high)
+    across: float = least - max(lean_low * lean_low, lean_high * lean_high)
     if across <= 0.0:
         return np.inf
     a, b = _interval_product(smallest(parts[10, :14]), largest(parts[10, :14]), smallest(parts[5, :13]), largest(parts[5, :13]))
@@ -165,7 +167,7 @@ def _spin_bound(parts):
 
 
 @compiled
-def _split_parts(parts, left):
+def _split_parts(parts: Array, left: Array) -> None:
     """Halve the interval of all parts: the left halves are written to `left`, `parts` become the right ones."""
     for row in range(_PARTS):
         size = _SIZES[row]
@@ -173,7 +175,7 @@ def _split_parts(parts, left):
 
 
 @compiled
-def _rate_bound(parts):
+def _rate_bound(parts: Array) -> float:
     """Upper bound of |omega| over the interval of the parts; infinite where the enclosure is too wide."""
     tilt = 0.0
     for k in range(_TILT):
@@ -185,7 +187,7 @@ def _rate_bound(parts):
 
 
 @compiled
-def rate_maximum(parts, attained, limit):
+def rate_maximum(parts: Array, attained: float, limit: float) -> tuple[float, float, float]:
     """Largest |omega| on a segment, enclosed as far as it exceeds what is attained elsewhere. [M:alg1]
 
     Args:
@@ -233,7 +235,8 @@ def rate_maximum(parts, attained, limit):
 
 
 @compiled
-def prove_rate(forces, squares, jerks, yaw, durations, coarse, limit, sampled):
+def prove_rate(forces: Array, squares: Array, jerks: Array, yaw: Array, durations: Array, coarse: Array, limit: float, sampled: float
+               ) -> tuple[float, int, float, int, float]:
     """Prove a body rate near the greatest that is attained, or find where the limit fails.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_planner.bounds import BELOW, cross, product, smallest, squared, stays_below
 
@@ -11,7 +12,7 @@ _SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself
 
 
 @compiled
-def surface_distance(coefficients, duration, begin, p_S, v_S, s3):
+def surface_distance(coefficients: Array, duration: float, begin: float, p_S: Array, v_S: Array, s3: Array) -> Array:
     """Distance of the centre of mass from the moving surface, Bernstein coefficients, shape (15,) [m]."""
     out = np.zeros(coefficients.shape[1])
     last = len(out) - 1
@@ -22,7 +23,7 @@ def surface_distance(coefficients, duration, begin, p_S, v_S, s3):
 
 
 @compiled
-def _rim_clears(distance, force, force2, s3, extension, gap):
+def _rim_clears(distance: Array, force: Array, force2: Array, s3: Array, extension: float, gap: float) -> tuple[bool, float]:
     """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful.
 
     The rim of a disc around the centre of mass reaches extension sin(tilt) towards the surface, and
@@ -42,7 +43,8 @@ def _rim_clears(distance, force, force2, s3, extension, gap):
 
 
 @compiled
-def prove_clearance(distances, forces, squares, s3, extension, limit, sampled):
+def prove_clearance(distances: Array, forces: Array, squares: Array, s3: Array, extension: float, limit: float, sampled: float
+                    ) -> tuple[float, int, float]:
     """Prove a clearance near the sampled one, or else that the limit holds, or else find where it fails.
 
     Args:

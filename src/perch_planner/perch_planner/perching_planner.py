@@ -96,7 +96,7 @@ def _load(settings: PerchSettings, vehicle: Vehicle) -> None:
     """Plan once, so that the kernels are there before the first request."""
     surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
     try:
-        planner.plan(PerchProblem(StartState((0.0, 0.0, 1.5)), surface), settings, vehicle)
+        planner.plan(PerchProblem(StartState(np.array([0.0, 0.0, 1.5])), surface), settings, vehicle)
     except PerchRefusal:  # these limits may leave no plan; the kernels are there all the same
         pass
 

@@ -23,8 +23,8 @@ def states(plan: PerchPlan, mass: float, step: float = 0.002) -> tuple[np.ndarra
     """Times and full states of a plan, every `step` seconds and at contact."""
     times = np.append(np.arange(0.0, plan.duration, step), plan.duration)
     at = plan.trajectory.sample_many(times)
-    rows = zip(at.p, at.v, at.a, at.j, at.s, at.yaw.tolist(), at.yaw_rate.tolist(), at.yaw_acc.tolist())
-    return times, [flat_to_state(*row, mass) for row in rows]
+    rows = zip(at.p, at.v, at.a, at.j, at.s, *(np.asarray(values).tolist() for values in (at.yaw, at.yaw_rate, at.yaw_acc)))
+    return times, [flat_to_state(p, v, a, j, s, yaw, rate, acceleration, mass) for p, v, a, j, s, yaw, rate, acceleration in rows]
 
 
 def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
@@ -33,11 +33,12 @@ def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
 
     times, full = states(plan, mass)
     at = plan.trajectory.sample_many(times)
+    yaw = np.asarray(at.yaw)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for k, state in enumerate(full):
-            row = [times[k], *at.p[k], *at.v[k], *at.a[k], at.yaw[k], *quat_from_matrix(state.R_WB), *state.w_WB_B,
+            row = [times[k], *at.p[k], *at.v[k], *at.a[k], yaw[k], *quat_from_matrix(state.R_WB), *state.w_WB_B,
                    state.thrust]
             writer.writerow([f"{float(v):.9g}" for v in row])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan2, hypot
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,10 +15,10 @@ from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import Vehicle
 
-_ZERO = (0.0, 0.0, 0.0)
+_ZERO: Any = (0.0, 0.0, 0.0)  # made an array, as what is given
 
 
-def _vector(source: str, key: str, value) -> np.ndarray:
+def _vector(source: str, key: str, value: Any) -> np.ndarray:
     """A finite vector of three.
 
     Raises:

@@ -80,9 +80,11 @@ def read_problem(mapping: Any, source: str) -> tuple[PerchProblem, PerchSettings
         surface = PerchSurface.from_inclination(np.array(target.position), radians(target.inclination_deg),
                                                 radians(target.heading_deg))
         problem = PerchProblem(
-            StartState(start.position, start.velocity, start.acceleration, start.jerk, radians(start.yaw_deg), start.yaw_rate),
-            surface, tuple(Waypoint(w.position, w.velocity, w.acceleration, w.jerk) for w in content.waypoints),
-            target.velocity, content.segment_times)
+            StartState(np.array(start.position), np.array(start.velocity), np.array(start.acceleration), np.array(start.jerk),
+                       radians(start.yaw_deg), start.yaw_rate),
+            surface, tuple(Waypoint(np.array(w.position), *(None if v is None else np.array(v) for v in (w.velocity, w.acceleration, w.jerk)))
+                           for w in content.waypoints),
+            np.array(target.velocity), content.segment_times)
     except ConfigError as error:
         raise ConfigError(source, error.key, error.problem) from None
     return problem, content.settings, load_vehicle(content.vehicle)

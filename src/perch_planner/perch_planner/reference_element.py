@@ -89,7 +89,8 @@ def _gram(order: int) -> np.ndarray:
     index = np.arange(n + 1)
     mass = np.outer(binomials, binomials) / bernstein.binomials(2 * n)[index[:, None] + index] / (2 * n + 1)
     gram = table.T @ mass @ table
-    return 0.5 * (gram + gram.T)
+    symmetric: np.ndarray = 0.5 * (gram + gram.T)
+    return symmetric
 
 
 TABLES = _derivative_tables(_position_table())

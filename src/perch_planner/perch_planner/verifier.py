@@ -7,13 +7,17 @@ taken from the roots of derivatives (numpy's eigenvalue method), where the plann
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import comb
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.polynomial import polynomial as power
+
+from perch_core.arrays import Array, Numbers
 
 _G = 9.81
 _TURN = 1e-4  # [s] between the rotations from which rates and accelerations are taken
@@ -29,8 +33,8 @@ class Rotors:
         thrust: least and greatest of each rotor [N].
     """
 
-    inertia: np.ndarray
-    allocation: np.ndarray
+    inertia: Array
+    allocation: Array
     thrust: tuple[float, float]
 
 
@@ -58,14 +62,14 @@ class Requirements:
         rotors: limits of the single rotors, or None.
     """
 
-    start: np.ndarray
+    start: Array
     start_yaw: tuple[float, float]
-    waypoints: np.ndarray
-    p_S: np.ndarray
-    s1: np.ndarray
-    s2: np.ndarray
-    s3: np.ndarray
-    v_S: np.ndarray
+    waypoints: Array
+    p_S: Array
+    s1: Array
+    s2: Array
+    s3: Array
+    v_S: Array
     perch_offset: float
     mass: float
     impact_acceleration: float
@@ -80,6 +84,16 @@ class Requirements:
     rotors: Rotors | None = None
 
 
+AtMost = Callable[[str, float, float, float, float], None]
+Axes = tuple[Array, Array, Array]
+
+
+class Equal(Protocol):
+    """Notes where a value is not the one that is wanted."""
+
+    def __call__(self, name: str, value: Any, wanted: Array, t: float, slack: float = 1.0) -> None: ...
+
+
 @dataclass(frozen=True)
 class Finding:
     """A requirement that a plan breaks: its name, by how much, and when [s]."""
@@ -89,7 +103,7 @@ class Finding:
     time: float
 
 
-def _powers(bernstein_row) -> np.ndarray:
+def _powers(bernstein_row: Numbers) -> Array:
     """Ascending powers of s, in exact integers over one power of two."""
     n = len(bernstein_row) - 1
     ratios = [float(c).as_integer_ratio() for c in bernstein_row]
@@ -99,7 +113,7 @@ def _powers(bernstein_row) -> np.ndarray:
                      for k in range(n + 1)])
 
 
-def _extrema(square, degree: int) -> tuple[float, float]:
+def _extrema(square: Callable[[Array], Array], degree: int) -> tuple[float, float]:
     """Smallest and largest value of a smooth function on [0, 1], from the roots of its Chebyshev interpolant's derivative."""
     nodes = 0.5 * (1.0 + np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)))
     series = chebyshev.chebfit(2.0 * nodes - 1.0, square(nodes), degree)
@@ -110,31 +124,33 @@ def _extrema(square, degree: int) -> tuple[float, float]:
 
 
 class _Segment:
-    def __init__(self, duration: float, rows) -> None:
+    def __init__(self, duration: float, rows: Sequence[Numbers] | Array) -> None:
         self.duration = float(duration)
         self._tables = [np.array([_powers(row) for row in rows]).T]  # powers of the derivatives up to the fourth
         for order in range(1, 5):
             self._tables.append(power.polyder(self._tables[0], order))
 
-    def at(self, s: np.ndarray, order: int, outputs: slice = slice(0, 4)) -> np.ndarray:
+    def at(self, s: Numbers, order: int, outputs: slice = slice(0, 4)) -> Array:
         """Derivatives of x, y, z, yaw, or of some of them, at s, shape (len(s), outputs)."""
-        return power.polyval(np.asarray(s, float), self._tables[order][:, outputs]).T / self.duration**order
+        values: Array = power.polyval(np.asarray(s, float), self._tables[order][:, outputs]).T / self.duration**order
+        return values
 
-    def force(self, s: np.ndarray) -> np.ndarray:
+    def force(self, s: Array) -> Array:
         """a + g e3 at s, shape (len(s), 3)."""
         return self.at(s, 2, slice(0, 3)) + (0.0, 0.0, _G)
 
-    def yaw(self, s: np.ndarray) -> np.ndarray:
+    def yaw(self, s: Array) -> Array:
         """Yaw at s, shape (len(s),)."""
         return self.at(s, 0, slice(3, 4))[:, 0]
 
 
-def _length(v: np.ndarray) -> np.ndarray:
+def _length(v: Array) -> Array:
     """Lengths of vectors, shape (n, 3) -> (n, 1)."""
-    return np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2 + v[:, 2] ** 2)[:, None]
+    lengths: Array = np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2 + v[:, 2] ** 2)
+    return lengths[:, None]
 
 
-def _rotations(f: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rotations(f: Array, yaw: Array) -> tuple[Array, Array, Array]:
     """Body axes b1, b2, b3, each of shape (n, 3)."""
     b3 = f / _length(f)
     c, s = np.cos(yaw), np.sin(yaw)
@@ -143,16 +159,17 @@ def _rotations(f: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     return b1, np.cross(b3, b1), b3
 
 
-def _turn(before: tuple, after: tuple) -> np.ndarray:
+def _turn(before: Axes, after: Axes) -> Array:
     """Axis times sine of the angle of the rotation between two attitudes, in the body frame, shape (n, 3)."""
-    def dot(i: int, k: int) -> np.ndarray:
+    def dot(i: int, k: int) -> Array:
         a, b = before[i], after[k]
-        return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+        product: Array = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+        return product
 
     return 0.5 * np.stack([dot(2, 1) - dot(1, 2), dot(0, 2) - dot(2, 0), dot(1, 0) - dot(0, 1)], axis=1)
 
 
-def verify(durations, segments, need: Requirements, step: float = 1e-4, tolerance: float = 1e-9) -> list[Finding]:
+def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 1e-4, tolerance: float = 1e-9) -> list[Finding]:
     """Check a plan against everything that was asked.
 
     Args:
@@ -170,7 +187,7 @@ def verify(durations, segments, need: Requirements, step: float = 1e-4, toleranc
     begins = np.concatenate([[0.0], np.cumsum([piece.duration for piece in pieces])])
     end = float(begins[-1])
 
-    def equal(name: str, value, wanted, t: float, slack: float = 1.0) -> None:
+    def equal(name: str, value: Any, wanted: Array, t: float, slack: float = 1.0) -> None:
         excess = float(np.abs(np.asarray(value) - wanted).max())
         if not excess <= tolerance * slack * (1.0 + float(np.abs(wanted).max())):
             found.append(Finding(name, excess, t))
@@ -193,11 +210,11 @@ def verify(durations, segments, need: Requirements, step: float = 1e-4, toleranc
         _check_exact(piece, float(begin), need, at_most)
         _check_dense(piece, float(begin), need, step, at_most)
         if need.rotors is not None:
-            _check_rotors(piece, float(begin), need, step, at_most)
+            _check_rotors(piece, float(begin), need, need.rotors, step, at_most)
     return found
 
 
-def _check_knots(pieces, begins, need: Requirements, equal) -> None:
+def _check_knots(pieces: list[_Segment], begins: Array, need: Requirements, equal: Equal) -> None:
     for order, wanted in enumerate(need.start):
         equal(f"start, derivative {order} [M:eq6]", pieces[0].at([0.0], order)[0, :3], wanted, 0.0, slack=10.0**order)
     equal("start yaw", pieces[0].at([0.0], 0)[0, 3], np.array(need.start_yaw[0]), 0.0)
@@ -210,7 +227,7 @@ def _check_knots(pieces, begins, need: Requirements, equal) -> None:
         equal(f"waypoint {k} [M:eq6]", pieces[k].at([1.0], 0)[0, :3], waypoint, float(begins[k + 1]))
 
 
-def _check_tube(pieces, begins, need: Requirements, contact: np.ndarray, at_most) -> None:
+def _check_tube(pieces: list[_Segment], begins: Array, need: Requirements, contact: Array, at_most: AtMost) -> None:
     length, step, q, floor = need.tube
     half = np.maximum(np.abs(q * contact), floor)
     for j in range(round(length / step)):
@@ -222,7 +239,7 @@ def _check_tube(pieces, begins, need: Requirements, contact: np.ndarray, at_most
         at_most("tube [M:eq15]", float((np.abs(a - contact) - half).max()), 0.0, t, 1e-8)
 
 
-def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most) -> None:
+def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most: AtMost) -> None:
     """Extrema of polynomials, from roots."""
     low, high = _extrema(lambda s: np.linalg.norm(piece.force(s), axis=1) ** 2, 26)
     at_most("thrust, greatest [M:eq16]", need.mass * max(high, 0.0) ** 0.5, need.thrust[1], begin, 1e-9)
@@ -234,7 +251,7 @@ def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most) -> 
     at_most("height, greatest", high, need.height[1], begin, 1e-9)
 
 
-def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float, at_most) -> None:
+def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float, at_most: AtMost) -> None:
     """Body rate and clearance on samples; the body rate from rotations half a step apart."""
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = (np.arange(count) + 0.5) / count
@@ -252,16 +269,16 @@ def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float,
     at_most("clearance", 0.0, float(gap[worst]), float(times[worst]), 1e-9)
 
 
-def _turn_rates(before: tuple, after: tuple, step: float) -> np.ndarray:
+def _turn_rates(before: Axes, after: Axes, step: float) -> Array:
     """Body rates between rotations `step` seconds apart, shape (n, 3)."""
     sine = _turn(before, after)
     size = _length(sine)
     return sine * np.where(size < 1e-9, 1.0, np.arcsin(np.clip(size, 0.0, 1.0)) / np.maximum(size, 1e-300)) / step
 
 
-def _check_rotors(piece: _Segment, begin: float, need: Requirements, step: float, at_most) -> None:
+def _check_rotors(piece: _Segment, begin: float, need: Requirements, rotors: Rotors, step: float, at_most: AtMost) -> None:
     """Rotor thrusts on samples: Euler's equation with rates and accelerations from three rotations `_TURN` apart."""
-    rotors, h = need.rotors, _TURN / piece.duration
+    h = _TURN / piece.duration
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = h + (np.arange(count) + 0.5) / count * (1.0 - 2.0 * h)
     force = [piece.force(s + k * h) for k in (-1.0, 0.0, 1.0)]

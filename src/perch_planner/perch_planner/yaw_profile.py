@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_planner.reference_element import DEGREE
 
 
 @compiled
-def _restrict(coefficients, a, b):
+def _restrict(coefficients: Array, a: float, b: float) -> Array:
     """The polynomial on [a, b], mapped to [0, 1]."""
     n = len(coefficients) - 1
     out = coefficients.copy()
@@ -29,7 +30,7 @@ def _restrict(coefficients, a, b):
 
 
 @compiled
-def _yaw(yaw, rate, acceleration, end, durations, degree):
+def _yaw(yaw: float, rate: float, acceleration: float, end: float, durations: Array, degree: int) -> Array:
     duration = durations.sum()
     whole = np.full(degree + 1, end)
     whole[0] = yaw

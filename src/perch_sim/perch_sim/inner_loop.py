@@ -22,7 +22,7 @@ from perch_sim.imu import ImuSample
 FIRMWARE = "perch_autopilot.loop:FirmwareLoop"  # an optional extra, loaded where a vehicle names it
 
 
-def inner_loop(vehicle: Vehicle, lag_factor: float) -> InnerLoop | Any:
+def inner_loop(vehicle: Vehicle, lag_factor: float, voltage_factor: float = 1.0) -> InnerLoop | Any:
     """What stands between commands and the rotors; None: nothing does.
 
     Raises:
@@ -30,7 +30,7 @@ def inner_loop(vehicle: Vehicle, lag_factor: float) -> InnerLoop | Any:
     """
     if vehicle.actuation.type == "rotor_speeds":
         return None
-    return resolved(FIRMWARE)(vehicle) if vehicle.actuation.firmware else InnerLoop(vehicle, lag_factor)
+    return resolved(FIRMWARE)(vehicle, voltage_factor) if vehicle.actuation.firmware else InnerLoop(vehicle, lag_factor)
 
 
 @compiled

@@ -72,7 +72,7 @@ class Simulation:
                               f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout), 0
-        self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor)
+        self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor, scenario.disturbance.voltage_factor)
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
         self._sample = ImuSample(np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)

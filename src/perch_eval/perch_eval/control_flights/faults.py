@@ -14,7 +14,6 @@ import numpy as np
 from perch_control.modes import Command, State
 from perch_core import so3
 from perch_core.values import Ask, OdometryState, seconds
-from perch_core.vehicle import GRAVITY
 from perch_eval.control_flights.flight import ControlFlight, scenario_of
 from perch_eval.control_flights.pilot import LEAD, TAKE_OFF_SPEED
 from perch_eval.control_flights.way_out import Search, search
@@ -151,7 +150,6 @@ class Ending:
         time: of the fault, since the order to take off [s]; phase: state of the controller then.
         done: what the fault was.
         before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] when it struck.
-        best_impact: speed at the floor [m/s] if all thrust that is left pointed upwards from then on, without lag and turning.
         end: hovering, landed, perched, crashed or lost.
         touched: surfaces hit by other parts than the plate without breaking anything.
         events: of the controller from the fault on.
@@ -164,7 +162,6 @@ class Ending:
     phase: str
     done: str
     before: tuple[float, float, float, float]
-    best_impact: float
     end: str
     touched: tuple[str, ...]
     events: tuple[str, ...]
@@ -190,7 +187,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
     moment = rng.uniform(begin, contact)
     script = [(begin, lambda: flight.pilot.go(np.array([0.0, 0.0, height]), rise)),
               (ready, lambda: flight.perch(place))]
-    struck, done, phase, before, best, first = False, "", "", (0.0,) * 4, 0.0, 0
+    struck, done, phase, before, first = False, "", "", (0.0,) * 4, 0
     resting = flight.time
     while flight.time < moment + LIMIT and not flight.simulation.plant.crashed:
         while script and flight.time >= script[0][0]:
@@ -198,7 +195,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
         if not struck and flight.time >= moment:
             struck, phase, before, first = True, flight.state.name, _situation(flight), len(flight.events)
             done = fault.strike(flight, rng)
-            best, plant = _best_impact(flight), copy.deepcopy(flight.simulation.plant)
+            plant = copy.deepcopy(flight.simulation.plant)
         flight.step()
         if flight.state is not State.HOVERING:
             resting = flight.time
@@ -211,7 +208,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
         flight.run(flight.time + 1.0)  # what has come off falls within this
     touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.loop.trace.contacts if c.state == ContactState.COLLISION}))
     end = _end(flight)
-    return Ending(fault.name, seed, moment - begin, phase, done, before, best, end, touched,
+    return Ending(fault.name, seed, moment - begin, phase, done, before, end, touched,
                   tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]),
                   None if end in END_STATES else search(plant))
 
@@ -220,15 +217,6 @@ def _situation(flight: ControlFlight) -> tuple[float, float, float, float]:
     x, pad = flight.simulation.state, flight.simulation.pad
     tilt = np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x.q_WB)[2, 2], -1.0, 1.0)))
     return float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt)
-
-
-def _best_impact(flight: ControlFlight) -> float:
-    """A bound of physics: no controller arrives at the floor more slowly, if it has to stop at all."""
-    body, x = flight.simulation.plant.body, flight.simulation.state
-    up = body.thrust_coefficient.sum() * body.speed_max**2 / body.mass - GRAVITY
-    height = max(float(x.p_WB[2]) - body.plate_offset, 0.0)
-    fall = max(-float(x.v_WB[2]), 0.0)
-    return float(np.sqrt(max(fall**2 - 2.0 * up * height, 0.0)))
 
 
 def _end(flight: ControlFlight) -> str:

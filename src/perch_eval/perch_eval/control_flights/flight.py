@@ -1,4 +1,4 @@
-"""A flight of the controller led by a script: take-off, hover, perch; plant, VIO model, estimator and planner as everywhere.
+"""A flight led by a script: take-off, hover, perch; plant, VIO model, estimator and planner as everywhere.
 
 Truth enters the controller through the sensors' models alone; the pad is localised without an error of its own, so that what is
 measured is the controller.
@@ -79,8 +79,8 @@ class ControlFlight:
         while self.time < until and not self.simulation.plant.crashed:
             self.step()
 
-    def arm(self) -> None:
-        """Wait for the estimator, and arm.
+    def arm(self) -> float:
+        """Wait for the estimator, and arm; returns when that was ordered [s].
 
         Raises:
             PerchError: the estimator is not ready within 10 s.
@@ -90,8 +90,10 @@ class ControlFlight:
                 raise PerchError(f"the estimator is not ready: {self.pilot.estimator.message}")
             self.step()
         self.run(self.time + 0.2)
+        ordered = self.time
         self.pilot.order(Command.ARM, "scripted flight")
         self.step()
+        return ordered
 
     def flew(self, order: int | None) -> bool:
         """Whether the controller has taken up an order; where it has not, its last event says why."""

@@ -53,8 +53,8 @@ def fault_sections(effort: Effort) -> list[Section]:
     for r in bad or ():
         height, gap, speed, tilt = r["before"]
         text.append(f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
-                    f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg; with all thrust upwards "
-                    f"from then on it would meet the floor with {r['best_impact']:.1f} m/s. End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
+                    f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. "
+                    f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
                     + _searched(r) + " / ".join(r["events"]))
     _write(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
     out.data = {"flights": flown}

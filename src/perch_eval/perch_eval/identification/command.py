@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from perch_core import config
 from perch_core.errors import PerchError
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.flight import Flight
 from perch_eval.identification import flight, page
-from perch_eval.identification.fit import identify
+from perch_eval.identification.fit import battery, identify
 from perch_eval.identification.record import record_of
 from perch_sim.scenario import load_scenario
+
+if TYPE_CHECKING:
+    from perch_eval.ros.recorded_flight import RecordedFlight
 
 EXAMPLES = """examples:
   python3 scripts/identify.py --vehicle snapdragon_rates                    fly in the simulator, and identify
   python3 scripts/identify.py --vehicle snapdragon_rates --scenario x.yaml  the same on a vehicle that differs (disturbance:)
   python3 scripts/identify.py --vehicle betaflight_unidentified --name betaflight   through Betaflight's firmware: config/vehicles/betaflight.yaml
   python3 scripts/identify.py --vehicle mine.yaml --recording flight.mcap   identify from a recorded flight: hover, short moves, turns
+  python3 scripts/identify.py --vehicle mine.yaml --recording full.mcap half.mcap low.mcap --voltage 16.4 15.2 14.0   with the battery's curve
 
 files: vehicle.yaml (extends the vehicle, with standard deviations), identify.png
 exit code: 0 everything is told, 1 something is not (the reasons beside it), 2 wrong arguments, or a flight that tells nothing"""
@@ -29,7 +36,9 @@ def command_line() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="identify.py", description="Identify lags, gains, thrust and drag of a vehicle from a flight.",
                                      epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
-    parser.add_argument("--recording", type=Path, help="MCAP file of a flight (default: fly in the simulator)")
+    parser.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
+    parser.add_argument("--voltage", type=float, nargs="+", default=[], metavar="V",
+                        help="the battery's in each flight, two or more: thrust against voltage; the first is that of the thrust curve")
     parser.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated flight (default: %(default)s)")
     parser.add_argument("--name", default="", help="name of the identified vehicle (default: that of the vehicle with _identified)")
@@ -37,26 +46,53 @@ def command_line() -> argparse.ArgumentParser:
     return parser
 
 
+def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | RecordedFlight]:
+    """Those that are recorded, or else flown in the simulator: one, or one at each voltage.
+
+    Raises:
+        PerchError: a recording is not there, or voltages are not those of the flights.
+    """
+    voltages = arguments.voltage
+    if voltages:
+        if len(voltages) < 2 or not all(0.0 < one < 100.0 for one in voltages):
+            raise PerchError(f"--voltage: needs two and more of 0 to 100 V, not {voltages}")
+        if vehicle.actuation.type != "rates_and_thrust":
+            raise PerchError(f"--voltage: {arguments.vehicle} takes {vehicle.actuation.type}, not rates_and_thrust")
+        if vehicle.actuation.battery.reference not in (0.0, voltages[0]):
+            raise PerchError(f"--voltage: the first must be the {vehicle.actuation.battery.reference:g} V of {arguments.vehicle}'s curve so far")
+    if arguments.recording:
+        if len(arguments.recording) != max(len(voltages), 1):
+            raise PerchError(f"--recording: {len(arguments.recording)} files, and {len(voltages)} voltages (--voltage)")
+        for file in arguments.recording:
+            if not file.is_file():
+                raise PerchError(f"{file}: no such file")
+        from perch_eval.ros.recorded_flight import RecordedFlight
+
+        return [RecordedFlight(file) for file in arguments.recording]
+    if voltages and not vehicle.actuation.firmware:
+        raise PerchError(f"--voltage: the simulated battery drives the motors of a firmware, and {arguments.vehicle} has none")
+    scenario = load_scenario(arguments.scenario)
+    differing = [replace(scenario.disturbance, voltage_factor=one / voltages[0]) for one in voltages] or [scenario.disturbance]
+    return [flight.fly(replace(scenario, disturbance=one), arguments.vehicle, arguments.seed) for one in differing]
+
+
 def main() -> int:
     """Fly or read, fit, write, tell."""
     arguments = command_line().parse_args()
     try:
         vehicle = load_vehicle(arguments.vehicle)
-        flown_as = str(arguments.recording or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}")
-        if arguments.recording is None:
-            flown = flight.fly(load_scenario(arguments.scenario), arguments.vehicle, arguments.seed)
-        else:
-            if not arguments.recording.is_file():
-                raise PerchError(f"{arguments.recording}: no such file")
-            from perch_eval.ros.recorded_flight import RecordedFlight
-
-            flown = RecordedFlight(arguments.recording)
-        found, answers = identify(record_of(flown), vehicle)
+        flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
+        flown = flights(arguments, vehicle)
+        found, answers = identify(record_of(flown[0]), vehicle)
+        if arguments.voltage:
+            gains = [next(one for one in identify(record_of(one), vehicle)[0] if one.key == "actuation.thrust_gain") for one in flown]
+            curve = vehicle.actuation.battery
+            found.append(battery(arguments.voltage, gains, curve.exponent if curve.reference else 0.0))
         arguments.out.mkdir(parents=True, exist_ok=True)
         is_file = arguments.vehicle.endswith((".yaml", ".yml"))
         base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
         name = arguments.name or f"{vehicle.name}_identified"
-        (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base), name, flown_as))
+        (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base), name, flown_as, arguments.voltage))
         page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -65,6 +101,7 @@ def main() -> int:
         print(f"error: {error.filename or arguments.out}: {error.strerror}", file=sys.stderr)
         return 2
     print("\n".join(map(str, found)))
-    print(f"{'thrust against battery voltage':32s} not identified: no recording holds battery voltage and thrust together")
+    if not arguments.voltage:
+        print(f"{'actuation.battery':32s} not identified: flights at two voltages and more tell it (--voltage)")
     print(f"written: {arguments.out / 'vehicle.yaml'}, {arguments.out / 'identify.png'}")
     return 1 if any(one.refused for one in found) else 0

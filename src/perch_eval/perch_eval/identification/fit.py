@@ -4,6 +4,8 @@
     f_z = thrust_coefficient sum Omega^2 / mass - drag_z v_z / mass,  Omega' = (Omega_cmd - Omega) / motor_time_constant
     f_x = -drag_x v_x / mass + bias                         likewise y
 
+The battery's curve comes of several records, one at each voltage.
+
 A value that the record does not tell is refused with the reason, and not written.
 """
 
@@ -11,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import exp, inf
+from math import exp, inf, sqrt
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -25,6 +27,8 @@ LEAST_RATE = 0.3     # standard deviation of a command below which nothing can b
 LEAST_THRUST = 0.5   # [m/s^2]
 LEAST_SPEED = 0.25   # of the air along an axis, for its drag [m/s]
 EXPLAINED = 0.9      # share of the answer's variance that the model must explain
+LEAST_VOLTAGES = 0.08  # between the greatest and the least voltage, as a share
+MISFIT = 0.03        # of the thrust at a voltage from its curve, as a share
 CERTAIN = 0.2        # a value is told where its standard deviation is below this share of it ...
 DELAY_CERTAIN = 0.003  # ... and a delay below this [s]
 
@@ -142,6 +146,35 @@ def thrust(record: Record, vehicle: Vehicle, delay: float) -> tuple[list[Found],
     return [_judged(keys[0], x[0], sigma[0], "s", why),
             _judged(keys[1], scale * x[1], scale * certain, "N s^2/rad^2" if rotors else "", why),
             _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], answer
+
+
+def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.0) -> Found:
+    """Exponent k of the thrust at a throttle, (voltage / first voltage)^k, by weighted least squares on logarithms.
+
+    The standard deviation is that of the gains, or their scatter about the curve where that is larger.
+
+    Args:
+        voltages: of the flights [V].
+        gains: of the thrust, one of each flight.
+        flown: exponent by which the throttle already followed the voltage in these flights.
+    """
+    x = np.log(np.asarray(voltages) / voltages[0])
+    y = np.log([gain.value / gains[0].value for gain in gains])[1:]
+    noise = np.array([gain.sigma / gain.value for gain in gains])
+    covariance = np.diag(noise[1:] ** 2) + noise[0] ** 2  # the first gain is in every ratio
+    W, x1 = np.linalg.inv(covariance), x[1:]
+    information = x1 @ W @ x1
+    more = float(x1 @ W @ y / max(information, 1e-12))
+    k, left, free = flown + more, y - more * x1, len(y) - 1
+    scatter = sqrt(max(float(left @ W @ left) / free, 1.0)) if free else 1.0
+    sigma, spread, why = scatter / sqrt(max(information, 1e-12)), float(np.ptp(x)), next((one.refused for one in gains if one.refused), "")
+    if not why and spread < LEAST_VOLTAGES:
+        why = f"voltages are {100 * spread:.0f} % apart; {100 * LEAST_VOLTAGES:.0f} are needed"
+    elif not why and np.max(np.abs(left), initial=0.0) > MISFIT:
+        why = f"a power of the voltage misses the thrust by {100 * np.max(np.abs(left)):.0f} %; {100 * MISFIT:.0f} are allowed"
+    elif not why and not 0.5 <= k <= 4.0:
+        why = f"an exponent of {k:.2g} is no battery's: 0.5 to 4"
+    return _judged("actuation.battery.exponent", k, sigma, "", why)
 
 
 def drag(record: Record, vehicle: Vehicle, axis: int) -> Found:

@@ -15,7 +15,7 @@ from perch_core.vehicle import Vehicle  # noqa: E402
 from perch_eval.identification.fit import Answer, Found  # noqa: E402
 
 
-def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str) -> str:
+def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str, voltages: Sequence[float] = ()) -> str:
     """A vehicle file that extends `base` by what was identified; all else stays as it is there, with the reason in a comment.
 
     Args:
@@ -24,12 +24,16 @@ def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flig
         base: its name, or its file.
         name: of the identified vehicle.
         flight: of which it was identified, in words.
+        voltages: of the flights [V], the first one that of the thrust curve.
     """
     lines: list[str] = []
     for key in dict.fromkeys(one.key.split("[")[0] for one in found):
         group = [one for one in found if one.key.split("[")[0] == key]
         owner = vehicle.actuation if key.startswith("actuation.") else vehicle
         field = key.split(".")[-1]
+        if key == "actuation.battery.exponent" and not group[0].refused:
+            text = f"{{reference: {voltages[0]:g}, exponent: {group[0].value:.4g}, range: [{min(voltages):g}, {max(voltages):g}]}}"
+            lines.append(f"  battery: {text}  # exponent +- {group[0].sigma:.2g}")
         old = getattr(owner, field, None)
         if old is None:
             continue

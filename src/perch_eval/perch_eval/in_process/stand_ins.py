@@ -1,4 +1,4 @@
-"""Components that take the place of others in a flight: the truth for an estimate, an error model for what a camera would have found."""
+"""Components that take the place of others in a flight: an error model for what a camera would have found."""
 
 from __future__ import annotations
 
@@ -11,43 +11,16 @@ from perch_core.component import Component, Input, Output
 from perch_core.errors import PerchError
 from perch_core.lines import Segment
 from perch_sim.scenario import Scenario
-from perch_core.values import CameraModel, EstimatorHealth, MappedPowerline, OdometryState, PowerlineMap
+from perch_core.values import CameraModel, MappedPowerline, PowerlineMap
 from perch_sim import seeding
 
 MAP_ERROR = 0.02  # 1 sigma of each axis of both ends of a mapped line [m]; the mapper's bar is 3 cm
-MAP_PERIOD = 100_000_000     # [ns]
-STATUS_PERIOD = 100_000_000  # [ns]
-RUNNING = 1
+MAP_PERIOD = 100_000_000  # [ns]
 
 
 @dataclass(frozen=True)
 class NoParameters:
     """Of a component that has none."""
-
-
-class TruthEstimator(Component[NoParameters]):
-    """The true state as `odometry`, in the place of the estimator."""
-
-    config_type = NoParameters
-
-    truth = Input(OdometryState, "ground_truth/odometry")
-    odometry = Output(OdometryState, "odometry")
-    status = Output(EstimatorHealth, "estimator/status")
-
-    def __init__(self, config: NoParameters = NoParameters()) -> None:
-        super().__init__(config)
-        self._next = 0
-
-    def on_truth(self, state: OdometryState) -> None:
-        """Pass a state on."""
-        self.odometry(self.believed(state))
-        if state.stamp >= self._next:
-            self._next = state.stamp + STATUS_PERIOD
-            self.status(EstimatorHealth(state.stamp, RUNNING, 0.0, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, "the truth"))
-
-    def believed(self, state: OdometryState) -> OdometryState:
-        """What is believed of a true state."""
-        return state
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ smaller program, and keeps every limit. Where the printed text cannot be used as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
 from time import process_time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +40,8 @@ _DERIVATIVES = tuple(bernstein.derivative(np.eye(N + 1), order) for order in ran
 
 def row(order: int, s: float, duration: float) -> np.ndarray:
     """The order-th derivative of the basis at t - t_(i-1) = s duration, shape (15,): times c_id it is that of p_id. [M:eq6, M:eq17]"""
-    return _DERIVATIVES[order] @ bernstein.basis(N - order, s) / duration**order
+    derivative: np.ndarray = _DERIVATIVES[order] @ bernstein.basis(N - order, s) / duration**order
+    return derivative
 
 
 def cost_matrix(duration: float, j: int) -> np.ndarray:
@@ -51,7 +53,8 @@ def cost_matrix(duration: float, j: int) -> np.ndarray:
 def _unit_cost(j: int) -> np.ndarray:
     n = N - j
     products = [[comb(n, i) * comb(n, k) / comb(2 * n, i + k) / (2 * n + 1) for k in range(n + 1)] for i in range(n + 1)]
-    return _DERIVATIVES[j] @ np.array(products) @ _DERIVATIVES[j].T
+    cost: np.ndarray = _DERIVATIVES[j] @ np.array(products) @ _DERIVATIVES[j].T
+    return cost
 
 
 def place(vector: np.ndarray, segment: int, f: int) -> np.ndarray:
@@ -61,7 +64,7 @@ def place(vector: np.ndarray, segment: int, f: int) -> np.ndarray:
     return out.ravel()
 
 
-def equalities(durations: np.ndarray, knots: list[dict[int, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def equalities(durations: np.ndarray, knots: Sequence[dict[int, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """A_d and b_d of all dimensions: what is imposed at the knots [M:eq6], and continuity there. [M:eq7]
 
     Args:
@@ -76,7 +79,7 @@ def equalities(durations: np.ndarray, knots: list[dict[int, np.ndarray]]) -> tup
         before = [place(row(order, 1.0, durations[k - 1]), k - 1, f) for order in range(SMOOTH + 1)] if k else None
         after = [place(row(order, 0.0, durations[k]), k, f) for order in range(SMOOTH + 1)] if k < f else None
         for order, value in imposed.items():
-            rows.append((after or before)[order])
+            rows.append((after or before or [])[order])
             right.append(np.atleast_1d(value))
         if before and after:
             rows += [b - a for b, a in zip(before, after)]
@@ -137,10 +140,11 @@ class Program:
     def coefficients(self, w: np.ndarray) -> np.ndarray:
         """Bernstein coefficients, shape (f, dimensions, 15)."""
         c = self.centre + self.spread @ w.reshape(self.centre.shape[1], -1).T
-        return c.T.reshape(-1, len(self.durations), N + 1).transpose(1, 0, 2).copy()
+        rows: np.ndarray = c.T.reshape(-1, len(self.durations), N + 1)
+        return rows.transpose(1, 0, 2).copy()
 
 
-def program(durations: np.ndarray, knots: list[dict[int, np.ndarray]], j: int,
+def program(durations: np.ndarray, knots: Sequence[dict[int, Any]], j: int,
             bounds: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None) -> Program:
     """min c' Q c subject to A c = b and y <= G c <= z. [M:eq4, M:eq8]
 
@@ -239,7 +243,8 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pa
     """
     begin = process_time()
     low, high = Limits.of(settings, vehicle).thrust
-    durations, done, solved = np.array(problem.segment_times, float), [], False
+    durations, solved = np.array(problem.segment_times, float), False
+    done: list[Any] = []
     while not solved and durations.sum() <= settings.duration_max and len(done) < settings.iterations_max:
         chosen = position_program(problem, settings, vehicle, durations)
         solution = least_norm(chosen.rows, chosen.lower, chosen.upper, settings.solver)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 
 
 @compiled
-def sturm_chain(powers):
+def sturm_chain(powers: Array) -> tuple[Array, np.ndarray]:
     """S_0 ... S_N of a polynomial in ascending powers, each scaled to a largest coefficient of 1. [defines M:eq18]
 
     Returns:
@@ -55,7 +56,7 @@ def sturm_chain(powers):
 
 
 @compiled
-def _sign_changes(chain, degrees, x):
+def _sign_changes(chain: Array, degrees: np.ndarray, x: float) -> int:
     changes, last = 0, 0.0
     for k in range(len(degrees)):
         value = 0.0
@@ -69,7 +70,7 @@ def _sign_changes(chain, degrees, x):
 
 
 @compiled
-def count_roots(powers, low, high):
+def count_roots(powers: Array, low: float, high: float) -> int:
     """STURM(F, t_0, t_f): number of distinct roots in (low, high]. [M:eq18]
 
     The appendix' example t^4 + t^3 - t - 1 has one in (0, 2]. [defines M:eq19]
@@ -79,7 +80,7 @@ def count_roots(powers, low, high):
 
 
 @compiled
-def global_bound_check(powers, bound, low, high):
+def global_bound_check(powers: Array, bound: float, low: float, high: float) -> bool:
     """True if H(t) < bound for all t in [low, high]. [M:alg1]
 
     Args:

@@ -47,10 +47,14 @@ class Gather:
         source = self._length + np.arange(len(rows))
         self._parts.append(values)
         self._length += len(rows)
-        self._rows.append(rows), self._columns.append(columns), self._source.append(source)
+        self._rows.append(rows)
+        self._columns.append(columns)
+        self._source.append(source)
         if mirror:
             off = rows != columns
-            self._rows.append(columns[off]), self._columns.append(rows[off]), self._source.append(source[off])
+            self._rows.append(columns[off])
+            self._columns.append(rows[off])
+            self._source.append(source[off])
 
     def matrix(self) -> ca.MX:
         """The matrix; values at the same place are added up."""

@@ -20,7 +20,8 @@ ROLL_ASIDE = 0.5  # turn about b3 by which a perch with the line in view begins 
 def smooth(s: np.ndarray) -> np.ndarray:
     """Quintic from 0 to 1 with zero slope and curvature at both ends."""
     s = np.clip(s, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
+    rising: np.ndarray = s**3 * (10 - 15 * s + 6 * s**2)
+    return rising
 
 
 def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, lean_W: np.ndarray) -> tuple[np.ndarray, float]:

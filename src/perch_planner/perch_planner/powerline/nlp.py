@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -145,7 +146,7 @@ class Problem:
         if self.structure.solver == "fatrop":
             hess_l = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [gradient, H], ["x", "p", "lam_f", "lam_g"],
                                  ["grad_gamma_x", "hess_gamma_x_x"])
-            options = {"structure_detection": "auto", "equality": self._equality.tolist(), "fatrop.print_level": 0}
+            options: dict[str, Any] = {"structure_detection": "auto", "equality": self._equality.tolist(), "fatrop.print_level": 0}
         else:
             hess_l = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [ca.triu(H)], ["x", "p", "lam_f", "lam_g"],
                                  ["triu_hess_gamma_x_x"])
@@ -154,7 +155,8 @@ class Problem:
         options |= {"print_time": False, "expand": False, "error_on_fail": False, "calc_lam_p": False,
                     "cache": {"nlp_jac_g": jac_g, "nlp_hess_l": hess_l},
                     f"{name}.tol": self.tolerance, f"{name}.max_iter": self.max_iterations, **self._start_options(name)}
-        self._solver = ca.nlpsol("powerline", name, {"x": x, "f": cost, "g": g, "p": p}, options)
+        problem: Any = {"x": x, "f": cost, "g": g, "p": p}
+        self._solver = ca.nlpsol("powerline", name, problem, options)
 
     def _start_options(self, name: str) -> dict[str, float]:
         """How to begin from a good guess: with a small barrier, and without pushing it far off its active bounds."""

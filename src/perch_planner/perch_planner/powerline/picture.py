@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -35,14 +36,16 @@ class SideView:
     def __call__(self, points_W: np.ndarray) -> np.ndarray:
         """Points in W, shape (..., 3), as (distance towards the line, height), shape (..., 2)."""
         points_W = np.asarray(points_W, float)
-        return np.stack([(points_W - self.origin) @ self.right_W, points_W[..., 2]], axis=-1)
+        seen: np.ndarray = np.stack([(points_W - self.origin) @ self.right_W, points_W[..., 2]], axis=-1)
+        return seen
 
     def body(self, state: np.ndarray, radii: tuple[float, float, float]) -> np.ndarray:
         """Outline of the body's ellipsoid, shape (60, 2): the projection of an ellipsoid is an ellipse."""
         A = np.stack([self.right_W, [0.0, 0.0, 1.0]]) @ so3.quat_to_matrix(state[Q]) @ np.diag(radii)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         angle = np.linspace(0, 2 * np.pi, 60)
-        return self(state[P]) + (U @ (s[:, None] * np.array([np.cos(angle), np.sin(angle)]))).T
+        outline: np.ndarray = self(state[P]) + (U @ (s[:, None] * np.array([np.cos(angle), np.sin(angle)]))).T
+        return outline
 
 
 def _scene(planned: PlannedProblem, axes: Axes) -> SideView:
@@ -52,13 +55,13 @@ def _scene(planned: PlannedProblem, axes: Axes) -> SideView:
         target = line.id == planned.request.target_line
         axes.plot(*ends.T, color=WIRE, lw=2 if target else 1, alpha=0.5)
         axes.plot(*view(line.centre), "o", color=WIRE, ms=7 if target else 4)
-        axes.annotate(f"line {line.id}", view(line.centre), xytext=(6, 6), textcoords="offset points", fontsize=8)
+        axes.annotate(f"line {line.id}", tuple(view(line.centre)), xytext=(6, 6), textcoords="offset points", fontsize=8)
     axes.axhline(planned.problem.settings.height_min, color="0.5", ls=":", lw=1)
     axes.set(xlabel="towards the line [m]", ylabel="height [m]", aspect="equal")
     return view
 
 
-def _body(axes: Axes, view: SideView, planned: PlannedProblem, state: np.ndarray, colour: str) -> list:
+def _body(axes: Axes, view: SideView, planned: PlannedProblem, state: np.ndarray, colour: str) -> list[Any]:
     R_WB = so3.quat_to_matrix(state[Q])
     mount = planned.vehicle.mounts[planned.problem.settings.camera]
     eye = state[P] + R_WB @ mount.p_BC
@@ -95,6 +98,7 @@ def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | No
     mount = planned.vehicle.mounts[planned.problem.settings.camera]
     figure = Figure(figsize=(8, 6), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1, sharex=True)
+    assert planned.plan.perch is not None
     perches = [(planned.plan.perch, PERCH, "with perception awareness" if planned.request.perception else "as planned")]
     if without is not None:
         perches.append((without, RECOVERY, "without"))
@@ -119,13 +123,13 @@ def draw_animation(planned: PlannedProblem, path: Path, rate: float = 20.0) -> N
     states = np.concatenate([trajectory.p, trajectory.q], axis=1)
     axes.plot(*view(trajectory.p).T, color="0.7", lw=1)
     joint = planned.plan.perch.duration if planned.plan.perch is not None else 0.0
-    drawn: list = []
+    drawn: list[Any] = []
 
-    def frame(k: int) -> list:
+    def frame(k: int) -> list[Any]:
         while drawn:
             drawn.pop().remove()
         drawn.extend(_body(axes, view, planned, states[k], PERCH if trajectory.times[k] <= joint else RECOVERY))
         axes.set_title(f"{trajectory.times[k]:.2f} s", fontsize=10)
         return drawn
 
-    FuncAnimation(figure, frame, frames=len(states)).save(path, writer=PillowWriter(fps=rate))
+    FuncAnimation(figure, frame, frames=len(states)).save(path, writer=PillowWriter(fps=round(rate)))

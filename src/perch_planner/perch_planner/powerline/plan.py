@@ -81,7 +81,8 @@ class PowerlinePlan:
             start_time: stamp of the start [s].
             step: wanted spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always there.
         """
-        times, states = [], []
+        times: list[np.ndarray] = []
+        states: list[np.ndarray] = []
         begin = 0.0
         for part in self.parts:
             stride = max(1, round(step * (len(part.times) - 1) / part.duration))
@@ -89,7 +90,7 @@ class PowerlinePlan:
             times.append(begin + part.times[rows])
             states.append(part.states[rows])
             begin += part.duration
-        times, states = np.concatenate(times), np.concatenate(states)
-        a_W, dw_B = accelerations(model, states)
-        return SampledTrajectory(times=times, p=states[:, P], q=states[:, Q], v=states[:, V], w=states[:, W], a=a_W,
-                                 dw=dw_B, rotor_thrust=states[:, THRUST], start_time=start_time)
+        x = np.concatenate(states)
+        a_W, dw_B = accelerations(model, x)
+        return SampledTrajectory(times=np.concatenate(times), p=x[:, P], q=x[:, Q], v=x[:, V], w=x[:, W], a=a_W, dw=dw_B,
+                                 rotor_thrust=x[:, THRUST], start_time=start_time)

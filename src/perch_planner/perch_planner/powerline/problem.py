@@ -111,6 +111,7 @@ class PowerlineProblem:
             q_WB = np.array(self.perch.orientation)
             perch = PerchPose.at(np.array(self.perch.position), q_WB / np.linalg.norm(q_WB), velocity)
         else:
+            assert self.perch.pitch_deg is not None  # it comes with the point
             perch = PerchPose.on_line(target, np.array(self.perch.point), np.radians(self.perch.pitch_deg),
                                       vehicle.wire_offset, start[:3], velocity)
         return PowerlineRequest(start, request.lines, self.target, perch, self.perception, self.recovery)

@@ -31,7 +31,7 @@ class PerchPose:
     def at(cls, p_WB: np.ndarray, q_WB: np.ndarray, v_W: np.ndarray | None = None) -> PerchPose:
         """From a full pose (quaternion xyzw); of its attitude only b3 counts, as the gripper may turn about it."""
         p_WB, q_WB = np.array(p_WB, float), np.array(q_WB, float)
-        norm = np.linalg.norm(q_WB)
+        norm = float(np.linalg.norm(q_WB))
         if not abs(norm - 1) < 1e-2:
             raise PlanningRefusal("bad_input", "perch pose", -abs(norm - 1), f"perch quaternion has norm {norm:.4f}, not 1")
         return cls(p_WB, so3.quat_to_matrix(q_WB / norm)[:, 2], np.zeros(3) if v_W is None else np.array(v_W, float))

@@ -9,11 +9,13 @@ compiled calls does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from perch_core import lines, rotor_model
+from perch_core.arrays import quaternion, vector3
 from perch_core.camera import CameraMount
 from perch_core.components import Scalar, Vector, components, dot, matrix_of
 from perch_core.rotor_model import INPUTS, P, Q, STATES, THRUST, V, W, RotorModel
@@ -46,9 +48,7 @@ class StageModel:
     @classmethod
     def of(cls, rotor: RotorModel, thrust_rate_max: float, body_radii: Vector, camera: CameraMount) -> StageModel:
         """The stage model of a vehicle's parts."""
-        q_BC = quat_from_matrix(camera.R_BC)
-        return cls(rotor, float(thrust_rate_max), tuple(map(float, body_radii)),
-                   tuple(float(v) for v in camera.p_BC), tuple(float(v) for v in q_BC))
+        return cls(rotor, float(thrust_rate_max), vector3(body_radii), vector3(camera.p_BC), quaternion(quat_from_matrix(camera.R_BC)))
 
 
 def _step(model: StageModel, x: Vector, u: Vector, unit_step: Scalar) -> Vector:
@@ -217,7 +217,9 @@ def stage_functions(model: StageModel) -> StageFunctions:
 
 
 def _nonzeros(matrix: ca.SX) -> ca.SX:
-    return ca.vertcat(*matrix.nonzeros())
+    entries: Any = matrix.nonzeros()
+    stacked: ca.SX = ca.vertcat(*entries)
+    return stacked
 
 
 def line_parameters(segment: lines.Segment, radius_reduction: float = 0.0) -> np.ndarray:

@@ -27,7 +27,7 @@ from perch_core.tag_board import TagBoard, load_board
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.specification import RUNS_MAX, Campaign, load_campaign
 from perch_eval.flyable import check_flight
-from perch_eval.fuzz.report import Report
+from fuzzing.report import Report
 from perch_eval.in_process.parameters import COMPONENTS, component_class, nested
 from perch_eval.node_launch import HOST_PARAMETERS, flattened, parameters_in
 from perch_planner.powerline.problem import PowerlineProblem

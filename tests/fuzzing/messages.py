@@ -25,10 +25,10 @@ from perch_core.component import Input, Job, JobFailed, JobStopped, Output, port
 from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
 from perch_core.ros import topics
-from perch_eval.fuzz import sense
-from perch_eval.fuzz.report import Report
-from perch_eval.fuzz.spoiled import Way, in_effect, senseless, some_way, spoilt
-from perch_eval.fuzz.streams import FLIGHTS, Event, component, is_rendered, recorded
+from fuzzing import sense
+from fuzzing.report import Report
+from fuzzing.spoiled import Way, in_effect, senseless, some_way, spoilt
+from fuzzing.streams import FLIGHTS, Event, component, is_rendered, recorded
 
 SLOW = 2.0        # of processor time [s]
 HUNG = 600.0      # of the wall clock, for a whole game [s]

@@ -9,8 +9,6 @@ from collections import Counter
 from pathlib import Path
 from typing import TextIO
 
-CASES = Path("tests") / "fuzz" / "cases"
-
 
 class Report:
     """Given to a hunt; it asks `going` before each input, and tells the outcome of each.

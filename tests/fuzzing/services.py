@@ -27,11 +27,11 @@ from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
     Ask, ChooseLaw, MappedPowerline, PerchGoal, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, seconds)
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
-from perch_eval.fuzz import messages, sense
-from perch_eval.fuzz.messages import Nonsense
-from perch_eval.fuzz.report import Report
-from perch_eval.fuzz.spoiled import Way, in_effect, senseless, some_way, spoilt
-from perch_eval.fuzz.streams import Event, component, recorded
+from fuzzing import messages, sense
+from fuzzing.messages import Nonsense
+from fuzzing.report import Report
+from fuzzing.spoiled import Way, in_effect, senseless, some_way, spoilt
+from fuzzing.streams import Event, component, recorded
 from perch_eval.in_process.parameters import nested
 
 PATIENCE = 15.0   # for an answer: the longest deadline of a planner, and some [s]
