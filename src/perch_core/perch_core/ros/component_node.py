@@ -124,12 +124,12 @@ class ComponentNode(Node):
             emitter = getattr(self.component, port.name)
             self.wiring.writes(publisher.topic_name, self.get_fully_qualified_name())
             emitter.receivers.append(self._emitted(publisher.topic_name, publication))
-            emitter.asked = self._asked(emitter, publisher.topic_name, publication)
+            emitter.asked = self._wanted(emitter, publisher.topic_name, publication)
 
     def _emitted(self, topic: str, publication: Publication) -> Callable[[Any], None]:
         return partial(self.wiring.emit, topic, publication)
 
-    def _asked(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
+    def _wanted(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
         """Who takes values beside this host, a neighbour, or somebody outside."""
         return lambda: len(emitter.receivers) > 1 or self.wiring.read_here(topic) or publication.heard()
 
