@@ -8,7 +8,7 @@ from perch_core import bernstein
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_planner import plan_checks, reduced_qp, reference_element, solvers
+from perch_planner import plan_checks, reduced_qp, reference_element, segment_program, solvers
 from perch_planner.contact_constraints import Contact, conditions, tube_bounds, tube_times
 from perch_planner.cutting import limit_cuts
 from perch_planner.linear_bounds import Bounds
@@ -92,6 +92,27 @@ def test_solvers_find_the_same_minimum():
     first, *others = (solved(made, rows, name) for name in solvers.SOLVERS)
     for other in others:
         assert other == pytest.approx(first, abs=1e-5)
+
+
+def test_a_program_that_starts_at_the_multipliers_of_another_has_the_same_minimum():
+    """Also where these are of rows that do not matter any more, and where the program has no solution."""
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        rows = rng.normal(size=(30, 12))
+        rows /= np.linalg.norm(rows, axis=1)[:, None]
+        lower = rng.uniform(-1.0, 0.4, 30)
+        cold = solvers.least_norm(rows, lower, lower + 0.5)
+        warm = solvers.least_norm(rows, lower, lower + 0.5, dual=rng.normal(size=30) * (rng.random(30) < 0.3))
+        assert warm.solved == cold.solved
+        if cold.solved:
+            assert np.abs(warm.w - cold.w).max() < 1e-9
+            again = solvers.least_norm(rows, lower, lower + 0.5, dual=cold.dual)
+            assert np.array_equal(np.sign(again.dual), np.sign(cold.dual))
+
+
+def test_multipliers_follow_the_keys_of_their_rows():
+    carried = segment_program._carried(np.array([2, 5, 7]), np.array([1.0, -2.0, 3.0]), np.array([1, 5, 6, 7, 9]))
+    assert carried.tolist() == [0.0, -2.0, 0.0, 3.0, 0.0]
 
 
 def test_least_norm_is_the_minimum_that_scipy_finds():

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from perch_core import bernstein
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_planner import taylor_models
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState
 from perch_planner.rotor_proof import prove_rotors
-from perch_planner.rotor_thrusts import _motion, _thrusts_at, rotor_model
+from perch_planner.rotor_thrusts import bases_at, motion, rotor_model, thrusts_at
 
 VEHICLE = load_vehicle("snapdragon")
 ROTORS = rotor_model(VEHICLE)
@@ -63,8 +62,9 @@ def planned(request):
     found = plan(PerchProblem(StartState((0.0, 0.0, 1.2)), surface), PerchSettings(), VEHICLE)
     rows = found.trajectory.coefficients
     position, yaw, durations = np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3]), found.trajectory.durations
-    bases = tuple(bernstein.basis(n, np.linspace(0.0, 1.0, 2000)) for n in range(10, 15))
-    thrusts = np.array([_thrusts_at(row, *ROTORS) for i in range(len(durations)) for row in _motion(position[i], yaw[i], durations[i], bases)])
+    bases = bases_at(np.linspace(0.0, 1.0, 2000))
+    thrusts = np.array([thrusts_at(x, k, *ROTORS) for i in range(len(durations))
+                        for x in [motion(position[i], yaw[i], durations[i], bases)] for k in range(2000)])
     certificate = next(c for c in found.certificates if c.quantity == "rotor_thrust")
     return (position, yaw, durations), certificate, thrusts.min(), thrusts.max()
 

@@ -14,8 +14,8 @@ from perch_planner.reference_element import FUNCTIONS, HERMITE
 
 
 @compiled
-def _place(local, segment, first, spread, centre, column, constant):
-    """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum."""
+def _place(local, segment, first, wide, centre, column, constant):
+    """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum; wide: `spread` transposed."""
     count = FUNCTIONS if first >= 0 else HERMITE
     for d in range(3):
         constant[d] = 0.0
@@ -26,7 +26,7 @@ def _place(local, segment, first, spread, centre, column, constant):
         for d in range(3):
             constant[d] += local[k] * centre[n, d]
         for i in range(len(column)):
-            column[i] += local[k] * spread[i, n]
+            column[i] += local[k] * wide[n, i]
 
 
 @compiled
@@ -48,13 +48,13 @@ def _normalise(rows, lower, upper):
 @compiled
 def rows_of(durations, first, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
     """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); arguments: fields of `ReducedProgram` and `Bounds`."""
-    m = len(spread)
+    m, wide = len(spread), spread.T.copy()
     rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
     column, constant = np.empty(m), np.empty(3)
     for q in range(len(owner)):
         i, r = segments[q], owner[q]
         if q == 0 or i != segments[q - 1] or places[q] != places[q - 1] or orders[q] != orders[q - 1]:
-            _place(functional(durations[i], unit, places[q], orders[q]), i, first[i], spread, centre, column, constant)
+            _place(functional(durations[i], unit, places[q], orders[q]), i, first[i], wide, centre, column, constant)
         for d in range(3):
             if direction[q, d] != 0.0:
                 for k in range(m):

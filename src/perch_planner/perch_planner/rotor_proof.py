@@ -2,8 +2,10 @@
 
 The rotor thrusts that `rotor_thrusts` samples are no polynomials, but they are made of some: specific force, jerk and snap, yaw and
 two derivatives. On an interval each of these is a Taylor model of second order, whose second derivative lies in the hull of its
-Bernstein coefficients, and the same formulas in such numbers (`taylor_models`) bound each rotor's thrust. An interval whose bounds
-leave the limits is halved.
+Bernstein coefficients, and the same formulas in such numbers (`taylor_models`) bound each rotor's thrust and its second derivative.
+Where the thrust itself is not bounded closely enough, samples are: between two of them, a distance h apart, a function whose second
+derivative lies in [a, b] leaves their hull by at most max(b, 0) h^2 / 8 downwards and max(-a, 0) h^2 / 8 upwards. An interval whose
+bounds leave the limits is halved.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import numpy as np
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import split, time_derivative
+from perch_planner.rotor_thrusts import add_values, bases_at, thrusts_at
 from perch_planner.taylor_models import (
     ROUNDING, ZERO, add, axpy, cosine, cross, dot, greatest, inverse_root, least, mul, scale, sine, sub, times, vector_add)
 
@@ -21,8 +24,11 @@ _ROWS = 4 * _ORDERS
 _SIZES = np.array([13, 12, 11, 10, 9] * 3 + [15, 14, 13, 12, 11])
 _DEPTH = 30
 _NODES = 20_000
+_SAMPLES = 16    # steps between samples of an interval
+_LONGEST = 0.1   # [s] longer intervals are halved at once: their models are wide
 _TIGHT = 0.02    # proved bounds lie within this share of the range from what is attained
 _SMALLEST = 1e-6  # squared lengths that may be less have no direction
+_BASES = bases_at(np.linspace(0.0, 1.0, _SAMPLES + 1))
 
 
 @compiled
@@ -124,6 +130,21 @@ def rotor_models(numbers, mass, J, mixing, out):
 
 
 @compiled
+def _sampled(rows, mass, J, mixing):
+    """Least and greatest thrust of a rotor [N] among the samples of an interval; rows: of `_rows`, of the interval."""
+    x = np.zeros((12, _SAMPLES + 1))
+    for d in range(4):
+        for order in range(3):
+            row = _ORDERS * d + order
+            add_values(rows[row, :_SIZES[row]], _BASES[_SIZES[row] - 11], x[3 * order + d if d < 3 else 9 + order])
+    lowest, highest = np.inf, -np.inf
+    for k in range(_SAMPLES + 1):
+        a, b, c, d = thrusts_at(x, k, mass, J, mixing)
+        lowest, highest = min(lowest, min(min(a, b), min(c, d))), max(highest, max(max(a, b), max(c, d)))
+    return lowest, highest
+
+
+@compiled
 def prove_rotors(coefficients, yaw, durations, lowest, highest, low, high, mass, J, mixing):
     """Prove that each rotor's thrust stays within [low, high], or find where it does not.
 
@@ -138,9 +159,9 @@ def prove_rotors(coefficients, yaw, durations, lowest, highest, low, high, mass,
     """
     tight, proved_low, proved_high = _TIGHT * (high - low), lowest, highest
     numbers, rotors = np.empty((4, 3, 4)), np.empty((4, 4))
-    rows, length = np.empty((_DEPTH + 2, _ROWS, 15)), np.empty(_DEPTH + 2)
+    rows, length, whole = np.empty((_DEPTH + 2, _ROWS, 15)), np.empty(_DEPTH + 2), np.empty((_ROWS, 15))
     nodes = 0
-    for i in range(len(durations)):
+    for i in range(len(durations) - 1, -1, -1):  # backwards: the end asks most of the rotors
         _rows(coefficients[i], yaw[i], durations[i], rows[0])
         length[0] = durations[i]
         top = 1
@@ -148,15 +169,24 @@ def prove_rotors(coefficients, yaw, durations, lowest, highest, low, high, mass,
             top -= 1
             nodes += 1
             half = 0.5 * length[top]
+            if length[top] <= _LONGEST:
+                whole[:] = rows[top]
             _halve(rows[top], rows[top + 1], half, numbers)
-            if rotor_models(numbers, mass, J, mixing, rotors):
-                below, above = np.inf, -np.inf
+            if length[top] <= _LONGEST and rotor_models(numbers, mass, J, mixing, rotors):
+                below, above, drop, lift = np.inf, -np.inf, 0.0, 0.0
                 for q in range(4):
                     rotor = rotors[q, 0], rotors[q, 1], rotors[q, 2], rotors[q, 3]
                     lowest, highest = min(lowest, rotor[0]), max(highest, rotor[0])
-                    below, above = min(below, least(rotor) - ROUNDING), max(above, greatest(rotor) + ROUNDING)
+                    below, above = min(below, least(rotor)), max(above, greatest(rotor))
+                    drop, lift = max(drop, rotor[2] + rotor[3]), max(lift, rotor[3] - rotor[2])
+                drop, lift = drop / (2 * _SAMPLES**2), lift / (2 * _SAMPLES**2)
+                if max(drop, lift) < tight and not (below > max(low, lowest - tight) and above < min(high, highest + tight)):
+                    at_least, at_most = _sampled(whole, mass, J, mixing)
+                    lowest, highest = min(lowest, at_least), max(highest, at_most)
+                    below, above = max(below, at_least - drop), min(above, at_most + lift)
                 if lowest < low or highest > high:
                     return False, lowest, highest
+                below, above = below - ROUNDING, above + ROUNDING
                 if below >= max(low, lowest - tight) and above <= min(high, highest + tight):
                     proved_low, proved_high = min(proved_low, below), max(proved_high, above)
                     continue

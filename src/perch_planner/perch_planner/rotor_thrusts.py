@@ -12,6 +12,8 @@ It is smooth in acceleration, jerk and snap: its linearisation at the present pl
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from perch_core import bernstein
@@ -21,11 +23,10 @@ from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.bounds import time_derivative
 
-_FINER = 4          # samples from one bound to the next
-_SAMPLES = 0.5 - 0.5 * np.cos(np.pi * np.arange(48 * _FINER + 1) / (48 * _FINER))  # dense at the ends, where polynomials turn fastest
-_PLACES = _SAMPLES[::_FINER].copy()  # where a rotor is bounded
-_SAMPLE_BASES = tuple(bernstein.basis(n, _SAMPLES) for n in range(10, 15))
-_PLACE_BASES = tuple(bernstein.basis(n, _PLACES) for n in range(10, 15))
+_COUNT = 49
+_FINER = 4  # samples from one place to the next, where a segment's thrusts come near a limit
+_SAMPLES = 0.5 - 0.5 * np.cos(np.pi * np.arange(_FINER * (_COUNT - 1) + 1) / (_FINER * (_COUNT - 1)))
+_PLACES = _SAMPLES[::_FINER].copy()  # where a rotor is bounded; dense at the ends, where polynomials turn fastest
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
 _ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
@@ -36,7 +37,13 @@ _BETWEEN = 1.5      # and by this multiple of what was seen between the places
 
 def rotor_model(vehicle: Vehicle) -> tuple[float, tuple[float, float, float], np.ndarray]:
     """What the kernels need of a vehicle: mass [kg], principal inertias [kg m^2], wrench to rotor thrusts, shape (4, 4)."""
-    return vehicle.mass, tuple(float(x) for x in vehicle.inertia), np.ascontiguousarray(np.linalg.inv(vehicle.allocation))
+    return vehicle.mass, tuple(float(x) for x in vehicle.inertia), _inverse(tuple(vehicle.allocation.ravel().tolist()))
+
+
+@lru_cache(maxsize=16)
+def _inverse(entries: tuple[float, ...]) -> np.ndarray:
+    """Inverse of a matrix of four rows: every plan of a vehicle takes the same."""
+    return np.ascontiguousarray(np.linalg.inv(np.reshape(entries, (4, 4))))
 
 
 @compiled
@@ -55,31 +62,40 @@ def thrusts_of(f, j, s, heading, mass, J, mixing):
             mixing[3, 0] * T + mixing[3, 1] * M[0] + mixing[3, 2] * M[1] + mixing[3, 3] * M[2])
 
 
+def bases_at(places: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Bernstein bases of degree 10 to 14 at places in [0, 1], each of shape (degree + 1, places)."""
+    return tuple(bernstein.basis(n, places).T.copy() for n in range(10, 15))
+
+
+_BASES, _FINE_BASES = bases_at(_PLACES), bases_at(_SAMPLES)
+
+
 @compiled
-def _motion(coefficients, yaw, duration, bases):
-    """Specific force, jerk and snap, yaw and its first two derivatives where bases of degree 10 to 14 are given, shape (n, 12)."""
-    count = len(bases[0])
-    out = np.zeros((count, 12))
-    for order in range(2, 5):
-        rows, basis = time_derivative(coefficients, order, duration), bases[4 - order]
-        for k in range(count):
-            for d in range(3):
-                for i in range(rows.shape[1]):
-                    out[k, 3 * (order - 2) + d] += basis[k, i] * rows[d, i]
+def add_values(row, basis, out):
+    """Add the values of a polynomial, given by Bernstein coefficients, at the places of a basis."""
+    for i in range(len(row)):
+        for k in range(basis.shape[1]):
+            out[k] += row[i] * basis[i, k]
+
+
+@compiled
+def motion(coefficients, yaw, duration, bases):
+    """Specific force, jerk and snap, yaw and its first two derivatives at the places of `bases_at`, shape (12, places)."""
+    out = np.zeros((12, bases[0].shape[1]))
     for order in range(3):
-        rows, basis = time_derivative(yaw.reshape((1, 15)), order, duration), bases[4 - order]
-        for k in range(count):
-            for i in range(rows.shape[1]):
-                out[k, 9 + order] += basis[k, i] * rows[0, i]
-    for k in range(count):
-        out[k, 2] += GRAVITY
+        rows, turn = time_derivative(coefficients, order + 2, duration), time_derivative(yaw.reshape((1, 15)), order, duration)
+        for d in range(3):
+            add_values(rows[d], bases[2 - order], out[3 * order + d])
+        add_values(turn[0], bases[4 - order], out[9 + order])
+    out[2] += GRAVITY
     return out
 
 
 @compiled
-def _thrusts_at(x, mass, J, mixing):
-    """Rotor thrusts [N] of one row of `_motion`."""
-    return thrusts_of((x[0], x[1], x[2]), (x[3], x[4], x[5]), (x[6], x[7], x[8]), (x[9], x[10], x[11]), mass, J, mixing)
+def thrusts_at(x, k, mass, J, mixing):
+    """Rotor thrusts [N] of column k of `motion`."""
+    return thrusts_of((x[0, k], x[1, k], x[2, k]), (x[3, k], x[4, k], x[5, k]), (x[6, k], x[7, k], x[8, k]),
+                      (x[9, k], x[10, k], x[11, k]), mass, J, mixing)
 
 
 @compiled
@@ -92,45 +108,53 @@ def _vertex(values, k, sign):
     middle = min(max(k, 1), last - 1)
     before, here, after = values[middle - 1], values[middle], values[middle + 1]
     bend = before - 2.0 * here + after
-    if sign * bend >= 0.0:
-        return _SAMPLES[k], values[k]
-    shift = 0.5 * (before - after) / bend
+    shift = 0.5 * (before - after) / bend if sign * bend < 0.0 else 2.0
     if abs(shift) > 1.0:
-        return _SAMPLES[k], values[k]
+        return 0.5 - 0.5 * np.cos(np.pi * k / last), values[k]
     return 0.5 - 0.5 * np.cos(np.pi * (middle + shift) / last), here - 0.25 * (before - after) * shift
 
 
 @compiled
-def sampled(coefficients, yaw, durations, mass, J, mixing):
-    """Rotor thrusts of a plan: on the 49 places of each segment that may be bounded, and the extrema among all samples.
+def _segment(coefficients, yaw, duration, bases, mass, J, mixing):
+    """Rotor thrusts of a segment at the places of `bases_at`, shape (4, places) [N]."""
+    x = motion(coefficients, yaw, duration, bases)
+    out = np.empty((4, x.shape[1]))
+    for k in range(x.shape[1]):
+        out[0, k], out[1, k], out[2, k], out[3, k] = thrusts_at(x, k, mass, J, mixing)
+    return out
+
+
+@compiled
+def sampled(coefficients, yaw, durations, low, high, mass, J, mixing):
+    """Rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
         yaw: of the heading, shape (f, 15) [rad].
         durations: shape (f,) [s].
+        low, high: limits of a rotor's thrust [N]; segments that come near them are sampled more finely.
         mass, J, mixing: of `rotor_model`.
 
     Returns:
-        (thrusts, row): thrusts, shape (f, 49, 4) [N]; row: least and its time, greatest and its time, refined between
+        (thrusts, row): thrusts, shape (f, 4, 49) [N]; row: least and its time, greatest and its time, refined between
         the samples, shape (4,) [N, s].
     """
-    f = len(durations)
-    out, fine = np.empty((f, len(_PLACES), 4)), np.empty((4, len(_SAMPLES)))
-    row = np.array([np.inf, 0.0, -np.inf, 0.0])
+    f, near = len(durations), _NEAR * (high - low)
+    out, row = np.empty((f, 4, _COUNT)), np.array([np.inf, 0.0, -np.inf, 0.0])
     begin = 0.0
     for i in range(f):
         T = durations[i]
-        motion = _motion(coefficients[i], yaw[i], T, _SAMPLE_BASES)
-        for k in range(len(_SAMPLES)):
-            fine[0, k], fine[1, k], fine[2, k], fine[3, k] = _thrusts_at(motion[k], mass, J, mixing)
+        found = _segment(coefficients[i], yaw[i], T, _BASES, mass, J, mixing)
+        out[i] = found
+        if found.min() < low + near or found.max() > high - near:
+            found = _segment(coefficients[i], yaw[i], T, _FINE_BASES, mass, J, mixing)
         for q in range(4):
-            out[i, :, q] = fine[q, ::_FINER]
-            place, found = _vertex(fine[q], fine[q].argmin(), -1.0)
-            if found < row[0]:
-                row[0], row[1] = found, begin + place * T
-            place, found = _vertex(fine[q], fine[q].argmax(), 1.0)
-            if found > row[2]:
-                row[2], row[3] = found, begin + place * T
+            place, value = _vertex(found[q], found[q].argmin(), -1.0)
+            if value < row[0]:
+                row[0], row[1] = value, begin + place * T
+            place, value = _vertex(found[q], found[q].argmax(), 1.0)
+            if value > row[2]:
+                row[2], row[3] = value, begin + place * T
         begin += T
     return out, row
 
@@ -145,59 +169,54 @@ def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        Fields of `linear_bounds.Bounds`: for each rotor and place one bound on a sum of acceleration, jerk and snap. Terms
-        of one derivative at one place stand together.
+        (keys, bounds): fields of `linear_bounds.Bounds`: for each rotor and place one bound on a sum of acceleration, jerk and
+        snap, and an ascending number of each that names segment, place and rotor. Terms of one derivative at one place stand
+        together.
     """
     near, keep = _NEAR * (high - low), _KEEP * (high - low)
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
     below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
-    count = 0
-    for i in range(thrusts.shape[0]):
-        for k in range(thrusts.shape[1]):
-            for q in range(4):
-                count += thrusts[i, k, q] < low + near or thrusts[i, k, q] > high - near
-    owner, segments, orders = np.empty(3 * count, np.int64), np.empty(3 * count, np.int64), np.empty(3 * count, np.int64)
+    chosen = (thrusts < low + near) | (thrusts > high - near)
+    count = chosen.sum()
+    keys, owner = np.empty(count, np.int64), np.empty(3 * count, np.int64)
+    segments, orders = np.empty(3 * count, np.int64), np.empty(3 * count, np.int64)
     places, direction = np.empty(3 * count), np.empty((3 * count, 3))
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
     r = t = 0
-    slopes, known = np.empty((4, 9)), np.empty(4)
-    for i in range(thrusts.shape[0]):
-        motion, ready = np.empty((0, 12)), False
-        for k in range(thrusts.shape[1]):
-            chosen = 0
-            for q in range(4):
-                chosen += thrusts[i, k, q] < low + near or thrusts[i, k, q] > high - near
-            if chosen == 0:
+    slopes = np.empty((4, 9))
+    for i in range(len(durations)):
+        if not chosen[i].any():
+            continue
+        x = motion(coefficients[i], yaw[i], durations[i], _BASES)
+        for k in range(_COUNT):
+            if not (chosen[i, 0, k] or chosen[i, 1, k] or chosen[i, 2, k] or chosen[i, 3, k]):
                 continue
-            if not ready:
-                motion, ready = _motion(coefficients[i], yaw[i], durations[i], _PLACE_BASES), True
-            x = motion[k]
-            for q in range(4):
-                known[q] = -thrusts[i, k, q]
             for e in range(9):
-                step, value = _STEPS[e // 3], x[e]
-                x[e] += step
-                moved = _thrusts_at(x, mass, J, mixing)
-                x[e] = value
-                if e == 2:
-                    value -= GRAVITY  # the bound is on the acceleration
+                step, value = _STEPS[e // 3], x[e, k]
+                x[e, k] += step
+                moved = thrusts_at(x, k, mass, J, mixing)
+                x[e, k] = value
                 for q in range(4):
-                    slopes[q, e] = (moved[q] - thrusts[i, k, q]) / step
-                    known[q] += slopes[q, e] * value
+                    slopes[q, e] = (moved[q] - thrusts[i, q, k]) / step
             first = r
             for q in range(4):
-                if thrusts[i, k, q] < low + near:
-                    lower[r] = above + known[q]
-                    r += 1
-                elif thrusts[i, k, q] > high - near:
-                    upper[r] = below + known[q]
-                    r += 1
+                if not chosen[i, q, k]:
+                    continue
+                known = -thrusts[i, q, k] - GRAVITY * slopes[q, 2]  # the bound is on the acceleration
+                for e in range(9):
+                    known += slopes[q, e] * x[e, k]
+                if thrusts[i, q, k] < low + near:
+                    lower[r] = above + known
+                else:
+                    upper[r] = below + known
+                keys[r] = (i * _COUNT + k) * 4 + q
+                r += 1
             for order in range(3):
                 r = first
                 for q in range(4):
-                    if thrusts[i, k, q] < low + near or thrusts[i, k, q] > high - near:
+                    if chosen[i, q, k]:
                         owner[t], segments[t], places[t], orders[t] = r, i, _PLACES[k], order + 2
                         for d in range(3):
                             direction[t, d] = slopes[q, 3 * order + d]
                         r, t = r + 1, t + 1
-    return owner, segments, places, orders, direction, lower, upper
+    return keys, (owner, segments, places, orders, direction, lower, upper)

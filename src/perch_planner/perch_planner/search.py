@@ -121,7 +121,7 @@ class Search:
             count += found.cuts
             if found.checked:
                 low, high = self.limits.rotor_thrust
-                thrusts, row = sampled(found.coefficients, yaw, durations, *self.rotors)
+                thrusts, row = sampled(found.coefficients, yaw, durations, low, high, *self.rotors)
                 kept = low <= row[0] and row[2] <= high
                 if kept and found.holds:
                     kept, row[0], row[2] = prove_rotors(found.coefficients, yaw, durations, row[0], row[2], low, high, *self.rotors)
@@ -131,9 +131,9 @@ class Search:
                 if found.holds and kept:
                     return Outcome(durations, found.coefficients, yaw, results, True)
                 if turning:
-                    bounds = Bounds(*linear_bounds(thrusts, row, found.coefficients, yaw, durations, low, high, *self.rotors))
-                    program.replace(bounds)
-                    count += len(bounds.lower)
+                    keys, bounds = linear_bounds(thrusts, row, found.coefficients, yaw, durations, low, high, *self.rotors)
+                    program.replace(keys, Bounds(*bounds))
+                    count += len(keys)
                 outcome = outcome or Outcome(durations, found.coefficients, yaw, results)
             best = outcome
             if not (found.cuts or turning):

@@ -44,6 +44,18 @@ def _judged(program, rows, lower, upper, w, yaw, question, patient, later):
     return (plan, extrema, results, *found, cuts), rows, lower, upper
 
 
+@compiled
+def _carried(keys, dual, to):
+    """Multipliers of rows with ascending keys, for rows with other ascending keys; zero where there was none."""
+    out, i = np.zeros(len(to)), 0
+    for k in range(len(to)):
+        while i < len(keys) and keys[i] < to[k]:
+            i += 1
+        if i < len(keys) and keys[i] == to[k]:
+            out[k] = dual[i]
+    return out
+
+
 class SegmentProgram:
     """The reduced program (`reduced_qp`) of a perch with the durations of its segments [s], shape (f,), and its rows."""
 
@@ -53,10 +65,19 @@ class SegmentProgram:
                                         cost_order, self._question)
         self._program = (durations, *program)
         self._local: tuple[np.ndarray, ...] | None = None
+        self._keys = np.empty(0, np.int64)
+        self._dual: tuple[np.ndarray, np.ndarray] | None = None  # of the present rows, and of those that hold near the present plan
 
-    def replace(self, bounds: Bounds) -> None:
-        """Set the bounds that hold near the present plan alone, instead of those set before."""
-        self._local = rows_of(*self._program, *bounds)
+    def replace(self, keys: np.ndarray, bounds: Bounds) -> None:
+        """Set the bounds that hold near the present plan alone, instead of those set before; bounds of one key replace each other.
+
+        Args:
+            keys: ascending.
+            bounds: one for each key.
+        """
+        if self._dual is not None:
+            self._dual = self._dual[0], _carried(self._keys, self._dual[1], keys)
+        self._local, self._keys = rows_of(*self._program, *bounds), keys
 
     def judged(self, yaw: np.ndarray, patient: bool, later: bool) -> Judgement | None:
         """Solve, judge the plan and add the cuts that were found; None where the program has no solution.
@@ -65,8 +86,11 @@ class SegmentProgram:
             yaw, patient, later: as for `judgement.judge`.
         """
         rows = self._rows if self._local is None else map(np.concatenate, zip(self._rows, self._local))
-        solution = solvers.least_norm(*rows, self._solver)
+        fixed = len(self._rows[1])
+        start = None if self._dual is None else np.concatenate((self._dual[0], np.zeros(fixed - len(self._dual[0])), self._dual[1]))
+        solution = solvers.least_norm(*rows, self._solver, start)
         if not solution.solved:
             return None
+        self._dual = None if solution.dual is None else (solution.dual[:fixed], solution.dual[fixed:])
         found, *self._rows = _judged(self._program, *self._rows, solution.w, yaw, self._question, patient, later)
         return Judgement(*found)

@@ -26,12 +26,14 @@ class Solution(NamedTuple):
         solved: the residual was checked and is within `FEASIBILITY`.
         residual: largest violation of a row.
         status: the solver's own word.
+        dual: multipliers of the rows, shape (r,), where the next program may start; None: the solver gives none.
     """
 
     w: np.ndarray
     solved: bool
     residual: float
     status: str
+    dual: np.ndarray | None = None
 
 
 @compiled
@@ -55,18 +57,18 @@ def _contains_zero(lower, upper):
     return True
 
 
-def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
+def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, dual: np.ndarray | None) -> tuple[np.ndarray, str, np.ndarray]:
     import daqp
 
     # Without a cost matrix and vector DAQP takes the unit matrix and zero.
-    w, _, flag, _ = daqp.solve(None, None, rows, upper, lower, np.zeros(len(lower), np.int32), primal_tol=1e-9)
-    return np.asarray(w), "solved" if flag == 1 else f"exit flag {flag}"
+    w, _, flag, found = daqp.solve(None, None, rows, upper, lower, np.zeros(len(lower), np.int32), dual_start=dual, primal_tol=1e-9)
+    return np.asarray(w), "solved" if flag == 1 else f"exit flag {flag}", np.asarray(found["lam"])
 
 
 _COARSE, _FINE = (1e-3, 1e-4, 1e-5, 1e-6), 1e-8  # tolerances of OSQP, one after the other
 
 
-def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, str]:
+def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, _: np.ndarray | None) -> tuple[np.ndarray, str, None]:
     import osqp
     from scipy import sparse
 
@@ -81,25 +83,26 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
         polished = result.info.status_polish == 1 and max(result.info.prim_res, result.info.dual_res) < _FINE
         if polished or "infeasible" in result.info.status:
             break
-    return np.asarray(result.x, float), str(result.info.status)
+    return np.asarray(result.x, float), str(result.info.status), None
 
 
 SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp}
 
 
-def least_norm(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: str = "daqp") -> Solution:
+def least_norm(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: str = "daqp", dual: np.ndarray | None = None) -> Solution:
     """The shortest w with `lower <= rows @ w <= upper`. [defines M:eq8, in whitened coordinates]
 
     Args:
         rows: rows of unit length, shape (r, n).
         lower, upper: bounds, infinite where there is none, shape (r,).
         solver: `daqp` or `osqp`.
+        dual: where DAQP starts, multipliers of a similar program; None: without active rows.
     """
     if _contains_zero(lower, upper):
         return Solution(np.zeros(rows.shape[1]), True, 0.0, "unconstrained optimum")
-    w, status = SOLVERS[solver](rows, lower, upper)
+    w, status, found = SOLVERS[solver](rows, lower, upper, dual)
     residual = _residual(rows, lower, upper, w) if w.shape == rows.shape[1:] else np.inf
     if residual == np.inf:
         return Solution(np.zeros(rows.shape[1]), False, np.inf, status)
     # A solver that says "infeasible" is not overruled by a residual; one that says "solved" is.
-    return Solution(w, status.lower() == "solved" and residual <= FEASIBILITY, residual, status)
+    return Solution(w, status.lower() == "solved" and residual <= FEASIBILITY, residual, status, found)
