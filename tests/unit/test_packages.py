@@ -31,7 +31,7 @@ def imported(package: str) -> set[str]:
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 names.add(str(node.module).split(".")[0])
-    return names - {package, *sys.stdlib_module_names}
+    return names - {package, "_typeshed", *sys.stdlib_module_names}  # _typeshed exists for type checkers only
 
 
 def selected(package: str) -> dict[str, list[Path]]:
