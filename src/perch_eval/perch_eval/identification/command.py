@@ -20,6 +20,7 @@ from perch_sim.scenario import load_scenario
 if TYPE_CHECKING:
     from perch_eval.ros.recorded_flight import RecordedFlight
 
+GENTLY = 1.4  # times as long as usual takes a move on another voltage: it asks for half the acceleration
 EXAMPLES = """examples:
   python3 scripts/identify.py --vehicle snapdragon_rates                    fly in the simulator, and identify
   python3 scripts/identify.py --vehicle snapdragon_rates --scenario x.yaml  the same on a vehicle that differs (disturbance:)
@@ -72,8 +73,11 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | Re
     if voltages and not vehicle.actuation.firmware:
         raise PerchError(f"--voltage: the simulated battery drives the motors of a firmware, and {arguments.vehicle} has none")
     scenario = load_scenario(arguments.scenario)
-    differing = [replace(scenario.disturbance, voltage_factor=one / voltages[0]) for one in voltages] or [scenario.disturbance]
-    return [flight.fly(replace(scenario, disturbance=one), arguments.vehicle, arguments.seed) for one in differing]
+    flown = [flight.fly(scenario, arguments.vehicle, arguments.seed)]
+    for one in voltages[1:]:
+        at = replace(scenario, disturbance=replace(scenario.disturbance, voltage_factor=one / voltages[0]))
+        flown.append(flight.fly(at, arguments.vehicle, arguments.seed, GENTLY))
+    return flown
 
 
 def main() -> int:

@@ -25,13 +25,14 @@ PAUSE = 0.3                                        # between them [s]
 PATIENCE = 12.0                                    # for the estimator, and for the take-off [s]
 
 
-def fly(scenario: Scenario, vehicle: str, seed: int) -> Flight:
+def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Flight:
     """Fly it in the simulator, with estimated state.
 
     Args:
         scenario: the room and how the real vehicle differs from its file.
         vehicle: name or file; what the controller believes.
         seed: of everything that is random.
+        stretch: of the moves' durations, where less thrust than usual is left.
 
     Raises:
         PerchError: the vehicle does not fly with this file.
@@ -56,7 +57,7 @@ def fly(scenario: Scenario, vehicle: str, seed: int) -> Flight:
         go_on(0.1)
         place, yaw = pilot.p_WB, 0.0
         for offset, turn, duration in (((0.0, 0.0, HEIGHT), 0.0, 2.5), *(
-                (sign * np.array(offset), sign * turn, T) for offset, turn, T in ROUNDS * MOVES for sign in (1.0, -1.0))):
+                (sign * np.array(offset), sign * turn, stretch * T) for offset, turn, T in ROUNDS * MOVES for sign in (1.0, -1.0))):
             pilot.follow(rest_to_rest(place, place + offset, yaw, yaw + turn, duration, pilot.time + LEAD))
             place, yaw = place + offset, yaw + turn
             go_on(duration + LEAD + PAUSE)
