@@ -26,6 +26,8 @@ from perch_sim.scenario_files import scenario_mapping
 
 CONDITIONS = {"surface_60": (60, 1.7), "surface_90": (90, 1.7), "surface_60_far": (60, 3.0), "surface_90_far": (90, 3.0)}
 """Scenario -> inclination [deg] and distance [m]."""
+AGGRESSIVE = "surface_90_aggressive"
+"""Flown for the body rates of Fig. 6."""
 
 SUCCESSES = {"surface_60": 4, "surface_90": 4, "surface_60_far": 3, "surface_90_far": 4}  # of 5
 BARS = {"surface_60": 0.95, "surface_90": 0.95, "surface_60_far": 0.90, "surface_90_far": 0.90}  # with 100 seeds
@@ -41,14 +43,14 @@ PEAK_RATE, PEAK_ACCELERATION = 600.0, 10.0  # [deg/s], [m/s^2]
 def perching_sections(effort: Effort) -> list[Section]:
     """Tables II and III, Fig. 5 and 6, and the proof that the engine flies what the real nodes fly."""
     found = _flights(effort)
-    groups = {name: [r for r in found if r.values["scenario"] == name] for name in CONDITIONS}
+    groups = {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
     return [_errors(effort, groups), _successes(effort, groups), *_figures(effort, groups), _engines()]
 
 
 def _flights(effort: Effort) -> list[RunResult]:
     """Every flight of every condition; finished ones of the same code are not flown again."""
     tasks = []
-    for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in CONDITIONS):
+    for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in (*CONDITIONS, AGGRESSIVE)):
         mapping = scenario_mapping(name)
         tasks.append(Task(Run(number, seed, {"scenario": name}), mapping, "in_process", SENSING))
     return flown(effort, "flights", tasks)
@@ -117,10 +119,13 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     if contact:
         five.show("contact of seed 1", f"{contact[0].normal_speed:.2f} m/s along, {contact[0].tangential_speed:.2f} m/s across, tilt error "
                   f"{math.degrees(contact[0].tilt_error):.1f} deg", "0.4-0.6 m/s planned")
-    rates = Spread.of(r.metrics.get("max_body_rate_deg_s") for r in groups["surface_90"])
+    rates, fast = (Spread.of(r.metrics.get("max_body_rate_deg_s") for r in groups[name]) for name in ("surface_90", AGGRESSIVE))
     peaks = Spread.of(r.metrics.get("max_acceleration_m_s2") for r in groups["surface_90"])
-    six.claim("largest body rate", rates.words(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s", 0.7 * PEAK_RATE <= rates.median <= 1.5 * PEAK_RATE,
-              "as aggressive: within 70 to 150 % of the paper's")
+    six.show("largest body rate, `surface_90`", rates.words(1.0, 0, "deg/s"))
+    six.claim(f"largest body rate, `{AGGRESSIVE}`", fast.words(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s",
+              0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None, "within 10 % of the paper's")
+    held = Rate(sum(r.cause == SUCCESS for r in groups[AGGRESSIVE]), len(groups[AGGRESSIVE]))
+    six.claim(f"perches, `{AGGRESSIVE}`", str(held), "", held.value >= 0.95 if held.trials else None, "at least 95 %")
     six.claim("largest acceleration", peaks.words(1.0, 1, "m/s^2"), f"up to {PEAK_ACCELERATION:g} m/s^2", peaks.median >= 0.7 * PEAK_ACCELERATION,
               "at least 70 % of the paper's")
     return [five, six]
