@@ -132,3 +132,7 @@ def test_the_search_for_a_way_out_knows_hopeless_from_harmless(w, saved):
     found = search(plant)
     assert (found.survived > 0) is saved and (saved or found.turn_deg < 10.0)
     assert np.allclose(flight.simulation.state.w_WB_B, w), "it looks at a copy"
+
+
+def test_a_vehicle_lost_in_the_climb_for_whose_place_there_is_no_plan_ends_safely():
+    assert fly_fault(next(fault for fault in FAULTS if fault.name == "lost VIO"), 12).end in END_STATES
