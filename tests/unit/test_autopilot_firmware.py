@@ -1,4 +1,4 @@
-"""Betaflight's own firmware: deterministic in the loop, flown through, spoken to over MSP. Skipped where it has not been built."""
+"""Betaflight's own firmware: in the loop, flown through, spoken to over MSP. Skipped where it has not been built."""
 
 from __future__ import annotations
 
