@@ -8,8 +8,8 @@ import scipy.linalg
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.perch_motion import PerchMotion, read_imu
-from perch_eval.recordings import simulated_tracks
-from perch_eval.recordings.simulated_tracks import bounds
+from unit import simulated_tracks
+from unit.simulated_tracks import bounds
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.vio import VioConfig
@@ -134,7 +134,7 @@ def test_nees_of_the_filter_on_simulated_perches():
 def test_nees_on_exact_tracks_with_declared_noise():
     """Errors of every part of the state are as large as the filter says, on four kinds of motion.
 
-    More draws, a wrong calibration and noises that are not as declared: `python -m perch_eval.recordings.simulated_tracks`.
+    More draws, a wrong calibration and noises that are not as declared: `python tests/unit/simulated_tracks.py`.
     """
     ends = [simulated_tracks.fly(name, seed, simulated_tracks.Setting()) for name in ("circle", "hand", "eight", "far") for seed in range(5)]
     low, high = bounds(len(ends), 3)  # 0.59, 1.53

@@ -7,7 +7,7 @@ import pytest
 from perch_core import so3
 from perch_core.values import ImuSample
 from perch_core.vehicle import load_vehicle
-from perch_eval.recordings.simulated_tracks import Tracks, Truth, bounds
+from unit.simulated_tracks import Tracks, Truth, bounds
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.vio import VioConfig
 from perch_perception.vio import state as at

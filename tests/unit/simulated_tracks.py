@@ -3,8 +3,8 @@
 Nothing here is rendered or flown. The truth is what the IMU's exact readings integrate to; biases walk, and noises are drawn, as the
 filter's settings say, or as a mismatch says. With what is declared, the NEES of every part of the state is 1 per dimension.
 
-    python -m perch_eval.recordings.simulated_tracks --draws 12
-    python -m perch_eval.recordings.simulated_tracks --time-inside 200
+    python tests/unit/simulated_tracks.py --draws 12
+    python tests/unit/simulated_tracks.py --time-inside 200
 """
 
 from __future__ import annotations
