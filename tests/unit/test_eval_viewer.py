@@ -17,11 +17,12 @@ from perch_core.trajectory import rest_to_rest
 from perch_core.values import (
     AtEnd, CameraImage, ControllerStatus, MappedPowerline, Markers, OdometryState, PowerlineMap, Serialized, Shape, TargetPose, TrajectoryOrder)
 from perch_core.vehicle import load_vehicle
-from perch_eval.ros.definitions import message_class, message_definition
+from perch_eval.ros.definitions import message_definition
 from perch_eval.view.gate import allowed
 from perch_eval.view.scene import Path, map_markers, vehicle_markers, world_markers
 from perch_eval.viewer import CAMERAS, FAST, LOCAL, MARKERS, PASSING, RARE, ViewerParameters
 from perch_eval.viewer_node import MessageViewer
+from perch_msgs.msg import Trajectory
 from perch_sim.scenario import load_scenario
 from rclpy.serialization import serialize_message
 from tornado.httpclient import HTTPClientError, HTTPRequest
@@ -208,7 +209,7 @@ def test_mapped_cables_come_and_go():
 def test_what_cannot_be_drawn_is_warned_of_and_passed_on(show):
     said = []
     show.viewer.log.receivers.append(said.append)
-    empty = message_class("perch_msgs/msg/Trajectory")(id=7)
+    empty = Trajectory(id=7)
     show.handlers["trajectory"](Serialized("/trajectory", 0, serialize_message(empty), type(empty)))
     assert [line.level for line in said] == ["warning"] and "trajectory is not drawn" in said[0].text
     show.until(lambda: "/trajectory" in show.client.channels, "the topic")

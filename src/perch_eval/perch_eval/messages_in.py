@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from perch_core.component import Component, Input
 from perch_core.values import CameraImage, Serialized
-from perch_eval.mcap_log import Schema
+
+if TYPE_CHECKING:
+    from perch_eval.ros.codec import MessageCodec
 
 CAMERAS = ("down", "front")
 STAMPLESS = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
@@ -16,26 +18,6 @@ STAMPLESS = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
 
 C = TypeVar("C")
 T = TypeVar("T", bound=type[Component[Any]])
-
-
-class Codec(Protocol):
-    """Messages and values, by channel; `perch_eval.ros.codec.MessageCodec` is the one."""
-
-    def schema(self, message: Any) -> Schema:
-        """Name and definition of a message class."""
-
-    def message(self, channel: str) -> Any:
-        """Message class of a channel."""
-
-    def encode(self, channel: str, value: Any) -> bytes:
-        """A value as a serialised message."""
-
-    def decode(self, channel: str, data: bytes) -> Any:
-        """The value of a serialised message.
-
-        Raises:
-            PerchError: the message cannot be a value.
-        """
 
 
 class Wire(Input[Serialized]):
@@ -67,7 +49,7 @@ class Listener(Component[C]):
         newest: newest stamp so far [ns].
     """
 
-    codec: Codec
+    codec: MessageCodec
 
     def __init__(self, config: C) -> None:
         super().__init__(config)

@@ -21,13 +21,7 @@ PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # durati
 
 
 def powerline_sections(effort: Effort) -> list[Section]:
-    """Table I with Fig. 6-8, the published problems, and what is not available."""
-    try:
-        from perch_planner.powerline import problem  # noqa: F401  (is it there at all?)
-    except ImportError as error:
-        out = Section("p_table_1", "[P] Table I and Fig. 6-8", "The powerline planner cannot be loaded.")
-        out.missing("planning times, plans and flights", "", str(error))
-        return [out]
+    """Table I with Fig. 6-8, and the published problems."""
     return [_table(effort), _published(), *_pictures(effort)]
 
 

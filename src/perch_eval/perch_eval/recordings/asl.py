@@ -92,13 +92,12 @@ def _frames(path: Path) -> list[tuple[int, str]]:
     return rows
 
 
-def table(path: Path, columns: int, delimiter: str = ",") -> tuple[np.ndarray, np.ndarray]:
-    """A table of numbers whose first column is a stamp.
+def table(path: Path, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """A table of numbers, separated by commas, whose first column is a stamp.
 
     Args:
         path: of the file; lines that begin with # are not numbers.
         columns: how many are read, with the stamp.
-        delimiter: between them.
 
     Returns:
         Stamps [ns], int64, shape (n,), exact; and the other columns, shape (n, columns - 1).
@@ -108,8 +107,8 @@ def table(path: Path, columns: int, delimiter: str = ",") -> tuple[np.ndarray, n
     """
     try:
         rows = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        stamps = np.array([int(line.split(delimiter, 1)[0]) for line in rows], np.int64)
-        values = np.loadtxt(rows, delimiter=delimiter, usecols=range(1, columns), ndmin=2) if rows else np.empty((0, columns - 1))
+        stamps = np.array([int(line.split(",", 1)[0]) for line in rows], np.int64)
+        values = np.loadtxt(rows, delimiter=",", usecols=range(1, columns), ndmin=2) if rows else np.empty((0, columns - 1))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, IndexError, OverflowError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
 
@@ -135,8 +136,8 @@ def _camera_of(topic: str, others: list[str]) -> str:
     return first.rpartition("camera_")[2].replace("/", "_") or "camera"
 
 
-def _open(path: Path) -> Any:
-    """A reader of a bag.
+def _open(path: Path) -> AbstractContextManager[Any]:
+    """A reader of a bag, which the end of a block closes.
 
     Raises:
         RecordingError: it is none, or is damaged.
@@ -150,16 +151,4 @@ def _open(path: Path) -> Any:
         reader.open()
     except Exception as error:  # whatever the libraries make of a damaged file
         raise RecordingError(f"{path}: cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from None
-    return _Opened(reader)
-
-
-class _Opened:
-    """A reader that has been opened, to be closed at the end of a block."""
-    def __init__(self, reader: Any) -> None:
-        self._reader = reader
-
-    def __enter__(self) -> Any:
-        return self._reader
-
-    def __exit__(self, *_: object) -> None:
-        self._reader.close()
+    return closing(reader)

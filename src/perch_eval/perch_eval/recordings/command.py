@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,7 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
         perception.take(event)
     findings = check(recording)
     figures, rows, plots, vio = _figures(perception, truth)
-    if not args.without or "powerline_mapper" not in args.without:
+    if "powerline_mapper" not in args.without:
         _write_lines(args.out, perception)
     _write_trajectories(args.out, perception, vio, truth)
     content = {
@@ -281,10 +282,7 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
             problems.append(f"{name}: {error}")
             continue
         seen[name] = found.figures()
-        if gallery.due():
-            gallery.add(drawn(image, found, board, name))
-        else:
-            gallery.pass_by()
+        gallery.offer(partial(drawn, image, found, board, name))
     problems += [recording.damage] if recording.damage else []
     tags, poses = sum(len(s["tags"]) for s in seen.values()), sum("board" in s for s in seen.values())
     rows = [("recording", str(recording.path.resolve())),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -35,13 +36,12 @@ class Gallery:
         """Whether the next picture, or one of the next few, will be taken."""
         return -self._offered % self._step < within
 
-    def pass_by(self) -> None:
-        """Count a picture that is not due."""
+    def offer(self, draw: Callable[[], Shown | None]) -> None:
+        """Draw and take the next picture, if it is due and there is one."""
+        picture = draw() if self.due() else None
         self._offered += 1
-
-    def add(self, picture: Shown) -> None:
-        """Take a picture that is due."""
-        self._offered += 1
+        if picture is None:
+            return
         self.shown.append(picture)
         if len(self.shown) >= self._most:
             self.shown, self._step = self.shown[::2], 2 * self._step

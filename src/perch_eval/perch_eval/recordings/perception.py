@@ -86,19 +86,16 @@ class _Vio(VioComponent):
 
     def use(self, image: CameraImage) -> None:
         """As it does."""
-        due, soon = self.gallery.due(), self.gallery.due(TAIL)
         drawn: list[CameraImage] = []
-        self.debug_image.receivers[:] = [drawn.append] if soon else []
+        self.debug_image.receivers[:] = [drawn.append] if self.gallery.due(TAIL) else []
         begin = time.process_time()
         super().use(image)
         r = self.result
         self.frames.append(
             Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, float(r.nis), r.nis_dimension, r.restarts,
                   time.process_time() - begin, r.message))
-        if due and drawn:
-            self.gallery.add(Shown(image.stamp, f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used", drawn[-1].pixels()))
-        else:
-            self.gallery.pass_by()
+        text = f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used"
+        self.gallery.offer(lambda: Shown(image.stamp, text, drawn[-1].pixels()) if drawn else None)
 
 
 class _Target(TargetLocalizer):
@@ -114,17 +111,18 @@ class _Target(TargetLocalizer):
         super().look(image, exposed)
         self.sighting.receivers.pop()
         seen = sightings[-1]
-        gallery = self.missed if seen.pose_camera is None else self.found
-        if not gallery.due() or image.pixels() is None:
-            gallery.pass_by()
-            return
+        (self.missed if seen.pose_camera is None else self.found).offer(lambda: self._drawn(image, seen))
+
+    def _drawn(self, image: CameraImage, seen: TargetSighting) -> Shown | None:
+        if image.pixels() is None:
+            return None
         camera = self.mounted.mount.camera
         drawn = canvas(mono_image(image, camera))
         text = seen.message
         if seen.pose_camera is not None:
             draw_board(drawn, camera, load_board(self.config.board), seen.pose_camera, seen.ids)
             text = f"tags {list(seen.ids)}, {np.linalg.norm(seen.pose_camera.p_WS):.2f} m, rms {seen.reprojection_rms:.2f} px"
-        gallery.add(Shown(image.stamp, text, caption(drawn, text[:80])))
+        return Shown(image.stamp, text, caption(drawn, text[:80]))
 
 
 class _Wires(PowerlineMapper):
@@ -135,15 +133,17 @@ class _Wires(PowerlineMapper):
     def look(self, image: CameraImage, exposed: float) -> None:
         """As it does."""
         super().look(image, exposed)
-        if not self.gallery.due() or image.pixels() is None:
-            self.gallery.pass_by()
-            return
+        self.gallery.offer(lambda: self._drawn(image))
+
+    def _drawn(self, image: CameraImage) -> Shown | None:
+        if image.pixels() is None:
+            return None
         camera = self.mounted.mount.camera
         pixels = rgb_image(image, camera) if self.config.detection.appearance == "red" else mono_image(image, camera)
         wires = detect_lines(pixels, camera, self.config.detection)
         drawn = canvas(mono_image(image, camera))
         draw_wires(drawn, camera, wires)
-        self.gallery.add(Shown(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires")))
+        return Shown(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires"))
 
 
 class Perception:

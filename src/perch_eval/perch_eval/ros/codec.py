@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 from perch_core.ros import topics
 from perch_eval.ros.definitions import schema_of
 
 
 class MessageCodec:
-    """What `perch_core.ros.topics` knows, behind `perch_eval.messages_in.Codec`."""
+    """What `perch_core.ros.topics` knows, for components that import nothing of ROS.
+
+    Attributes:
+        schema: name and definition of a message class.
+        message: message class of a channel.
+        encode: a value of a channel as a serialised message.
+        decode: the value of a channel's serialised message; PerchError: it cannot be a value.
+    """
 
     schema = staticmethod(lru_cache(maxsize=None)(schema_of))
-
-    def message(self, channel: str) -> type:
-        """Message class of a channel."""
-        return topics.message_type(channel)
-
-    def encode(self, channel: str, value: Any) -> bytes:
-        """A value as a serialised message."""
-        return topics.encode(channel, value)
-
-    def decode(self, channel: str, data: bytes) -> Any:
-        """The value of a serialised message.
-
-        Raises:
-            PerchError: the message cannot be a value.
-        """
-        return topics.decode(channel, data)
+    message = staticmethod(topics.message_type)
+    encode = staticmethod(topics.encode)
+    decode = staticmethod(topics.decode)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
 
@@ -49,16 +48,3 @@ def message_definition(name: str) -> str:
         package, _, short = full.split("/")
         parts += ["=" * 80, f"MSG: {package}/{short}", seen[full]]
     return "\n".join(parts)
-
-
-def message_class(name: str) -> Any:
-    """Message class of `package/msg/Name`.
-
-    Raises:
-        LookupError: the package or the type is not installed.
-    """
-    package, kind, short = name.split("/")
-    try:
-        return getattr(__import__(f"{package}.{kind}", fromlist=[short]), short)
-    except (ImportError, AttributeError):
-        raise LookupError(f"message type {name} is not installed") from None
