@@ -7,10 +7,11 @@ import pytest
 
 from perch_core import so3
 from perch_core.surface import PerchSurface
+from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
     AdhesionLimits, AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
-    PlanAnswer, Result, State, SurfaceMission, Target)
+    Plan, Refusal, Result, State, SurfaceMission, Target)
 
 TICK = 0.02
 SURFACE = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.2]), math.pi / 2)
@@ -50,9 +51,9 @@ class World:
             self.controller = ControllerState.HOVERING
         plan = None
         if self.query is not None:
-            plan = PlanAnswer(self.plans, "thrust floor 5.2 N > 4.05 N" if not self.plans else "ok", object(),
-                              self.query.start_time,
-                              1.2 if self.query.duration is None else self.query.duration + self.detour)
+            plan = Refusal("thrust floor 5.2 N > 4.05 N") if not self.plans else Plan(
+                rest_to_rest(np.zeros(3), np.zeros(3), 0.0, 0.0, 1.0, self.query.start_time),
+                1.2 if self.query.duration is None else self.query.duration + self.detour)
             self.query = None
         target = Target(self.time, SURFACE.p_WS, Q_PERCH, 0.01, 0.01) if self.sees and self.time > 2.0 else None
         falling = 0.0 if self.off_at is None or self.stays else max(self.time - self.off_at - 0.1, 0.0)

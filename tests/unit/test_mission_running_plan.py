@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, PlanAnswer, State, Target
+from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, Plan, Refusal, State, Target
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.requests import flown_order
 from perch_control.smooth_position import BEFORE
@@ -36,17 +36,16 @@ def target(time: float, x: float = 5.0, sigma: float = 0.02) -> Target:
 
 
 def running(length: float = LENGTH) -> RunningPlan:
-    return RunningPlan(answer(START, length), target(9.0), SETTINGS)
+    return RunningPlan.begun(answer(START, length), target(9.0), SETTINGS)
 
 
-def answer(start: float, length: float, success: bool = True) -> PlanAnswer:
-    sampled = dataclasses.replace(states(length + 0.8), start_time=start) if success else None
-    return PlanAnswer(success, "", object(), start, length, sampled)
+def answer(start: float, length: float, success: bool = True) -> Plan | Refusal:
+    return Plan(dataclasses.replace(states(length + 0.8), start_time=start), length) if success else Refusal("")
 
 
 def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near():
     plan, time, starts = running(), START - 0.03, []
-    while time < plan.end - SETTINGS.way_out_until:
+    while time < plan.plan.end - SETTINGS.way_out_until:
         query = plan.query(time, AT_REST, None, GOAL)
         if query is not None:
             assert query.recovery and plan.query(time, AT_REST, None, GOAL) is None, "one query at a time"
@@ -59,14 +58,14 @@ def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near
             assert ready is not None and better is None
             starts.append(query.start_time)
         time += 0.02
-    gaps = np.diff([START, *starts, plan.end])
+    gaps = np.diff([START, *starts, plan.plan.end])
     assert len(starts) >= 4 and gaps.max() < 0.65, "an abort finds one within the time that the controller flies on"
 
 
 def test_the_last_way_out_leaves_the_wire_from_where_the_vehicle_is_beside_the_newest_map():
     plan, newest, time, asked = running(), target(12.0, x=5.06, sigma=0.05), START + LENGTH - 0.36, []
     beside, turn = np.array([0.03, 0.0, -0.05]), so3.quat_exp([0.0, 0.2, 0.0])
-    while time < plan.end + 0.3:
+    while time < plan.plan.end + 0.3:
         planned = plan.state(time)
         present = State(planned.p + beside, so3.quat_multiply(turn, planned.q), planned.v + [0.1, 0.0, 0.0], planned.w)
         query = plan.query(time, present, newest, GOAL)
@@ -76,7 +75,7 @@ def test_the_last_way_out_leaves_the_wire_from_where_the_vehicle_is_beside_the_n
             assert plan.answered(answer(query.start_time, 1.0), time)[0] is not None
         time += 0.02
     (query,) = asked
-    assert query.recovery and query.start_time == pytest.approx(plan.end, abs=0.021) and query.target is newest
+    assert query.recovery and query.start_time == pytest.approx(plan.plan.end, abs=0.021) and query.target is newest
     at_wire = plan.state(query.start_time)
     np.testing.assert_allclose(query.state.p, at_wire.p + beside, atol=1e-9)
     np.testing.assert_allclose(query.state.v, at_wire.v + [0.1, 0.0, 0.0], atol=1e-9)
@@ -88,10 +87,10 @@ def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
     plan = running()
     query = plan.query(START + 0.1, AT_REST, target(10.0, x=5.26), GOAL)
     assert not query.recovery and query.target.p_WS[0] == 5.26
-    np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.end).p + [0.26, 0.0, 0.0], atol=1e-9)
-    ready, better = plan.answered(answer(query.start_time, plan.end - query.start_time + 0.05), START + 0.3)
+    np.testing.assert_allclose(query.perch_pose[0], plan.state(plan.plan.end).p + [0.26, 0.0, 0.0], atol=1e-9)
+    ready, better = plan.answered(answer(query.start_time, plan.plan.end - query.start_time + 0.05), START + 0.3)
     assert ready is None and better.target.p_WS[0] == 5.26
-    assert better.end == pytest.approx(plan.end + 0.05)
+    assert better.plan.end == pytest.approx(plan.plan.end + 0.05)
 
 
 @pytest.mark.parametrize("length, success", [(4.0, True), (1.0, False)])
@@ -122,9 +121,9 @@ def test_the_plan_moves_with_the_wire(time):
     plan = running()
     way_out = plan.query(time, AT_REST, None, GOAL)
     following = plan.moved(time, target(10.0, x=5.03), GOAL)
-    assert following.end == pytest.approx(plan.end) and following.target.p_WS[0] == 5.03
+    assert following.plan.end == pytest.approx(plan.plan.end) and following.target.p_WS[0] == 5.03
     assert time - 0.02 < following.plan.start_time <= time, "the rest of it"
-    for t in (time, plan.end, plan.end + 0.4):  # the recovery as well
+    for t in (time, plan.plan.end, plan.plan.end + 0.4):  # the recovery as well
         np.testing.assert_allclose(following.state(t).p, plan.state(t).p + [0.03, 0.0, 0.0], atol=1e-9)
         np.testing.assert_allclose(following.state(t).rotor_thrust, plan.state(t).rotor_thrust)
     if way_out is not None:
@@ -148,8 +147,8 @@ def test_a_plan_that_was_moved_is_ordered_from_its_states():
     following = running().moved(START + 1.0, target(10.0, x=5.03), GOAL)
     order = flown_order(7, following.plan, 0.25)
     assert (order.id, order.at_end, order.contact_time) == (7, AtEnd.RECOVER, 0.25)
-    assert order.recovery_start == pytest.approx(following.end - following.plan.start_time)
-    np.testing.assert_allclose(order.trajectory.p, following.plan.sampled.p)
+    assert order.recovery_start == pytest.approx(following.plan.end - following.plan.start_time)
+    np.testing.assert_allclose(order.trajectory.p, following.states.p)
 
 
 def test_an_answer_that_comes_too_late_is_not_used():

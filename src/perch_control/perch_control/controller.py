@@ -16,6 +16,7 @@ from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
 from perch_control.modes import Command, State, StepResult
 from perch_control.parameters import ControllerParameters
+from perch_control.reference import Setpoint
 from perch_control.stamp_guard import Stamp, StampGuard
 
 STATUS_PERIOD = 20_000_000        # of controller/status [ns]
@@ -172,7 +173,7 @@ class Controller(Component[ControllerParameters]):
         try:
             if isinstance(order.trajectory, FlatTrajectory):
                 raise PerchError("a way out must carry states")
-            if (start := order.trajectory.start_time) > seconds(self._stamps.newest or 0) + LONGEST_PLAN:
+            if (start := order.trajectory.start_time) > seconds(self._stamps.newest) + LONGEST_PLAN:
                 raise PerchError(f"it starts at {start:.1f} s, long after what is flown")
             way_out = order._replace(at_end=AtEnd.HOLD, contact_time=0.0, recovery_start=0.0)
             self.flight.keep_ready(self._assembly.order(way_out))
@@ -181,8 +182,7 @@ class Controller(Component[ControllerParameters]):
 
     def on_command(self, command: ControllerCommand) -> None:
         """Carry it out, or say why not. One that was given before this controller began, or long ago, is not meant for now."""
-        newest = self._stamps.newest
-        if newest is not None and 0 < command.stamp < newest - STALE:
+        if 0 < command.stamp < self._stamps.newest - STALE:
             self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
             return
         try:
@@ -194,7 +194,7 @@ class Controller(Component[ControllerParameters]):
     def on_powerlines(self, lines: PowerlineMap) -> None:
         """Show the map to the laws that look at it. It is latched: an old one may be the newest there is, one of the future is nonsense."""
         newest = self._stamps.newest
-        if newest is not None and lines.stamp > newest + STALE:
+        if self._stamps.begun and lines.stamp > newest + STALE:
             self.warn(f"powerlines: of {seconds(lines.stamp):.3f} s, which is to come ({seconds(newest):.3f} s): ignored", every=1.0)
             return
         if not self.config.nmpc.lines.any:
@@ -207,7 +207,7 @@ class Controller(Component[ControllerParameters]):
     def on_estimator(self, health: EstimatorHealth) -> None:
         """An estimator that is not well ends what is flown."""
         newest = self._stamps.newest
-        if newest is not None and abs(newest - health.stamp) > STALE:
+        if self._stamps.begun and abs(newest - health.stamp) > STALE:
             self.warn(f"estimator/status: of {seconds(health.stamp):.3f} s, not of the present ({seconds(newest):.3f} s): ignored", every=1.0)
             return
         self.flight.supervisor.estimator(health.state, float(health.vio_age), health.message[:_WORDS])
@@ -247,18 +247,18 @@ class Controller(Component[ControllerParameters]):
         if self._first is None:
             self._first = now
         if now - self._first >= self._due:
-            self._say(now, stamp, result)
+            self._say(now, now - self._first, stamp, result)
 
-    def _say(self, now: int, stamp: int, result: StepResult) -> None:
-        """What is due by now."""
-        since, period = now - self._first, nanoseconds(self.config.controller.reference_period)
+    def _say(self, now: int, since: int, stamp: int, result: StepResult) -> None:
+        """What is due by now, `since` the first answer [ns]."""
+        period = nanoseconds(self.config.controller.reference_period)
         if since >= self._statuses * STATUS_PERIOD:
             self._statuses = since // STATUS_PERIOD + 1
             self._emit_status(now)
         if since >= self._references * period:
             self._references = since // period + 1
             if result.setpoint is not None and self.reference.wanted:
-                self._emit_reference(stamp, result)
+                self._emit_reference(stamp, result.setpoint, result)
         if since >= self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE:
             self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
             self._diagnose(now)
@@ -273,8 +273,7 @@ class Controller(Component[ControllerParameters]):
             position_error=float(flight.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
             thrust_margin=float(flight.margin), message=maneuvers.message))
 
-    def _emit_reference(self, stamp: int, result: StepResult) -> None:
-        x = result.setpoint
+    def _emit_reference(self, stamp: int, x: Setpoint, result: StepResult) -> None:
         self.reference(ControlReference(
             stamp, self.flight.maneuvers.trajectory_id, p=x.p, q=result.q_C, v=x.v, a=x.a, w=result.w_C, dw=result.dw_C,
             thrust=float(result.wrench[0]), moment=tuple(result.wrench[1:4])))

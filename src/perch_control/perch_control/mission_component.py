@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from perch_control.mission.moves import Moves
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission.requests import flown_order, perch_request, plan_answer, powerline_request
 from perch_control.mission.values import (
-    TICK, ControllerState, Inputs, Mode, Outcome, Outputs, PlanAnswer, PlanQuery, Result, State, Target)
+    TICK, ControllerState, Inputs, Mode, Outcome, Outputs, Plan, PlanQuery, Refusal, Result, State, Target)
 from perch_control.period import MeasuredPeriod
 from perch_control.stamp_guard import Stamp, StampGuard
 
@@ -46,6 +45,25 @@ class _Asked:
     due: int
     start: float
     answer: PerchPlan | PowerlinePlan | Unavailable | None = None
+
+
+@dataclass
+class _Running:
+    """A goal under way.
+
+    Attributes:
+        goal: as the host hands it over.
+        machine: flies it.
+        started: the machine has taken it.
+        waiting_since: the host's time since which it waits for odometry [ns].
+        pending: the query whose answer counts.
+    """
+
+    goal: Goal
+    machine: MissionMachine
+    started: bool = False
+    waiting_since: int | None = None
+    pending: _Asked | None = None
 
 
 class _Departing:
@@ -88,8 +106,7 @@ class Mission(Component[MissionParameters]):
     def __init__(self, config: MissionParameters) -> None:
         super().__init__(config)
         self._ids = count(1)  # the controller tells trajectories apart by them: they go on from goal to goal
-        self._goal: Goal | None = None
-        self._machine: MissionMachine | None = None
+        self._running: _Running | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -103,18 +120,15 @@ class Mission(Component[MissionParameters]):
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
         self._asked: dict[str, list[_Asked]] = {"plan_perch": [], "plan_powerline": []}
-        self._pending: _Asked | None = None
         self._used = self._heard = -1          # odometry of the last tick, and the host's time then [ns]
-        self._waiting_since: int | None = None  # the host's time since which a goal waits for odometry [ns]
-        self._started = False                   # the machine has taken the goal
         self._told = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
         self._diagnosed: int | None = None
 
     def reconfigure(self, config: MissionParameters) -> None:
         """New settings count from the next tick on."""
         self.config = config
-        if self._machine is not None:
-            self._machine.reconfigure(config.mission)
+        if self._running is not None:
+            self._running.machine.reconfigure(config.mission)
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
@@ -141,31 +155,31 @@ class Mission(Component[MissionParameters]):
             return False
         if verdict is Stamp.ANEW:
             self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s: starting anew")
-            if self._goal is not None:
-                self._finish(stamp, Outcome(Result.TRACKING_LOST, "time has begun anew"))
+            if self._running is not None:
+                self._finish(self._running, stamp, Outcome(Result.TRACKING_LOST, "time has begun anew"))
             self._begin()
             self._stamps.judge(stamp)
         return True
 
     def on_target(self, pose: TargetPose) -> None:
         """Keep the newest pose of the pad."""
-        problem = ""
-        if self._odometry is None:
+        x, problem = self._odometry, ""
+        if x is None:
             problem = "there is no odometry yet"
         elif pose.stamp > self._stamps.newest + AHEAD:
             problem = "its stamp is in the future"
         elif self._pad is not None and pose.stamp < self._pad[0].stamp:
             problem = "it is older than the newest"
-        if problem:
+        if x is None or problem:
             self.warn(f"target/pose refused: {problem}", every=1.0)
             return
-        self._pad = pose, self._odometry.pose_covariance
+        self._pad = pose, x.pose_covariance
 
-    def _pad_now(self) -> Target | None:
+    def _pad_now(self, x: OdometryState) -> Target | None:
         """The pad as it stands to the vehicle: what the odometry has drifted since it was seen makes it less certain."""
         if self._pad is None:
             return None
-        (pose, before), x = self._pad, self._odometry
+        pose, before = self._pad
         covariance = pose.covariance + drift(x.pose_covariance, before, pose.p_WS - x.p_WB)
         return Target(seconds(pose.stamp), pose.p_WS, pose.q_WS / np.linalg.norm(pose.q_WS), largest_sigma(covariance[:3, :3]),
                       largest_sigma(covariance[3:, 3:]))
@@ -174,7 +188,7 @@ class Mission(Component[MissionParameters]):
         """Keep the newest map."""
         newest = self._stamps.newest
         try:
-            if newest is None or lines.stamp > newest + AHEAD:
+            if not self._stamps.begun or lines.stamp > newest + AHEAD:
                 raise PerchError("its stamp is in the future")
             if self._map is not None and lines.stamp < self._map.stamp:
                 raise PerchError("it is older than the newest")
@@ -187,28 +201,29 @@ class Mission(Component[MissionParameters]):
 
     def on_status(self, status: ControllerStatus) -> None:
         """Keep the controller's state."""
-        if self._of_another_time(status.stamp):
-            self.warn(f"controller/status: of {seconds(status.stamp):.3f} s: ignored", every=1.0)
-        else:
+        if not self._outdated(status, self._status, "controller/status"):
             self._status = status
 
     def on_estimator(self, health: EstimatorHealth) -> None:
         """Keep the estimator's state."""
-        if self._of_another_time(health.stamp):
-            self.warn(f"estimator/status: of {seconds(health.stamp):.3f} s: ignored", every=1.0)
-        else:
+        if not self._outdated(health, self._estimator, "estimator/status"):
             self._estimator = health
 
-    def _of_another_time(self, stamp: int) -> bool:
-        """What goes on while sensors are silent may be ahead of them, but not behind."""
-        return self._stamps.newest is not None and stamp < self._stamps.newest - STALE
+    def _outdated(self, state: ControllerStatus | EstimatorHealth, kept: ControllerStatus | EstimatorHealth | None, channel: str) -> bool:
+        """What goes on while sensors are silent may be ahead of them, but not behind, nor overtaken; far ahead it keeps out no other."""
+        overtaken = kept is not None and 0 < kept.stamp - state.stamp <= STALE
+        if overtaken or state.stamp < self._stamps.newest - STALE:
+            self.warn(f"{channel}: of {seconds(state.stamp):.3f} s, {'older than the one before' if overtaken else 'not of the present'}: ignored", every=1.0)
+            return True
+        return False
 
     # -- ticks -------------------------------------------------------------------------------------------------------
 
     def on_tick(self, now: int) -> None:
         """Decide, where there is odometry that is newer than at the last tick, or none at all for a while."""
         if self._odometry is None:
-            self._wait_for_odometry(now)
+            if self._running is not None:
+                self._wait_for_odometry(self._running, now)
             return
         stamp = self._odometry.stamp
         if stamp != self._used or now < self._heard:
@@ -217,53 +232,48 @@ class Mission(Component[MissionParameters]):
             stamp += now - self._heard
         else:
             return
-        self._decide(stamp)
+        if self._running is not None:
+            self._decide(self._running, stamp, self._odometry)
+        self._forces.clear()
         if self._diagnosed is None or stamp - self._diagnosed >= NANOSECONDS:
             self._diagnosed = stamp
-            phase = self._machine.phase.value if self._machine is not None else "idle"
-            message = self._machine.message if self._machine is not None else "no goal"
+            machine = self._running.machine if self._running is not None else None
+            phase, message = (machine.phase.value, machine.message) if machine is not None else ("idle", "no goal")
             self.diagnostics(Diagnostics(stamp, {"phase": phase}, 0, message))
 
-    def _wait_for_odometry(self, now: int) -> None:
-        if self._goal is None:
-            return
-        if self._waiting_since is None or now < self._waiting_since:
-            self._waiting_since = now
-        if self._goal.cancel_requested:
-            self._finish(0, Outcome(Result.CANCELLED, "cancelled on the ground"))
-        elif now - self._waiting_since > nanoseconds(self.config.mission.arming_timeout):
-            self._finish(0, Outcome(Result.TIMEOUT, f"no odometry within {self.config.mission.arming_timeout:g} s"))
+    def _wait_for_odometry(self, running: _Running, now: int) -> None:
+        if running.waiting_since is None or now < running.waiting_since:
+            running.waiting_since = now
+        if running.goal.cancel_requested:
+            self._finish(running, 0, Outcome(Result.CANCELLED, "cancelled on the ground"))
+        elif now - running.waiting_since > nanoseconds(self.config.mission.arming_timeout):
+            self._finish(running, 0, Outcome(Result.TIMEOUT, f"no odometry within {self.config.mission.arming_timeout:g} s"))
 
-    def _decide(self, stamp: int) -> None:
-        machine, status = self._machine, self._status
-        if machine is None:
-            self._forces.clear()
+    def _decide(self, running: _Running, stamp: int, odometry: OdometryState) -> None:
+        status = self._status
+        if status is not None and odometry.stamp - status.stamp > STALE:  # it answers every sample, whatever its state
+            self._finish(running, stamp, Outcome(Result.TRACKING_LOST, f"the controller is silent: no controller/status for {seconds(STALE):g} s"))
             return
-        if status is not None and self._odometry.stamp - status.stamp > STALE:  # it answers every sample, whatever its state
-            self._finish(stamp, Outcome(Result.TRACKING_LOST, f"the controller is silent: no controller/status for {seconds(STALE):g} s"))
-            return
-        time, answer, pending = seconds(stamp), None, self._pending
-        if not self._started:
-            self._started = True
-            machine.start(goal_of(self._goal.value, self.config.mission), time)
+        time, answer, pending = seconds(stamp), None, running.pending
+        if not running.started:
+            running.started = True
+            running.machine.start(goal_of(running.goal.value, self.config.mission), time)
         if pending is not None and stamp >= pending.due and pending.answer is not None:
-            self._pending, answer = None, plan_answer(pending.answer)
-        outputs = machine.tick(self._inputs(time, answer))
-        self._forces.clear()
-        self._act(stamp, outputs)
+            running.pending, answer = None, plan_answer(pending.answer)
+        self._act(running, stamp, running.machine.tick(self._inputs(running, time, odometry, answer)))
 
-    def _inputs(self, time: float, answer: PlanAnswer | None) -> Inputs:
-        status, estimator, x = self._status, self._estimator, self._odometry
+    def _inputs(self, running: _Running, time: float, x: OdometryState, answer: Plan | Refusal | None) -> Inputs:
+        status, estimator = self._status, self._estimator
         state = State(np.array(x.p_WB), np.array(x.q_WB), np.array(x.v_WB), np.array(x.w_B))
         return Inputs(
             time=time, state=state, estimator_ready=estimator is not None and estimator.state == RUNNING,
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0, trajectory_time=status.trajectory_time if status else 0.0,
-            target=self._machine.target(self._pad_now(), self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3), plan=answer,
-            cancel=self._goal.cancel_requested, imu_period=self._imu_period.value)
+            target=running.machine.target(self._pad_now(x), self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3), plan=answer,
+            cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
 
-    def _act(self, stamp: int, outputs: Outputs) -> None:
+    def _act(self, running: _Running, stamp: int, outputs: Outputs) -> None:
         for command, reason in outputs.commands:
             self.command(ControllerCommand(stamp, int(command), reason))
         if outputs.reference is not None:
@@ -273,30 +283,32 @@ class Mission(Component[MissionParameters]):
         if outputs.way_out is not None:
             self.recovery(TrajectoryOrder.of(outputs.trajectory_id, outputs.way_out.trajectory, AtEnd.HOLD))
         if outputs.query is not None:
-            self._ask(stamp, outputs.query)
-        if self._machine.phase.value != "idle":
-            self._tell(stamp)
+            self._ask(running, stamp, outputs.query)
+        if running.machine.phase.value != "idle":
+            self._tell(running, stamp)
         if outputs.outcome is not None:
-            self._finish(stamp, outputs.outcome)
+            self._finish(running, stamp, outputs.outcome)
 
-    def _tell(self, stamp: int) -> None:
+    def _tell(self, running: _Running, stamp: int) -> None:
         """The goal's feedback: at every change, and every `FEEDBACK_PERIOD`."""
-        machine = self._machine
+        machine = running.machine
         words = (machine.phase.value, machine.message)
         if words == self._told[1:] and stamp - self._told[0] < FEEDBACK_PERIOD:
             return
         self._told = (stamp, *words)
-        self._goal.feedback(PerchFeedback(machine.phase.value, machine.phase.progress, float(machine.time_to_contact), machine.message))
+        running.goal.feedback(PerchFeedback(machine.phase.value, machine.phase.progress, float(machine.time_to_contact), machine.message))
 
     # -- planners ----------------------------------------------------------------------------------------------------
 
-    def _ask(self, stamp: int, query: PlanQuery) -> None:
-        surface = self._goal.value.mode == Mode.SURFACE
-        request: Any = perch_request(query) if surface else powerline_request(query)
-        asked = self._pending = _Asked(stamp, stamp + nanoseconds(query.latency), seconds(request.start))
+    def _ask(self, running: _Running, stamp: int, query: PlanQuery) -> None:
+        surface = running.goal.value.mode == Mode.SURFACE
+        asked = running.pending = _Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time)))
         under_way = self._asked["plan_perch" if surface else "plan_powerline"]
         under_way[:] = [other for other in under_way if stamp - other.made < FORGOTTEN] + [asked]
-        (self.plan_perch if surface else self.plan_powerline)(request, asked.due)
+        if surface:
+            self.plan_perch(perch_request(query), asked.due)
+        else:
+            self.plan_powerline(powerline_request(query), asked.due)
 
     def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:
         """Keep it until it counts."""
@@ -320,7 +332,7 @@ class Mission(Component[MissionParameters]):
 
     def on_perch(self, goal: Goal) -> str:
         """Take a goal; one that cannot be flown ends at once, with its reason."""
-        if self._goal is not None:
+        if self._running is not None:
             self.warn("goal refused: another goal is being flown")
             return "another goal is being flown"
         problem = problem_with(goal.value, self.config.mission)
@@ -333,19 +345,17 @@ class Mission(Component[MissionParameters]):
 
     def on_depart(self, request: Ask, reply: Callable[[Done], None]) -> None:
         """Leave what carries the vehicle; answered when it hovers, or cannot."""
-        if self._goal is not None:
+        if self._running is not None:
             reply(Done(False, "a goal is being flown"))
         else:
             self._take(_Departing(reply), Departure)
 
     def _take(self, goal: Goal, kind: type[MissionMachine]) -> None:
-        self._goal, self._started, self._pending, self._waiting_since = goal, False, None, None
-        self._machine = kind(self.config.mission, self._ids, self._moves)
+        self._running = _Running(goal, kind(self.config.mission, self._ids, self._moves))
 
-    def _finish(self, stamp: int, outcome: Outcome) -> None:
+    def _finish(self, running: _Running, stamp: int, outcome: Outcome) -> None:
         self.info(f"{outcome.result.name.lower()}: {outcome.message}")
-        goal, self._goal, self._machine, self._pending = self._goal, None, None, None
-        x = self._odometry
+        self._running, x = None, self._odometry
         pose = {} if x is None else {"final_position": tuple(x.p_WB), "final_attitude": tuple(x.q_WB)}
-        goal.finish(_ENDINGS.get(outcome.result, "aborted"), PerchResult(
+        running.goal.finish(_ENDINGS.get(outcome.result, "aborted"), PerchResult(
             outcome.result is Result.PERCHED, int(outcome.result), outcome.message, float(outcome.contact_time), seconds(stamp), **pose))

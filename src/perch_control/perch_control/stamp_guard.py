@@ -21,11 +21,12 @@ class StampGuard:
     """Owns the newest stamp of several streams of the same clock.
 
     Attributes:
-        newest: the newest stamp that was believed [ns]; None: none yet.
+        newest: the newest stamp that was believed [ns], 0 where none was.
+        begun: one was.
     """
 
     def __init__(self) -> None:
-        self.newest: int | None = None
+        self.newest, self.begun = 0, False
         self._first = self._last = -1  # of stamps that are away from the newest, with nothing else between them
 
     def judge(self, stamp: int, may_restart: bool = True) -> Stamp:
@@ -36,10 +37,9 @@ class StampGuard:
             may_restart: time may begin anew; otherwise stamps of the past are refused however many there are.
         """
         newest = self.newest
-        if newest is None or -_JUMP <= stamp - newest <= _JUMP:
+        if not self.begun or -_JUMP <= stamp - newest <= _JUMP:
             self._first = -1
-            if newest is None or stamp > newest:
-                self.newest = stamp
+            self.newest, self.begun = max(stamp, newest) if self.begun else stamp, True
             return Stamp.PRESENT
         if self._first < 0 or not 0 <= stamp - self._last <= _JUMP:
             self._first = stamp

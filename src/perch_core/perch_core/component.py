@@ -145,6 +145,10 @@ class Client(_Port, Generic[Q, A]):
         super().__init__(channel)
         self.request, self.answer = request, answer
 
+    if TYPE_CHECKING:  # an instance holds under the port's name what the host has put there
+
+        def __get__(self, instance: Component[Any], owner: type) -> Callable[[Q, int], None]: ...
+
 
 @dataclass(frozen=True)
 class Unavailable:

@@ -12,7 +12,7 @@ from perch_control.mission.machine import MissionMachine
 from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import (
-    Command, ControllerState, Inputs, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target)
+    Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target)
 
 _THRUST = 0.5  # of each rotor, soon after its start [N]
 
@@ -46,23 +46,23 @@ class Departure(MissionMachine):
             if self._moves.wire is None:
                 outputs.commands.append((Command.ARM, "departing"))
             else:
-                outputs.query = self._way_out(inputs)
+                outputs.query = self._way_out(inputs, self._moves.wire)
 
-    def _way_out(self, inputs: Inputs) -> PlanQuery:
+    def _way_out(self, inputs: Inputs, wire: Target) -> PlanQuery:
         """From the vehicle as it hangs there."""
         zero, x, latency = np.zeros(3), inputs.state, self.settings.powerline_latency
         start = inputs.time + self.settings.lead(latency)
         still = StateSample(p=x.p_WB, q=x.q_WB, v=zero, w=zero, a=zero, dw=zero, rotor_thrust=np.full(4, _THRUST))
-        return PlanQuery(start, x.p_WB, zero, zero, zero, 0.0, self._moves.wire, self._goal, latency, state=still, recovery=True)
+        return PlanQuery(start, x.p_WB, zero, zero, zero, 0.0, wire, self._goal, latency, state=still, recovery=True)
 
-    def _fly(self, inputs: Inputs, outputs: Outputs, plan: PlanAnswer) -> None:
+    def _fly(self, inputs: Inputs, outputs: Outputs, plan: Plan | Refusal) -> None:
         """A vehicle at rest may begin its plan at any time: at once."""
-        if not plan.success:
+        if isinstance(plan, Refusal):
             self.message = f"no plan to leave the wire: {plan.message}"
             outputs.commands.append((Command.ARM, "departing"))
             return
         start = inputs.time + LEAD
-        outputs.perch = replace(plan, trajectory=replace(plan.trajectory, start_time=start), start_time=start)
+        outputs.perch = replace(plan, trajectory=replace(plan.trajectory, start_time=start))
         outputs.trajectory_id = self._new_id()
 
     def _recovered(self, inputs: Inputs, outputs: Outputs) -> None:

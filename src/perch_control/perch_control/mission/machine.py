@@ -12,7 +12,7 @@ from perch_core.values import PerchGoal, PowerlineMap
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.moves import Look, Moves, Place
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.usable_target import usable
+from perch_control.mission.usable_target import unusable
 from perch_control.mission.values import Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, Result, Target
 
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
@@ -32,10 +32,9 @@ class MissionMachine(ABC):
         phases: what is done in each phase.
     """
 
+    _goal: Goal  # from `start` on
     unseen = "no target seen"
     """Words for a target that is not seen."""
-    legs = 0
-    """Places of the pattern that are flown to before anything else."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         """
@@ -52,11 +51,18 @@ class MissionMachine(ABC):
             Phase.ARMING: self._arming, Phase.TAKE_OFF: self._take_off, Phase.SEARCHING: self._searching,
             Phase.RECOVERING: self._recovering}
         self._adhesion = AdhesionMonitor(settings.adhesion)
-        self._goal: Goal | None = None
+        self._since = self._entered_search = 0.0
+        self._seen_since: float | None = None
+        self._asked = False
         self._ids = count(1) if ids is None else ids
         self._moves = Moves(settings) if moves is None else moves
 
     # -- what a kind says --------------------------------------------------------------------------------------------
+
+    @property
+    def legs(self) -> int:
+        """Places of the pattern that are flown to before anything else."""
+        return 0
 
     @classmethod
     def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
@@ -148,13 +154,12 @@ class MissionMachine(ABC):
     def _searching(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._lost(inputs, outputs):
             return
-        target = inputs.target
-        good, why = usable(target, self._entered_search, self._goal, self.settings, self.unseen)
         if self._moves.looked < self.legs:
             if self._moves.arrived(inputs.time, inputs.state):
                 self._go_on_looking(inputs, outputs, "mapping the lines")
             return
-        if good:
+        target, why = self._usable_now(inputs)
+        if target is not None:
             if self._seen_since is None:
                 self._seen_since = inputs.time
                 self.message = "target in view"
@@ -169,7 +174,7 @@ class MissionMachine(ABC):
 
     def _go_on_looking(self, inputs: Inputs, outputs: Outputs, message: str) -> None:
         """Fly to the next place of the pattern."""
-        place = self._moves.next_look(self._goal, self.pattern(), lambda offset, p: self.reach(offset, p, inputs.target))
+        place = self._moves.next_look(self.pattern(), lambda offset, p: self.reach(offset, p, inputs.target))
         self._go(inputs, outputs, place)
         self.message = message
 
@@ -202,14 +207,17 @@ class MissionMachine(ABC):
         """From where the vehicle stands or hovers to the search place."""
         self._moves.begin(self._goal, inputs.state, on_ground)
         self._enter(Phase.TAKE_OFF, inputs.time, message)
-        self._go(inputs, outputs, self._moves.search_place(self._goal))
+        self._go(inputs, outputs, self._moves.search)
 
     def _go(self, inputs: Inputs, outputs: Outputs, place: Place) -> None:
         outputs.reference, outputs.trajectory_id = self._moves.go(inputs.time, place), self._new_id()
 
-    def _usable_now(self, inputs: Inputs) -> Target | None:
-        """The target, where it is fresh and certain enough to plan on."""
-        return inputs.target if usable(inputs.target, self._entered_search, self._goal, self.settings)[0] else None
+    def _usable_now(self, inputs: Inputs) -> tuple[Target | None, str]:
+        """The target, where it is fresh and certain enough to plan on; otherwise None, and why."""
+        if inputs.target is None or inputs.target.time < self._entered_search:
+            return None, self.unseen
+        why = unusable(inputs.target, self._goal, self.settings)
+        return None if why else inputs.target, why
 
     # -- endings -----------------------------------------------------------------------------------------------------
 
@@ -245,7 +253,7 @@ class MissionMachine(ABC):
 
     def _end(self, outputs: Outputs, result: Result, message: str, contact_time: float = float("nan")) -> None:
         outputs.outcome = Outcome(result, message, contact_time)
-        self.phase, self.message, self._goal = Phase.IDLE, message, None
+        self.phase, self.message = Phase.IDLE, message
 
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         self.phase, self.message, self._since = phase, message, time

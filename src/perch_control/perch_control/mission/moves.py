@@ -33,6 +33,7 @@ class Moves:
     Attributes:
         settings: speeds and times.
         home: where the vehicle stood when it was armed last; below where it hovered at the first goal, if nobody saw that.
+        search: the goal's search pose, or above the place where the vehicle took off.
         hover: where the last move ends, or the vehicle was when there was none.
         wire: the place on a wire that was perched on last, None: a surface.
     """
@@ -40,7 +41,8 @@ class Moves:
     def __init__(self, settings: MissionSettings) -> None:
         self.settings = settings
         self.home: Place | None = None
-        self.hover: Place | None = None
+        self.hover: Place = np.zeros(3), 0.0
+        self.search = self.hover
         self.wire: Target | None = None
         self.began = 0.0                  # when the last move was decided [s]
         self.length = 0.0                 # from then to its end [s]
@@ -48,30 +50,28 @@ class Moves:
 
     def begin(self, goal: Goal, state: State, on_ground: bool) -> None:
         """Go on from the vehicle's state: armed on the ground, or in the air."""
-        self.hover = p, yaw = place_of(state)
+        p, yaw = self.hover = place_of(state)
+        height = np.array([0.0, 0.0, goal.takeoff_height])
         if on_ground:
             self.home = self.hover
         elif self.home is None:
-            self.home = p - np.array([0.0, 0.0, goal.takeoff_height]), yaw
-
-    def search_place(self, goal: Goal) -> Place:
-        """The goal's search pose, or above the place where the vehicle took off."""
+            self.home = p - height, yaw
         p, yaw = self.home
-        if goal.search_position is not None:
-            return goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
-        return p + np.array([0.0, 0.0, goal.takeoff_height]), yaw
+        if goal.search_position is None:
+            self.search = p + height, yaw
+        else:
+            self.search = goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
 
-    def next_look(self, goal: Goal, pattern: Sequence[Look], reach: Reach) -> Place:
+    def next_look(self, pattern: Sequence[Look], reach: Reach) -> Place:
         """The next place of a pattern around the search hover.
 
         Args:
-            goal: what was asked for.
             pattern: the places.
             reach: shortens an offset (forward, left, up [m]), given the search place [m].
         """
         offset, turn = pattern[self.looked % len(pattern)]
         self.looked += 1
-        p, yaw = self.search_place(goal)
+        p, yaw = self.search
         return p + so3.exp(np.array([0.0, 0.0, yaw])) @ reach(offset, p), yaw + turn
 
     def go(self, time: float, place: Place) -> FlatTrajectory:

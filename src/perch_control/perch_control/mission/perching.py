@@ -4,23 +4,37 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from perch_control.mission.machine import MissionMachine
 from perch_control.mission.moves import Moves
-from perch_control.mission.running_perch import RunningPerch
-from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, PlanAnswer, PlanQuery, Result, Target
+from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
 
-class PerchingMission(MissionMachine):
-    """What perches on surfaces and on wires share."""
+class InFlight(Protocol):
+    """A plan that is flown, and the place that it was made for."""
+
+    @property
+    def plan(self) -> Plan: ...
+
+    @property
+    def target(self) -> Target: ...
+
+
+R = TypeVar("R", bound=InFlight)
+
+
+class PerchingMission(MissionMachine, Generic[R]):
+    """What perches on surfaces and on wires share. R: what is known of the plan in flight."""
+
+    _target: Target  # from the query on
+    _running: R      # from the first trajectory on
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         super().__init__(settings, ids, moves)
-        self._running: RunningPerch | RunningPlan | None = None
         self.phases |= {Phase.PLANNING: self._planning, Phase.TRACKING: self._tracking, Phase.VERIFYING: self._verifying,
                         Phase.PERCHED: self._perched}
 
@@ -32,7 +46,7 @@ class PerchingMission(MissionMachine):
         """From the request of a plan from a hover to its use [s]."""
 
     @abstractmethod
-    def running(self, plan: PlanAnswer, target: Target) -> RunningPerch | RunningPlan:
+    def running(self, plan: Plan, target: Target) -> R:
         """A plan in flight."""
 
     @abstractmethod
@@ -41,14 +55,14 @@ class PerchingMission(MissionMachine):
 
     def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Near the contact: whether it is still awaited."""
-        return inputs.time <= self._running.end + self.settings.contact_time + 0.2
+        return inputs.time <= self._running.plan.end + self.settings.contact_time + 0.2
 
     def not_held(self, outputs: Outputs) -> None:
         """No contact was felt: what is done about it."""
 
     def holds(self, inputs: Inputs) -> bool:
         """A contact came late, or an abort did: what was given up holds the vehicle all the same."""
-        return (self._running is not None and -self.settings.contact_early < inputs.time - self._running.end < 1.0
+        return (self._flown_id > 0 and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
                 and self._adhesion.tells(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
 
     # -- phases ------------------------------------------------------------------------------------------------------
@@ -69,14 +83,14 @@ class PerchingMission(MissionMachine):
             if self._elapsed(inputs) > self.settings.phase_timeout:
                 self._end(outputs, Result.TIMEOUT, f"the planner has not answered within {self.settings.phase_timeout:g} s; hovering")
             return
-        if not inputs.plan.success:
+        if isinstance(inputs.plan, Refusal):
             self._end(outputs, Result.REFUSED, f"planner refused: {inputs.plan.message}")
             return
         self._fly(self.running(inputs.plan, self._target), outputs)
         self._enter(Phase.TRACKING, inputs.time, f"perching, {inputs.plan.duration:.2f} s")
 
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
-        end = self._running.end
+        end = self._running.plan.end
         self.time_to_contact = end - inputs.time
         if inputs.trajectory_id == self._flown_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"perch given up: {inputs.controller_message}")
@@ -87,7 +101,7 @@ class PerchingMission(MissionMachine):
             self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
 
     def _verifying(self, inputs: Inputs, outputs: Outputs) -> None:
-        self.time_to_contact = self._running.end - inputs.time
+        self.time_to_contact = self._running.plan.end - inputs.time
         if self._adhesion.attached(inputs.state, self._running.target):
             self._contact_time = inputs.time
             self._adhesion.reset()
@@ -111,10 +125,10 @@ class PerchingMission(MissionMachine):
 
     # -- plans in flight ---------------------------------------------------------------------------------------------
 
-    def _fly(self, running: RunningPerch | RunningPlan, outputs: Outputs) -> None:
+    def _fly(self, running: R, outputs: Outputs) -> None:
         self._running, self._flown_id = running, self._new_id()
         outputs.perch, outputs.trajectory_id = running.plan, self._flown_id
 
-    def _fly_better(self, better: RunningPerch | RunningPlan, outputs: Outputs) -> None:
+    def _fly_better(self, better: R, outputs: Outputs) -> None:
         self._fly(better, outputs)
         self.message = f"re-planned, {better.plan.duration:.2f} s"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from perch_core import so3
 from perch_core.component import Unavailable
 from perch_core.values import AtEnd, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, TrajectoryOrder, nanoseconds
-from perch_control.mission.values import PlanAnswer, PlanQuery
-from perch_control.reference import normalised
+from perch_control.mission.values import Plan, PlanQuery, Refusal
 
 
 def perch_request(query: PlanQuery) -> PerchPlanRequest:
@@ -19,30 +22,29 @@ def perch_request(query: PlanQuery) -> PerchPlanRequest:
 def powerline_request(query: PlanQuery) -> PowerlinePlanRequest:
     """The request for a perch on a cable, or for the way out of one."""
     x, target = query.state, query.target
-    moving = {} if x is None else {"w": x.w, "rotor_thrust": tuple(x.rotor_thrust.tolist())}
-    return PowerlinePlanRequest(
-        start=nanoseconds(query.start_time), p=query.p, q=so3.quat_exp([0.0, 0.0, query.yaw]) if x is None else x.q, v=query.v,
+    request = PowerlinePlanRequest(
+        start=nanoseconds(query.start_time), p=query.p, q=so3.quat_exp(np.array([0.0, 0.0, query.yaw])), v=query.v,
         lines=target.lines, target_line=target.line, perch_pose=query.perch_pose, perch_point=target.p_WS,
         perch_pitch=float(query.goal.perch_pitch), perception_aware=query.goal.perception_aware, with_recovery=True,
-        recovery_only=query.recovery, **moving)
+        recovery_only=query.recovery)
+    return request if x is None else replace(request, q=x.q, w=x.w, rotor_thrust=tuple(x.rotor_thrust.tolist()))
 
 
-def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> PlanAnswer:
+def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal:
     """What a planner's answer means to the mission."""
     if isinstance(plan, Unavailable):
-        return PlanAnswer(False, plan.reason)
+        return Refusal(plan.reason)
     if not plan.success or plan.trajectory is None:
-        return PlanAnswer(False, plan.message or "no reason was given")
+        return Refusal(plan.message or "no reason was given")
     trajectory = plan.trajectory
     if isinstance(plan, PerchPlan):
-        return PlanAnswer(True, plan.message, trajectory, trajectory.start_time, trajectory.duration)
+        return Plan(trajectory, trajectory.duration)
     if plan.recovery_start < 0.0:  # a perch alone, which the planner offers where it finds no recovery
-        return PlanAnswer(False, plan.message)
+        return Refusal(plan.message)
     at_end = AtEnd.RECOVER if plan.perch_time else AtEnd.HOLD  # a recovery alone ends in a hover
-    return PlanAnswer(True, plan.message, trajectory, trajectory.start_time, plan.perch_time or plan.recovery_time, normalised(trajectory),
-                      at_end, plan.recovery_start)
+    return Plan(trajectory, plan.perch_time or plan.recovery_time, at_end, plan.recovery_start)
 
 
-def flown_order(id: int, plan: PlanAnswer, contact_time: float) -> TrajectoryOrder:
+def flown_order(id: int, plan: Plan, contact_time: float) -> TrajectoryOrder:
     """A plan as it is ordered; `contact_time`: how long the contact is awaited [s]."""
     return TrajectoryOrder.of(id, plan.trajectory, plan.at_end, contact_time, plan.recovery_start)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Goal, PlanAnswer, PlanQuery, Target
+from perch_control.mission.values import Goal, Plan, PlanQuery, Refusal, Target
 
 
 @dataclass(frozen=True)
@@ -22,21 +22,16 @@ class RunningPerch:
         asked_at: time of the newest query [s].
     """
 
-    plan: PlanAnswer
+    plan: Plan
     target: Target
     asked: Target
     asked_at: float = -math.inf
 
-    @property
-    def end(self) -> float:
-        """Time of the planned contact [s]."""
-        return self.plan.start_time + self.plan.duration
-
-    def better(self, answer: PlanAnswer | None, time: float, settings: MissionSettings) -> RunningPerch | None:
+    def better(self, answer: Plan | Refusal | None, time: float, settings: MissionSettings) -> RunningPerch | None:
         """The plan to fly instead of this one, from the answer to the newest query; None: this one."""
-        if answer is None or not answer.success or answer.start_time <= time:
+        if not isinstance(answer, Plan) or answer.start_time <= time:
             return None
-        if abs(answer.start_time + answer.duration - self.end) > settings.replan_shift:
+        if abs(answer.end - self.plan.end) > settings.replan_shift:
             return self  # a detour: the running plan is better
         return replace(self, plan=answer, target=self.asked)
 
@@ -52,10 +47,10 @@ class RunningPerch:
             start: when a new plan could start [s].
             latency: from the request to the use of a plan [s].
         """
-        if target is None or target.time <= self.asked.time or self.end - start <= settings.replan_until:
+        if target is None or target.time <= self.asked.time or self.plan.end - start <= settings.replan_until:
             return None
         if start <= self.plan.start_time or time - self.asked_at < settings.replan_period:
             return None
         zero = np.zeros(3)
-        query = PlanQuery(start, zero, zero, zero, zero, 0.0, target, goal, latency, current=self.plan.trajectory, duration=self.end - start)
+        query = PlanQuery(start, zero, zero, zero, zero, 0.0, target, goal, latency, current=self.plan.trajectory, duration=self.plan.end - start)
         return replace(self, asked=target, asked_at=time), query

@@ -16,10 +16,11 @@ import math
 import numpy as np
 
 from perch_core import so3
-from perch_core.trajectory import StateSample
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory, StateSample
 from perch_core.values import AtEnd
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import TICK, Goal, PlanAnswer, PlanQuery, State, Target
+from perch_control.mission.values import TICK, Goal, Plan, PlanQuery, Refusal, State, Target
+from perch_control.reference import normalised
 from perch_control.smooth_position import BEFORE
 
 _AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
@@ -32,23 +33,30 @@ class RunningPlan:
     Attributes:
         plan: what is flown.
         target: the place that it was made for.
+        states: of the plan, with unit quaternions.
         covered: start of the latest way out that is known [s].
     """
 
-    def __init__(self, plan: PlanAnswer, target: Target, settings: MissionSettings, replanned_at: float = -math.inf) -> None:
-        self.plan, self.target, self.covered = plan, target, plan.start_time
+    def __init__(self, plan: Plan, target: Target, settings: MissionSettings, states: SampledTrajectory, replanned_at: float = -math.inf) -> None:
+        self.plan, self.target, self.states, self.covered = plan, target, states, plan.start_time
         self._settings, self._replanned_at = settings, replanned_at
         self._asked: PlanQuery | None = None
         self._leaving = False  # the way out from the wire has been asked for
 
-    @property
-    def end(self) -> float:
-        """Time of the planned contact [s]."""
-        return self.plan.start_time + self.plan.duration
+    @classmethod
+    def begun(cls, plan: Plan, target: Target, settings: MissionSettings, replanned_at: float = -math.inf) -> RunningPlan:
+        """A planner's answer in flight.
+
+        Raises:
+            TypeError: it carries no states.
+        """
+        if isinstance(plan.trajectory, FlatTrajectory):
+            raise TypeError("a powerline plan carries states, not polynomials")
+        return cls(plan, target, settings, normalised(plan.trajectory), replanned_at)
 
     def state(self, time: float) -> StateSample:
         """The plan's state at a time [s]."""
-        return self.plan.sampled.sample(time - self.plan.start_time)
+        return self.states.sample(time - self.plan.start_time)
 
     def query(self, time: float, present: State, target: Target | None, goal: Goal) -> PlanQuery | None:
         """What to ask now, if anything.
@@ -66,16 +74,16 @@ class RunningPlan:
             self._replanned_at = time
             return self._ask(start, self.state(start), target, goal, perch_pose=self._perch_pose(target))
         start = max(start, self.covered + s.way_out_spacing)
-        if start < self.end - s.way_out_until:
+        if start < self.plan.end - s.way_out_until:
             return self._ask(start, self.state(start), self.target, goal, recovery=True)
         soonest = time + s.ahead_latency + _DECISION
-        if not self._leaving and self.end - TICK < soonest < self.end + s.contact_time:
+        if not self._leaving and self.plan.end - TICK < soonest < self.plan.end + s.contact_time:
             self._leaving = True
-            start = max(soonest, self.end)
+            start = max(soonest, self.plan.end)
             return self._ask(start, self._continued(time, present, start), self.target if target is None else target, goal, recovery=True)
         return None
 
-    def answered(self, plan: PlanAnswer, time: float) -> tuple[PlanAnswer | None, RunningPlan | None]:
+    def answered(self, plan: Plan | Refusal, time: float) -> tuple[Plan | None, RunningPlan | None]:
         """Take the answer to the last query.
 
         Returns:
@@ -86,14 +94,14 @@ class RunningPlan:
             return None, None
         if query.recovery:
             self.covered = query.start_time  # a refusal, too: the next one is asked for further on
-        if not plan.success or plan.start_time <= time:
+        if isinstance(plan, Refusal) or plan.start_time <= time:
             return None, None
         if query.recovery:
             return plan, None
-        late = plan.start_time + plan.duration - self.end
+        late = plan.end - self.plan.end
         if abs(late) > self._settings.replan_shift:
             return None, None  # a detour: the wire is better met as planned, or missed and left
-        return None, RunningPlan(plan, query.target, self._settings, self._replanned_at)
+        return None, RunningPlan.begun(plan, query.target, self._settings, self._replanned_at)
 
     def moved(self, time: float, target: Target | None, goal: Goal) -> RunningPlan | None:
         """The same plan, moved with the wire; None: it stays where it is.
@@ -110,16 +118,14 @@ class RunningPlan:
         s = self._settings
         if not goal.replan or target is None or not self._seen_better(target):
             return None
-        if not self.plan.start_time + _DECISION < time < self.end - BEFORE:
+        if not self.plan.start_time + _DECISION < time < self.plan.end - BEFORE:
             return None
         offset = target.p_WS - self.target.p_WS
         if not s.shift_distance < float(np.linalg.norm(offset)) < s.shift_max:
             return None
-        rest = self.plan.sampled.rest_of(time - self.plan.start_time, offset)
-        left = self.end - rest.start_time
-        plan = dataclasses.replace(self.plan, trajectory=rest, sampled=rest, start_time=rest.start_time, duration=left,
-                                   at_end=AtEnd.RECOVER, recovery_start=float(left))
-        following = RunningPlan(plan, target, s, self._replanned_at)
+        rest = self.states.rest_of(time - self.plan.start_time, offset)
+        left = self.plan.end - rest.start_time
+        following = RunningPlan(Plan(rest, left, AtEnd.RECOVER, float(left)), target, s, rest, self._replanned_at)
         following.covered, following._asked = self.covered, self._asked  # ways out stay: centimetres do not matter there
         following._leaving = self._leaving
         return following
@@ -129,13 +135,13 @@ class RunningPlan:
 
     def _better(self, target: Target, time: float, start: float) -> bool:
         s = self._settings
-        return (self._seen_better(target) and self.end - start > s.powerline_replan_until
+        return (self._seen_better(target) and self.plan.end - start > s.powerline_replan_until
                 and start > self.plan.start_time + _DECISION and time - self._replanned_at >= s.powerline_replan_period
                 and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.shift_max)
 
     def _perch_pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
         """The planned end, moved with the wire: position [m] and attitude xyzw. Its side of the wire stays the same."""
-        end = self.state(self.end)
+        end = self.state(self.plan.end)
         return end.p + target.p_WS - self.target.p_WS, end.q
 
     def _continued(self, time: float, present: State, later: float) -> StateSample:

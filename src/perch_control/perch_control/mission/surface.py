@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_perch import RunningPerch
-from perch_control.mission.values import Command, Inputs, Outputs, PlanAnswer, Target
+from perch_control.mission.values import Command, Inputs, Outputs, Plan, Target
 
 
-class SurfaceMission(PerchingMission):
+class SurfaceMission(PerchingMission[RunningPerch]):
     """Find the pad, plan, perch; where asked, plan again to the pad as it is seen nearer."""
 
     unseen = "no tags seen"
@@ -17,7 +17,7 @@ class SurfaceMission(PerchingMission):
         """Of a plan for a surface, from a hover or in flight [s]."""
         return self.settings.planner_latency
 
-    def running(self, plan: PlanAnswer, target: Target) -> RunningPerch:
+    def running(self, plan: Plan, target: Target) -> RunningPerch:
         """A plan in flight."""
         return RunningPerch(plan, target, target)
 
@@ -31,7 +31,7 @@ class SurfaceMission(PerchingMission):
                 self._fly_better(better, outputs)
             return
         start = inputs.time + self.settings.lead(self.latency)
-        asked = self._running.query(inputs.time, self._usable_now(inputs), self._goal, self.settings, start, self.latency)
+        asked = self._running.query(inputs.time, self._usable_now(inputs)[0], self._goal, self.settings, start, self.latency)
         if asked is not None:
             self._running, outputs.query = asked
 

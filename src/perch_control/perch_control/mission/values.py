@@ -107,7 +107,7 @@ class Goal:
     takeoff_height: float
     search_timeout: float
     mode: int = Mode.SURFACE
-    perch_point: np.ndarray | None = None
+    perch_point: np.ndarray = field(default_factory=lambda: np.zeros(3))
     perch_pitch: float = 0.0
     perception_aware: bool = False
     search_position: np.ndarray | None = None
@@ -152,27 +152,36 @@ class PlanQuery:
 
 
 @dataclass(frozen=True)
-class PlanAnswer:
-    """The planner's answer.
+class Plan:
+    """What the planner has found.
 
     Attributes:
-        success: there is a plan.
-        message: the planner's words.
         trajectory: what is flown.
-        start_time: when it starts [s].
         duration: from its start to the contact [s].
-        sampled: the states of a powerline plan, with unit quaternions.
         at_end, recovery_start: as in `TrajectoryOrder`.
     """
 
-    success: bool
-    message: str
-    trajectory: FlatTrajectory | SampledTrajectory | None = None
-    start_time: float = 0.0
-    duration: float = 0.0
-    sampled: SampledTrajectory | None = None
+    trajectory: FlatTrajectory | SampledTrajectory
+    duration: float
     at_end: AtEnd = AtEnd.CONTACT
     recovery_start: float = -1.0
+
+    @property
+    def start_time(self) -> float:
+        """When it starts [s]."""
+        return self.trajectory.start_time
+
+    @property
+    def end(self) -> float:
+        """Time of the planned contact [s]."""
+        return self.start_time + self.duration
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """There is no plan, in the planner's words."""
+
+    message: str
 
 
 @dataclass(frozen=True)
@@ -188,7 +197,7 @@ class Inputs:
     trajectory_time: float
     target: Target | None
     specific_force_B: np.ndarray  # IMU samples since the last tick [m/s^2], shape (n, 3)
-    plan: PlanAnswer | None = None
+    plan: Plan | Refusal | None = None
     cancel: bool = False
     imu_period: float = NOMINAL_PERIOD  # [s]
 
@@ -208,8 +217,8 @@ class Outputs:
 
     commands: list[tuple[Command, str]] = field(default_factory=list)
     reference: FlatTrajectory | None = None    # a trajectory of the mission's own: take-off, search
-    perch: PlanAnswer | None = None            # a planned perch to be flown
-    way_out: PlanAnswer | None = None          # a recovery to keep ready, out of the trajectory with this id
+    perch: Plan | None = None                  # a planned perch to be flown
+    way_out: Plan | None = None                # a recovery to keep ready, out of the trajectory with this id
     trajectory_id: int = 0
     query: PlanQuery | None = None
     outcome: Outcome | None = None

@@ -10,7 +10,7 @@ from perch_control.mission.machine import MissionMachine
 from perch_control.mission.moves import Look
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_plan import RunningPlan
-from perch_control.mission.values import Inputs, Outputs, PlanAnswer, Target
+from perch_control.mission.values import Inputs, Outputs, Plan, Target
 
 
 class LineMission(MissionMachine):
@@ -28,7 +28,7 @@ class LineMission(MissionMachine):
         return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
 
 
-class PowerlineMission(LineMission, PerchingMission):
+class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
     """Map the lines, plan a perch with its recovery, fly it with ways out kept ready."""
 
     @property
@@ -48,9 +48,9 @@ class PowerlineMission(LineMission, PerchingMission):
         """Of a plan from a hover [s]."""
         return self.settings.powerline_latency
 
-    def running(self, plan: PlanAnswer, target: Target) -> RunningPlan:
+    def running(self, plan: Plan, target: Target) -> RunningPlan:
         """A plan in flight."""
-        return RunningPlan(plan, target, self.settings)
+        return RunningPlan.begun(plan, target, self.settings)
 
     def better(self, inputs: Inputs, outputs: Outputs) -> None:
         """Follow the map as it gets better, and keep a way out ready."""
@@ -59,7 +59,7 @@ class PowerlineMission(LineMission, PerchingMission):
             outputs.trajectory_id = self._flown_id
             if better is not None:
                 self._fly_better(better, outputs)
-        target = self._usable_now(inputs)
+        target, _ = self._usable_now(inputs)
         moved = self._running.moved(inputs.time, target, self._goal)
         if moved is not None and outputs.perch is None and outputs.way_out is None:
             self._running = moved
@@ -68,7 +68,7 @@ class PowerlineMission(LineMission, PerchingMission):
 
     def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
         """The plan goes on into its recovery by itself; until then ways out are still asked for."""
-        if inputs.time <= self._running.end + self.settings.contact_time:
+        if inputs.time <= self._running.plan.end + self.settings.contact_time:
             self.better(inputs, outputs)
             return True
         return super().waiting(inputs, outputs)
