@@ -88,15 +88,16 @@ class Assembly:
         work(Job(build_law, (name, self.vehicle, params), partial(self._prepared, name, params, work, say)))
 
     def _prepared(self, name: str, params: ControllerParameters, work: Callable[[Job], None], say: Callable[[str], None],
-                  law: Law | Exception) -> None:
+                  built: Law | Exception) -> None:
+        law: Law | Exception | None = built
         if params is not self._params:  # gains were changed in the meantime
             try:
-                law = None if isinstance(law, Exception) else law.retuned(self._params)
+                law = None if isinstance(built, Exception) else built.retuned(self._params)
             except ConfigError:
                 law = None
-            if law is None:
-                self._prepare(name, work, say)
-                return
+        if law is None:
+            self._prepare(name, work, say)
+            return
         if isinstance(law, Exception):
             self._failed[name] = str(law), partial(self._prepare, name, work, say)
             say(f"{name} could not be built: {law}")

@@ -15,7 +15,7 @@ from perch_control.geometric import GeometricController
 from perch_control.l1 import L1Augmentation, L1Settings
 from perch_control.modes import Command, State
 from perch_control.period import NOMINAL_PERIOD
-from perch_control.reference import FlatReference
+from perch_control.reference import FlatReference, Vector
 from perch_control.settings import GeometricGains
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import GRAVITY, Vehicle
@@ -43,7 +43,7 @@ class _DryRun:
         path = rest_to_rest(np.array(self._expected()[0]), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE, start_time=start)
         self.flight.follow(Order(id, FlatReference(path), start, at_end))
 
-    def _expected(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    def _expected(self) -> tuple[Vector, Vector]:
         """Position [m] and velocity [m/s]; at rest on the ground before the first order."""
         if not self.flight.maneuvers.flying:
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -9,6 +9,7 @@ import numpy as np
 from perch_core.vector3 import axes_of
 from perch_core.vehicle import Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
+from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import packed_vehicle
 from perch_control.geometric.step import predicted
@@ -225,7 +226,7 @@ class FlightController:
             elif verdict.jumped:
                 m.stay(verdict.reason)
         if m.blind is not None:
-            return self._descend()
+            return self._descend(m.blind)
         self._schedule.activate(self.law)
         if m.flying:
             self._thrust.judge(self.law, self.compensator)
@@ -239,7 +240,7 @@ class FlightController:
         if m.flying and stamp - self._imu_stamp > self.settings.down_time:
             m.motors_off(State.FAILED, f"neither odometry nor IMU for {self.settings.down_time:g} s")
         m.descend("no odometry")
-        return self._descend() if m.blind is not None else self._idle()
+        return self._descend(m.blind) if m.blind is not None else self._idle()
 
     def _advance(self, stamp: float) -> float:
         m = self.maneuvers
@@ -292,17 +293,17 @@ class FlightController:
             return NO_COMPENSATION
         if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0 or m.may_touch(0.0):
             return self.compensator.hold()
-        return self.compensator.update(m.belief, m.rotors, m.now)
+        return self.compensator.update(m.belief, m.rotors.speed, m.now)
 
-    def _descend(self) -> StepResult:
+    def _descend(self, blind: BlindDescent) -> StepResult:
         m = self.maneuvers
-        if m.blind.landed:
+        if blind.landed:
             m.motors_off(self._lying, "landed without position, motors off")
             return self._idle()
-        speed, thrust = m.blind.rotors(m.rotors.led.speed)
-        m.rotors = m.rotors.following(speed, (*_NOWHERE, *m.blind.attitude.q, *m.blind.attitude.w), self.vehicle)
+        speed, thrust = blind.rotors(m.rotors.led.speed)
+        m.rotors = m.rotors.following(speed, (*_NOWHERE, *blind.attitude.q, *blind.attitude.w), self.vehicle)
         self.margin = (self.vehicle.thrust_max - max(thrust)) / self.vehicle.thrust_max
-        return StepResult(True, speed, wrench=m.blind.wanted(), margin=self.margin, event=self._event(), loop=m.rotors.sent)
+        return StepResult(True, speed, wrench=blind.wanted(), margin=self.margin, event=self._event(), loop=m.rotors.sent)
 
     @property
     def _lying(self) -> State:

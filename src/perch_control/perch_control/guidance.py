@@ -10,7 +10,7 @@ from operator import add
 
 import numpy as np
 
-from perch_control.reference import Setpoint, fields, flat_setpoints, packed_many
+from perch_control.reference import Setpoint, Source, Vector, fields, flat_setpoints, packed_many
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory
 
@@ -36,7 +36,7 @@ class Hold:
         return self.target
 
 
-def horizontal(h) -> tuple[float, float, float]:
+def horizontal(h) -> Vector:
     """b2_des turned into the horizontal plane; a vertical one counts as heading zero."""
     n = float(np.hypot(h[0], h[1]))
     return (float(h[0]) / n, float(h[1]) / n, 0.0) if n > 1e-3 else (0.0, 1.0, 0.0)
@@ -45,7 +45,7 @@ def horizontal(h) -> tuple[float, float, float]:
 class Polynomial:
     """A polynomial in position with a fixed heading; past its end the end velocity goes on."""
 
-    def __init__(self, coefficients: np.ndarray, duration: float, h: tuple[float, float, float]) -> None:
+    def __init__(self, coefficients: np.ndarray, duration: float, h: Vector) -> None:
         """
         Args:
             coefficients: Bernstein coefficients of x, y, z [m], shape (3, degree + 1).
@@ -130,7 +130,7 @@ class Blend:
         lasting: the offset goes on past its end instead of being over.
     """
 
-    source: object
+    source: Source
     start: float
     offset: Polynomial
     lasting: bool = False
@@ -153,14 +153,14 @@ class Blend:
         if since < 0.0 or not (self.lasting or since < self.offset.duration):
             return x
         moved = (tuple(map(add, *pair)) for pair in zip(x[:5], self.offset.setpoint(since)))
-        return Setpoint(*moved, *x[5:])
+        return Setpoint._make((*moved, *x[5:]))
 
 
 @dataclass(frozen=True)
 class Running:
     """A running reference, and the time on it at which another one shall take over [s]."""
 
-    source: object
+    source: Source
     time: float
 
     @property
@@ -180,15 +180,15 @@ class Running:
         return np.zeros((2, 3))
 
 
-def blended(old: Setpoint, source, start: float, end: float):
+def blended(old: Setpoint, source: Source, start: float, end: float) -> Source:
     """`source` from its time `start` on, taken over from the old setpoint without a jump in position, velocity or
     acceleration, within `LONG` or half of the time to `end`, but no faster than within `SHORT` where there is so much; the source
     itself where it continues the old one exactly."""
     new = source.setpoint(start)
-    gap = [np.subtract(getattr(old, k), getattr(new, k)) for k in ("p", "v", "a")]
-    if max(float(np.abs(g).max()) for g in gap) < 1e-6:
+    p, v, a = (np.subtract(*pair) for pair in zip(old[:3], new[:3]))
+    if max(float(np.abs(g).max()) for g in (p, v, a)) < 1e-6:
         return source
     zero = np.zeros(3)
     left = end - start
     duration = min(LONG, max(0.5 * left, min(left, SHORT), 0.1))
-    return Blend(source, start, Polynomial(quintic(*gap, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))
+    return Blend(source, start, Polynomial(quintic(p, v, a, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))

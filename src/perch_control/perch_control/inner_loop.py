@@ -25,7 +25,7 @@ from perch_core.vector3 import axpy, cross, limited, scale, times, turned
 from perch_core.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from perch_control.reference import Following, Setpoint
+    from perch_control.reference import Following, Setpoint, Source
 
 _LARGEST_TURN = 1.5  # of a commanded attitude from the present one [rad]
 _ZERO = (0.0, 0.0, 0.0)
@@ -59,7 +59,7 @@ class Later(NamedTuple):
     delay: float
 
     @property
-    def source(self) -> object:
+    def source(self) -> Source:
         """Of the reference."""
         return self.running.source
 

@@ -18,7 +18,7 @@ from perch_core.vector3 import axes_of, axpy, cross, limited, scale, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.step import drag_compensation, wrench_of
-from perch_control.rotor_lag import RotorEstimate, thrusts
+from perch_control.rotor_lag import thrusts
 
 _ZERO = (0.0,) * 6
 _LONGEST_GAP = 0.025  # a longer time between samples starts the predictor anew [s]
@@ -110,17 +110,17 @@ class L1Augmentation:
         self._last = None
         return tuple(-x for x in self.disturbance)
 
-    def update(self, state: tuple[float, ...], rotors: RotorEstimate, now: float) -> tuple[float, ...]:
+    def update(self, state: tuple[float, ...], speed: tuple[float, ...], now: float) -> tuple[float, ...]:
         """Take a state; returns what makes up for the disturbance, 6 floats (see `geometric_step`).
 
         Args:
             state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
-            rotors: rotor speeds now.
+            speed: of the rotors now [rad/s], 4 floats.
             now: [s].
         """
         s = self.settings
         measured = (*state[3:6], *state[10:13])
-        f = thrusts(rotors.speed, self._vehicle[1][0])
+        f = thrusts(speed, self._vehicle[1][0])
         if self._last is None or not 0.0 < now - self._last[0] < _LONGEST_GAP:
             predicted = measured
         else:

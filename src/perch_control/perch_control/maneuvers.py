@@ -40,7 +40,7 @@ class Maneuvers:
         unseen: IMU samples since then: time [s], rates [rad/s], specific force [m/s^2].
         rotors: rotor speeds, or the inner loop, as the lag model has them.
         source, start: running reference and the time at which it began [s].
-        order, trajectory_id: trajectory that is being tracked; the id stays until another one or the motors' stop.
+        order, trajectory_id: trajectory that is being tracked, None in all states but TRACKING; the id stays until another one or the motors' stop.
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
         events: what has happened since the last step.
@@ -174,7 +174,7 @@ class Maneuvers:
         left, s = self.specific_thrust_max, self.settings.rotors
         said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
         upright = axes_of(self.belief[6:10])[2][2] >= _UPRIGHT
-        if self.state is State.TRACKING:
+        if self.order is not None:
             if upright and self.order.at_end is AtEnd.CONTACT:
                 return f"{said}, too little to recover from a missed contact"
             if self._judged is None or self._judged[0] is not self.source or self._judged[1] is not self.vehicle:
@@ -207,7 +207,7 @@ class Maneuvers:
     @property
     def time_to_contact(self) -> float:
         """Time to the planned contact of the running trajectory [s], 0 after it, infinite where there is none."""
-        if self.state is not State.TRACKING or self.order.at_end is not AtEnd.CONTACT:
+        if self.order is None or self.order.at_end is not AtEnd.CONTACT:
             return inf
         return max(self.order.source.duration - self.elapsed, 0.0)
 

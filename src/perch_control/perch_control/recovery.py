@@ -15,7 +15,7 @@ from perch_core.config import quantity
 from perch_core.vector3 import axes_of, axpy, dot, limited, norm, scale
 from perch_core.vehicle import GRAVITY
 from perch_control.guidance import horizontal
-from perch_control.reference import Setpoint
+from perch_control.reference import Setpoint, Vector
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class RecoverySettings:
     timeout: float = quantity(6.0, unit="s", above=0.0, doc="then descend")
 
 
-def towards(f: tuple[float, ...], b1: tuple[float, ...], b3: tuple[float, ...], ahead: float) -> tuple[float, ...] | None:
+def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:
     """The direction that is `ahead` [rad] from b3 on the shortest turn to `f`; None: `f` is nearer than that."""
     if dot(b3, f) >= cos(ahead) * norm(f):
         return None
-    across = axpy(-dot(b3, f), b3, f)
+    across: Vector = axpy(-dot(b3, f), b3, f)
     across = scale(1.0 / norm(across), across) if norm(across) > 1e-6 * norm(f) else b1  # opposite ones turn about b2
     return axpy(sin(ahead), across, scale(cos(ahead), b3))
 
@@ -54,7 +54,7 @@ class Recovery:
     by_state = True  # a function of the state, with nothing to be previewed
 
     def __init__(self, settings: RecoverySettings, specific_thrust_max: float, state: tuple[float, ...],
-                 normal: tuple[float, float, float] | None) -> None:
+                 normal: Vector | None) -> None:
         """
         Args:
             settings: how to fly.
@@ -64,8 +64,8 @@ class Recovery:
         """
         self._settings, self._thrust_max = settings, specific_thrust_max
         self._origin, self._normal = state[0:3], normal
+        self._push = None if normal is None or normal[2] >= cos(radians(30.0)) else normal
         _, self._h, _ = axes_of(state[6:10])
-        self._pushing = normal is not None and normal[2] < cos(radians(30.0))
         self._setpoint = Setpoint(state[0:3], state[3:6], h=self._h)
         self.finished = False
 
@@ -76,14 +76,14 @@ class Recovery:
         b1, b2, b3 = axes_of(state[6:10])
         moved = axpy(-1.0, self._origin, p)
         clearance = dot(moved, self._normal) if self._normal is not None else s.away_distance
-        if self._pushing and (elapsed > s.push_time or clearance > s.push_clearance):
-            self._pushing = False
-        if self._pushing:
-            f = scale(s.thrust_share * self._thrust_max, self._normal)
+        if elapsed > s.push_time or clearance > s.push_clearance:
+            self._push = None
+        if self._push is not None:
+            f = scale(s.thrust_share * self._thrust_max, self._push)
             self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._h)
             return
         climb = min(max(-s.climb_gain * moved[2], -s.climb_speed_max), s.climb_speed_max)
-        away = (0.0, 0.0, 0.0)
+        away: Vector = (0.0, 0.0, 0.0)
         if self._normal is not None and clearance < s.away_distance:
             nx, ny, _ = self._normal
             away = scale(s.away_speed, (nx, ny, 0.0))

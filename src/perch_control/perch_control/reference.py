@@ -6,7 +6,7 @@ A source is anything with `duration` and `setpoint(t)`, t in seconds since its s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import GRAVITY
 
-Vector = tuple[float, float, float]
+Vector = tuple[float, ...]
+"""3 floats."""
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -63,11 +64,24 @@ def _floats(v) -> Vector:
     return (float(v[0]), float(v[1]), float(v[2]))
 
 
+class Source(Protocol):
+    """A reference: setpoints over the time since its start, and how long it lasts [s]."""
+
+    @property
+    def duration(self) -> float: ...
+
+    def setpoint(self, t: float) -> Setpoint:
+        """Setpoint at a time [s]."""
+
+
 class Following(Protocol):
     """A running reference: its source, the time since it began, and its setpoint some time from now."""
 
-    source: Any
-    elapsed: float
+    @property
+    def source(self) -> Source: ...
+
+    @property
+    def elapsed(self) -> float: ...
 
     def setpoint(self, ahead: float = 0.0) -> Setpoint:
         """Setpoint `ahead` seconds from now."""

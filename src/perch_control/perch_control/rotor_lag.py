@@ -75,8 +75,8 @@ class RotorEstimate(NamedTuple):
         command: what the rotors are following [rad/s], 4 floats.
     """
 
-    speed: tuple[float, float, float, float]
-    command: tuple[float, float, float, float]
+    speed: tuple[float, ...]
+    command: tuple[float, ...]
 
     @classmethod
     def at_idle(cls, vehicle: Vehicle) -> RotorEstimate:
@@ -89,7 +89,7 @@ class RotorEstimate(NamedTuple):
         share = 1.0 if time_constant <= 0.0 else 1.0 - exp(-duration / time_constant)
         return RotorEstimate(approached(self.speed, self.command, share), self.command)
 
-    def following(self, command: tuple[float, float, float, float], *_: object) -> RotorEstimate:
+    def following(self, command: tuple[float, ...], *_: object) -> RotorEstimate:
         """The same rotors with a new command."""
         return RotorEstimate(self.speed, command)
 

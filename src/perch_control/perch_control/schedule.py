@@ -51,7 +51,7 @@ class Schedule:
         speed needs more room than a planned way out.
         """
         m, order = self._maneuvers, self._maneuvers.order
-        if m.state is not State.TRACKING or order.recovery_start < 0.0:
+        if order is None or order.recovery_start < 0.0:
             return False
         own = order.start + order.recovery_start
         if m.now >= own:
@@ -88,7 +88,7 @@ class Schedule:
         Nothing is blended: the reference comes to the vehicle, and the way from there is clear of the wire.
         """
         m, order = self._maneuvers, self._maneuvers.order
-        if m.state is not State.TRACKING or order.at_end is not AtEnd.RECOVER or order.recovery_start < 0.0:
+        if order is None or order.at_end is not AtEnd.RECOVER or order.recovery_start < 0.0:
             return
         own = order.start + order.recovery_start
         way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= m.now), None)

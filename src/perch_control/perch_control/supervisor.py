@@ -92,7 +92,7 @@ class Supervisor:
             m.stop(f"hover: {outside:.1f} m outside the geofence")
         elif self._monitor.exhausted(margin, m.now):
             m.land("landing: the rotors are at their limit")
-        elif m.state is State.TRACKING:
+        elif m.order is not None:
             self._at_end(m.order, m.elapsed - m.order.source.duration)
         elif m.elapsed > s.silence_time:
             m.land(f"landing: no order for {s.silence_time:.0f} s")

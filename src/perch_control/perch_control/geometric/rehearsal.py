@@ -75,19 +75,21 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
     """
     T, period = source.duration, controller.period
     first = np.zeros((4, 3)) if running is None else _apart(running.setpoint, source.setpoint(0.0))
-    n = int((T if first.any() else min(_SPAN, T)) / period)
+    taken = running if first.any() else None
+    n = int((min(_SPAN, T) if taken is None else T) / period)
     growth = n * period - _QUIET
     if growth < _QUIET:
         return source
-    begin, lead = (0.0 if first.any() else T - n * period), controller.lead
+    begin, lead = (T - n * period if taken is None else 0.0), controller.lead
     times = np.arange(n) * period + lead
     table = packed_many(source, begin + times)
-    start, rotors = _on_reference(running.setpoint if first.any() else source.setpoint(begin), vehicle)
+    start, rotors = _on_reference(source.setpoint(begin) if taken is None else taken.setpoint, vehicle)
     end = source.setpoint(T)
     s3 = np.add(end.a, (0.0, 0.0, GRAVITY)) / np.linalg.norm(np.add(end.a, (0.0, 0.0, GRAVITY)))
     faster = max(contact_speed + float(np.dot(end.v, s3)), 0.0)
     wanted = np.array([np.subtract(end.p, overshoot * s3), np.subtract(end.v, faster * s3)])
-    delta, best, least = running.carried if first.any() else np.zeros((2, 3)), None, np.inf
+    delta = np.zeros((2, 3)) if taken is None else taken.carried
+    best, least = delta, np.inf
     for _ in range(_ROUNDS):
         shifted = table.copy()
         shifted[:, :15] += _offset(delta, growth, first).many(times)[:, :15]
@@ -99,7 +101,7 @@ def rehearsed(source, vehicle: Vehicle, controller, contact_speed: float, oversh
         if error < _CLOSE:
             break
         delta = np.clip(delta - miss, -_LARGEST, _LARGEST)
-    return Blend(source, begin, _offset(best, growth, first), lasting=True) if best.any() or first.any() else source
+    return Blend(source, begin, _offset(best, growth, first), lasting=True) if best.any() or taken is not None else source
 
 
 def _apart(running: Setpoint, start: Setpoint) -> np.ndarray:

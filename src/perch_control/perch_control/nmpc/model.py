@@ -128,7 +128,7 @@ def stage(vehicle: Vehicle, step: float, layout: StageLayout) -> ca.Function:
     x, u, reference, disturbance, weights, line_parameters = parts
     model, thrust_states = RotorModel.of(vehicle), n == STATES
     drag = tuple(float(d) for d in vehicle.drag)
-    change = (0.0,) * INPUTS if thrust_states else reference[13:17]
+    change: Vector = (0.0,) * INPUTS if thrust_states else reference[13:17]
 
     def rate(s: Vector, share: float) -> Vector:
         return _rate(model, drag, s, tuple(a + share * b for a, b in zip(u, change, strict=True)), disturbance, thrust_states)
