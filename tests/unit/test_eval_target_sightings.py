@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_eval import consistency
 from perch_eval.estimation_flight import EstimatorTrack, Flight, motion_of
+from perch_eval.in_process.modelled_sight import ModelledSight
 from perch_eval.perch_motion import ImuReadings
 from perch_eval.target_sightings import estimated_body, see_target
+from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.scenario import load_scenario
+from perch_sim.state_history import StateHistory, TrueState
 
 OFF = np.array([0.02, -0.01, 0.015])
 
@@ -43,3 +47,12 @@ def test_errors_of_the_body_move_vehicle_and_target_alike(hover):
     assert np.linalg.norm(exact.errors[:, :3], axis=1).max() < 0.01
     np.testing.assert_allclose(wrong.errors[:, :3], exact.errors[:, :3], atol=2e-3)
     assert consistency.nees(wrong.errors, wrong.covariances).max() < 16.8  # 99 % of chi2 with 6 degrees of freedom
+
+
+def test_an_image_from_before_the_truth_was_heard_first_shows_nothing():
+    config, mount = TargetLocalizerConfig(), load_vehicle("snapdragon").mounts["front"]
+    truth = StateHistory(10)
+    truth.append(TrueState(1_490_000_000, np.r_[np.zeros(3), 0.0, 0.0, 0.0, 1.0, np.zeros(6)]))
+    sight = ModelledSight(load_board(config.board), mount, mount, config.localizer, np.random.default_rng(1), truth, lambda: None)
+    found = sight.process(None, 1.148, None)
+    assert found.board is None and "outside" in found.message

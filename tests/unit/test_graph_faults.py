@@ -7,12 +7,15 @@ import os
 import signal
 import time
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from perch_core.errors import PerchError
 from perch_eval.graph_faults import campaign
 from perch_eval.graph_faults.cases import (
     FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named)
+from perch_eval.graph_faults.flight import UNANSWERED, _Director
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.nursery import Nursery, alive, session
 
@@ -69,7 +72,7 @@ def test_disturbances():
 
 def row(**changes) -> dict:
     return {**CASE._asdict(), "seed": 1, "commit": "abc", "struck": 3.0, "before": [1.0, 0.0, 0.0], "end": "landed", "named": 0.5,
-            "words": "w", "goal": "g", "impact": 0.0, "ended": [], "left": [], "duration": 9.0} | changes
+            "words": "w", "goal": "g", "impact": 0.0, "ended": [], "left": [], "duration": 9.0, "code": "now"} | changes
 
 
 @pytest.mark.parametrize("changes, problem", [
@@ -88,10 +91,35 @@ def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
     file.write_text(json.dumps(row()) + "\n" + json.dumps(row(node="mission"))[:50])
     assert list(campaign.load(file)) == [CASE]
     flown = []
+    monkeypatch.setattr(campaign, "digest", lambda: "now")
     monkeypatch.setattr(campaign, "fly_all", lambda missing, *_: flown.extend(missing))
     assert campaign.main(["--out", str(tmp_path), "--logs", str(tmp_path), "--only", "kill estimator climb"]) == 0
     assert flown == [CASE._replace(mode=REAL_TIME)]
     assert "1 of " in (tmp_path / "README.md").read_text() and set(SAFE) >= {"landed"}
+
+
+def test_rows_of_other_code_are_flown_again_and_dropped(tmp_path, monkeypatch):
+    file, other = tmp_path / campaign.ROWS, CASE._replace(node="mission")
+    file.write_text(json.dumps(row(code="before")) + "\n" + json.dumps(row(node="mission")) + "\n")
+    kept = campaign.load(file, "now")
+    assert set(campaign.load(file)) == {CASE, other} and list(kept) == [other]
+    campaign.fly_all([], file, tmp_path, kept)
+    assert list(campaign.load(file)) == [other]
+
+
+@pytest.mark.parametrize("code, older", [("now", False), ("before", True)])
+def test_the_page_says_whether_its_rows_are_of_this_code(monkeypatch, code, older):
+    monkeypatch.setattr(campaign, "digest", lambda: "now")
+    assert ("older than the code" in campaign.page([row(code=code)])) == older
+
+
+def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_time_to_be_named():
+    for case, after, followed in ((CASE._replace(node="mission"), 5.0, True), (CASE._replace(node="mission"), 6.0, False),
+                                  (CASE._replace(node="mission", fault="restart"), 60.0, True), (CASE, 60.0, True)):
+        director = _Director(case, None, None, 1.2, None)
+        director.struck = time.time() - after
+        with nullcontext() if followed else pytest.raises(PerchError, match=UNANSWERED):
+            director.follow()
 
 
 def test_processes_of_a_nursery_are_their_own_and_end_with_it(tmp_path, monkeypatch):

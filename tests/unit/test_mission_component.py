@@ -311,6 +311,20 @@ def test_foreign_odometry_imu_and_states_are_ignored(odometry):
     assert world.goal.ending == "succeeded" and ("ignored" in world.said or "odometry: " in world.said)
 
 
+@pytest.mark.parametrize("older", [TICK, 2 * NANOSECONDS, -3600 * NANOSECONDS])
+def test_states_that_were_overtaken_do_not_undo_the_newer_ones_and_one_of_the_future_keeps_out_no_other(older):
+    class Reordered(World):
+        def tick(self):
+            super().tick()
+            if self.phase in ("verifying", "perched"):
+                self.mission.on_status(ControllerStatus(self.stamp - TICK - older, int(ControllerState.TRACKING), "", 1, 0.0, 0.0, 0.0, 0.0, 1.0, "old"))
+                self.mission.on_estimator(EstimatorHealth(self.stamp - TICK - older, 2, 9.0, 1, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""))
+
+    world = Reordered().send().run()
+    assert world.goal.ending == "succeeded"
+    assert ("controller/status: of" in world.said) == (older > 0)
+
+
 def test_a_vehicle_that_was_started_again_ends_the_goal_and_takes_the_next():
     world = World().send().run(3.0)
     world.stamp, world.p, world.flown, world.state = NANOSECONDS, np.zeros(3), None, ControllerState.DISARMED

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.workers import prepare_worker
 from perch_eval.evaluation.document import machine
-from perch_eval.graph_faults.cases import FAULTS, MODES, NAMED, PHASES, SAFE, TRAFFIC, Case, cases
-from perch_eval.revision import banner, commit
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
+from perch_eval.graph_faults.flight import fly
+from perch_eval.nursery import Nursery
+from perch_eval.revision import banner, commit, digest
 
 EXAMPLES = """examples:
-  python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on
+  python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on;
+                                                               rows of other code are dropped first
+  python3 scripts/faults.py --jobs 2                           flights in lockstep two at a time; real time always alone
   python3 scripts/faults.py --most 20                          so many more
   python3 scripts/faults.py --only "kill estimator"            cases with these words in their names
   python3 scripts/faults.py --again --only "stop controller"   fly them once more
@@ -40,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--logs", type=Path, default=Path("out/faults"), metavar="DIR", help="logs of the flights (default: %(default)s)")
     out.add_argument("--only", default="", metavar="WORDS", help="cases with all of these words in their names")
     out.add_argument("--most", type=count, metavar="N", help="fly at most so many")
+    out.add_argument("--jobs", type=count, default=1, metavar="N", help="flights in lockstep at a time (default: %(default)s)")
     out.add_argument("--again", action="store_true", help="fly what has been flown, too")
     out.add_argument("--page", action="store_true", help="fly nothing")
     return out
@@ -53,10 +62,10 @@ def main(arguments: list[str] | None = None) -> int:
         chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
         if not chosen:
             raise PerchError(f"--only {args.only}: no case has these words in its name")
-        rows = load(args.out / ROWS)
+        rows = load(args.out / ROWS, None if args.page else digest())
         missing = [] if args.page else [case for case in chosen if args.again or case not in rows][:args.most]
         if missing:
-            fly_all(missing, args.out / ROWS, args.logs, rows)
+            fly_all(missing, args.out / ROWS, args.logs, rows, args.jobs)
         known = [rows[case] for case in cases() if case in rows]
         (args.out / "README.md").write_text(page(known))
     except KeyboardInterrupt:
@@ -70,44 +79,79 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if bad else 0
 
 
-def load(file: Path) -> dict[Case, dict[str, Any]]:
-    """The rows flown so far, the last of each case; a line that was cut off, or a flight that ended before its fault, does not count."""
+def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
+    """The rows flown so far, the last of each case; a line that was cut off, or a flight that ended before its fault, does not count.
+
+    Args:
+        file: a row a line.
+        code: digest of the code whose rows count; None: any.
+    """
     found = {}
     for line in file.read_text().splitlines() if file.exists() else ():
         try:
             row = json.loads(line)
-            if row["struck"] is not None:
+            if row["struck"] is not None and code in (None, row.get("code")):
                 found[Case(row["fault"], row["node"], row["phase"], row["mode"])] = row
         except (ValueError, KeyError, TypeError):
             continue
     return found
 
 
-def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]]) -> None:
-    """Fly cases one after the other; each is kept when it has been flown."""
-    from perch_eval.graph_faults.flight import fly
-    from perch_eval.nursery import Nursery
+def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int = 1) -> None:
+    """Fly cases, `jobs` at a time in lockstep, one at a time in real time; each is kept when it has been flown.
 
-    nursery, progress = Nursery(MODULES, ("surface_90",)), Progress(len(missing), what="flights")
+    Raises:
+        PerchError: a process that flies has died.
+    """
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
+    progress = Progress(len(missing), what="flights")
     try:
-        for case in missing:
-            folder = logs / case.name.replace(", ", "_").replace(" ", "_")
-            for old in folder.glob("*.log"):
-                old.unlink()
+        for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
+            own = [case for case in missing if case.mode == mode]
+            pool = ProcessPoolExecutor(at_once, multiprocessing.get_context("spawn"), _prepare)
             try:
-                row = fly(case, nursery, folder, commit()).as_json()
-            except PerchError as error:
-                print(f"\n{case.name}: not flown: {error}", file=sys.stderr)
-                continue
-            rows[case] = row
-            with file.open("a") as out:
-                out.write(json.dumps(row) + "\n")
-            if problems(row):
-                print(f"\n{case.name}: {'; '.join(problems(row))}", file=sys.stderr, flush=True)
-            progress.add(not problems(row))
+                flights = {pool.submit(_fly, case, logs): case for case in own}
+                for flight in as_completed(flights):
+                    _keep(flights[flight], flight.result(), file, rows, progress)
+            except BrokenProcessPool:
+                raise PerchError("a process that flies has died: the same command goes on") from None
+            except BaseException:
+                for process in multiprocessing.active_children():
+                    process.terminate()
+                raise
+            finally:
+                pool.shutdown(cancel_futures=True)
     finally:
         progress.close()
-        nursery.close()
+
+
+def _prepare() -> None:
+    global _nursery
+    prepare_worker()
+    _nursery = Nursery(MODULES, ("surface_90",))
+
+
+def _fly(case: Case, logs: Path) -> dict[str, Any] | str:
+    """The row of a flight, or why there is none."""
+    folder = logs / case.name.replace(", ", "_").replace(" ", "_")
+    for old in folder.glob("*.log"):
+        old.unlink()
+    code = digest()
+    try:
+        return {**fly(case, _nursery, folder, commit()).as_json(), "code": code}
+    except PerchError as error:
+        return f"not flown: {error}"
+
+
+def _keep(case: Case, row: dict[str, Any] | str, file: Path, rows: dict[Case, dict[str, Any]], progress: Progress) -> None:
+    if isinstance(row, dict):
+        rows[case] = row
+        with file.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+        progress.add(not problems(row))
+    words = [row] if isinstance(row, str) else problems(row)
+    if words:
+        print(f"\n{case.name}: {'; '.join(words)}", file=sys.stderr, flush=True)
 
 
 def problems(row: dict[str, Any]) -> list[str]:
@@ -134,13 +178,14 @@ def _ends(rows: Sequence[dict[str, Any]]) -> str:
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """The page of what has been flown."""
     struck = [row for row in rows if row["struck"] is not None]
-    lost = sum(row["impact"] > FALL and row["end"] in SAFE for row in struck)
+    lost = Counter(row["node"] for row in struck if row["impact"] > FALL and row["end"] in SAFE)
     safe = [row for row in struck if row["end"] in SAFE]
     through = [row for row in struck if tolerated(row)]
     told = [row for row in struck if row["named"] is not None and row["named"] <= NAMED]
     clean = [row for row in rows if not row["left"]]
     commits = Counter(row["commit"] for row in rows)
-    text = ["# Faults on the real graph", "", banner(", ".join(commits)), "",
+    present = {row.get("code") for row in rows} == {digest()}
+    text = ["# Faults on the real graph", "", banner(commit() if present else ", ".join(commits)), "",
             "Made by `python3 scripts/faults.py`; edit nothing here. Rows: [rows.jsonl](rows.jsonl).", "",
             f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
             + f" on {machine()}.", "",
@@ -149,7 +194,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             "  goal, says who or whose messages are missing. The node that was struck is no witness, and what starts the processes is none.",
             f"  Not counted: {len(through)} flights whose messages were disturbed and that perched as if they had not been.",
             f"* **{len(clean)} of {len(rows)} leave nothing**: no process, no socket of the lockstep, no shared memory in the end.",
-            f"* {lost} of those that end safely hit the floor with more than {FALL:g} m/s.",
+            f"* {lost.total()} of those that end safely hit the floor with more than {FALL:g} m/s"
+            + (f"; struck were: {', '.join(f'{node} ({n})' for node, n in lost.items())}." if lost else "."),
             f"* In {sum(bool(row['ended']) for row in rows)} flights a node that was not struck ended.",
             "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
             "that do not look at images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",

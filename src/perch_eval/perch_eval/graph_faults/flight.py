@@ -16,7 +16,7 @@ from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.domain import reserved_domain
-from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, SAFE, TALKERS, Case, Situation, ending, named
+from perch_eval.graph_faults.cases import LOCKSTEP, NAMED, PROCESS, SAFE, TALKERS, Case, Situation, ending, named
 from perch_eval.graph_faults.relay_node import DIRECT
 from perch_eval.graph_faults.ros.watcher import Watcher
 from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS, blind_launches
@@ -43,6 +43,7 @@ READY = 60.0     # for the nodes to come up [s]
 STALL = 30.0     # simulation time may stand still for so long [s]
 SETTLE = 4.0     # an end that lasts so long is one, in simulation time [s]
 LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
+UNANSWERED = "unanswered"
 STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
 GOING = 10.0     # for what processes had open to vanish after their end, on a busy machine [s]
 PORTS, DOMAIN_PORTS = 7400, 250  # first port of domain 0, and ports of each, by the standard of DDS
@@ -231,6 +232,21 @@ class _Director:
         if self.struck is None and self._now():
             self.strike()
 
+    def follow(self) -> None:
+        """As `look`, while the goal is awaited.
+
+        Raises:
+            PerchError: the mission does not run any more, and the fault has had its time to be named; nobody else answers to the goal.
+        """
+        self.look()
+        if self._case.node == "mission" and self._case.fault in ("kill", "stop") and self.struck is not None and self.told:
+            raise PerchError(UNANSWERED)
+
+    @property
+    def told(self) -> bool:
+        """Whether what has been struck has had its time to be named."""
+        return self.struck is None or time.time() - self.struck > NAMED + 0.5
+
     def _now(self) -> bool:
         phase, elapsed, watcher = self._phase, self._watcher.time - self._since, self._watcher
         if self._case.phase == "climb":
@@ -300,11 +316,12 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
                 if time.monotonic() > limit or group.ended():
                     raise PerchError(f"not ready: {', '.join(group.ended() or sorted(missing))}; logs: {folder}")
             try:
-                result = pilot.fly(scenario, director.on_phase, director.look, stall=STALL)
+                result = pilot.fly(scenario, director.on_phase, director.follow, stall=STALL)
                 goal = f"{result.outcome}: {result.message}"
             except PerchError as error:
                 goal = str(error)
-            director.said.append((time.time(), goal))
+            if goal != UNANSWERED:
+                director.said.append((time.time(), goal))
             end = _settled(pilot, watcher, director)
             ended = tuple(name for name in group.ended() if name != case.node or case.fault == "restart" or case.fault not in PROCESS)
         finally:
@@ -333,7 +350,6 @@ def _settled(pilot: Pilot, watcher: Watcher, director: _Director) -> str:
         found = ending(now)
         if found != last:
             last, since = found, watcher.time
-        waited = director.struck is None or time.time() - director.struck > 5.5
-        if found in SAFE and watcher.time - since > SETTLE and waited:
+        if found in SAFE and watcher.time - since > SETTLE and director.told:
             return found
     return f"{last}, which does not last" if last in SAFE else last

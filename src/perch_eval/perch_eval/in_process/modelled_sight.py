@@ -84,7 +84,11 @@ class ModelledSight:
             if exposed - self._searched < 1.0 / settings.search_rate - 1e-3:
                 return Localization(None, message="waiting for the next search")
             self._searched = exposed
-        pixels, ids, side = self._visible(self._truth.at(self.middle(exposed)), self._pad())
+        try:
+            state = self._truth.at(self.middle(exposed))
+        except LookupError as error:  # an image from before the truth was heard first
+            return Localization(None, message=str(error))
+        pixels, ids, side = self._visible(state, self._pad())
         if not ids:
             return Localization(None, message="no tag of the board found")
         sigma = np.repeat(corner_sigma(side)[:, None], 4, axis=1)
