@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -12,7 +10,7 @@ import numpy as np
 from harness import Figure, figure, measure
 from perch_eval import estimation_flight
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.workers import prepare_worker
+from perch_eval.campaign.workers import spread
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import Estimator, ImuSample, Inertial, VioPose
@@ -30,12 +28,8 @@ def figures(quick: bool) -> list[Figure]:
     ukf = _ukf(quick)  # by the wall clock: before the flights, which use every core
     tasks = [(scenario, seed) for scenario in (*dict(SCENARIOS), IDEAL) for seed in range(1 if quick else 20)]
     flown: dict[str, list[_Flown]] = {scenario: [] for scenario, _ in tasks}
-    progress = Progress(len(tasks), what="perches")
-    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker) as pool:
-        for (scenario, _), one in zip(tasks, pool.map(_fly, *zip(*tasks))):
-            flown[scenario].append(one)
-            progress.add(True)
-    progress.close()
+    for one, (scenario, _) in zip(spread(_fly, None, Progress(len(tasks), what="perches"), *zip(*tasks)), tasks):
+        flown[scenario].append(one)
     costs = [cost for one in sum(flown.values(), []) for cost in one.costs]
     out = [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="), *ukf]
     for scenario, name in SCENARIOS:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +14,7 @@ import exact_sturm
 
 from perch_core import bernstein
 from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.workers import spread
 from perch_planner import bounds
 
 _CHUNK = 100  # polynomials
@@ -38,12 +37,6 @@ def _wrong(first: int) -> int:
 
 def wrong_verdicts(count: int) -> float:
     """Verdicts on `count` polynomials, a multiple of 100, that the exact chain contradicts; on all processors but one."""
-    wrong, starts = 0, range(0, count, _CHUNK)
+    starts = range(0, count, _CHUNK)
     progress = Progress(len(starts), what=f"times {_CHUNK} verdicts")
-    workers = max(1, (os.cpu_count() or 1) - 1)
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for one in pool.map(_wrong, starts):
-            wrong += one
-            progress.add(not one)
-    progress.close()
-    return float(wrong)
+    return float(sum(spread(_wrong, max(1, (os.cpu_count() or 1) - 1), progress, starts, good=lambda wrong: not wrong)))

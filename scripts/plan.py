@@ -20,7 +20,7 @@ files: plan.csv, plan.json (coefficients or figures, certificates), plan.png; po
 exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file"""
 
 
-def _plan_perch(mapping: dict, source: str, out: Path) -> int:
+def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
     from perch_planner import plan_output
     from perch_planner.planner import plan
     from perch_planner.problem import Limits
@@ -39,7 +39,7 @@ def _plan_perch(mapping: dict, source: str, out: Path) -> int:
     return 0
 
 
-def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool = False) -> int:
+def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> int:
     from perch_core import config
     from perch_planner.powerline import problem
     from perch_planner.powerline.report import write_report
@@ -60,12 +60,8 @@ def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool = Fal
     return 0
 
 
-def _animate_powerline(mapping: dict, source: str, out: Path) -> int:
-    return _plan_powerline(mapping, source, out, animation=True)
-
-
 KINDS = {"perch": _plan_perch, "powerline": _plan_powerline}
-ANIMATED = {"powerline": _animate_powerline}
+ANIMATED = ("powerline",)
 
 
 def _apply(mapping: dict, changes: list[str]) -> None:
@@ -111,8 +107,7 @@ def main() -> int:
         _apply(mapping, arguments.set)
         if arguments.animation and mapping["kind"] not in ANIMATED:
             raise ConfigError("--animation", mapping["kind"], f"only for {', '.join(ANIMATED)}")
-        kinds = ANIMATED if arguments.animation else KINDS
-        return kinds[mapping["kind"]](mapping, str(path), arguments.out)
+        return KINDS[mapping["kind"]](mapping, str(path), arguments.out, arguments.animation)
     except PlanningRefusal as refusal:
         print(f"refused ({refusal.code}): {refusal}", file=sys.stderr)
         return 2 if refusal.code == "bad_input" else 1

@@ -1,5 +1,6 @@
 """Campaign files, draws, causes of failure, results and their ranking."""
 
+import io
 import math
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.distributions import parse
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.figures import Axis
+from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.ranking import worst
 from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results
 from perch_eval.campaign.specification import Run, load_campaign, scenario_of
@@ -255,3 +257,24 @@ def test_a_run_that_a_broken_pool_refuses_goes_on_waiting(monkeypatch, broken_at
     monkeypatch.setattr(workers, "carry_out", lambda task: RunResult(task.run.number, task.run.seed, "perched", "perched", ""))
     tasks = [Task(Run(n, 0, {}), {}, "", "") for n in range(12)]
     assert {r.number for r in workers.in_pool(tasks, 2)} == set(range(12))
+
+
+def test_work_in_processes_keeps_its_order_and_ends_with_whoever_waits_for_it(monkeypatch):
+    ended = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, jobs, mp_context, initializer):
+            super().__init__(jobs)
+
+        def shutdown(self, wait=True, *, cancel_futures=False):
+            ended.append((wait, cancel_futures))
+            super().shutdown(wait, cancel_futures=cancel_futures)
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
+    progress = Progress(2, out=io.StringIO())
+    done = workers.spread(divmod, 1, progress, [7, 9], [2, 4], good=lambda result: result[0] > 2)
+    assert list(done) == [(3, 1), (2, 1)] and "2/2 runs, 1 good" in progress.line(0.0)
+    interrupted = workers.spread(divmod, 1, Progress(2, out=io.StringIO()), [7, 9], [2, 4])
+    next(interrupted)
+    interrupted.close()  # as an exception of the caller does
+    assert ended == [(True, False), (False, True)]

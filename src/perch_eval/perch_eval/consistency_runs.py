@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +19,7 @@ from perch_eval import consistency
 from perch_eval import estimation_flight as flights
 from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.workers import prepare_worker
+from perch_eval.campaign.workers import spread
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
 from perch_eval.target_sightings import Sightings, see_target
@@ -55,13 +53,9 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     Returns:
         NEES of estimator, VIO and target over time, and a summary with RMSE through the perch and mean NIS.
     """
-    flown, progress = [], Progress(runs, what="perches")
     motion = flights.motion_of(load_scenario(scenario_name), first_seed)  # its phases are those of every run
-    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker) as pool:
-        for one in pool.map(_fly, [scenario_name] * runs, range(first_seed, first_seed + runs)):
-            flown.append(one)
-            progress.add(True)
-    progress.close()
+    seeds = range(first_seed, first_seed + runs)
+    flown = list(spread(_fly, None, Progress(runs, what="perches"), [scenario_name] * runs, seeds))
     n = min(len(one.track.times) for one in flown)
     times = flown[0].track.times[:n]
     errors = np.array([one.track.errors[:n] for one in flown])

@@ -6,16 +6,19 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
 
 from perch_core.errors import PerchError
 from perch_core.processes import end_with_parent
 from perch_eval.campaign.engines import Task, carry_out
+from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import RunResult
 from perch_eval.extras import require
 
+T = TypeVar("T")
 END_LIMIT = 5  # of a worker that is told to end [s]
 ATTEMPTS = 3  # a run whose worker died so often is given up
 
@@ -44,6 +47,41 @@ def _carry_out(task: Task) -> RunResult:
         os._exit(1)
 
 
+def spread(work: Callable[..., T], jobs: int | None, progress: Progress, *columns: Iterable[Any], good: Callable[[T], bool] = lambda _: True
+           ) -> Iterator[T]:
+    """`map` in processes, which are not forked: BLAS threads of the parent do not survive a fork.
+
+    Args:
+        work: to be done, a function of a module.
+        jobs: processes; None: one on each core.
+        progress: told of each result, and closed at the end.
+        columns: arguments of `work`.
+        good: what is counted as good on the way.
+    """
+    pool = _pool(jobs)
+    try:
+        for result in pool.map(work, *columns):
+            progress.add(good(result))
+            yield result
+    except BaseException:
+        _abandon(pool)
+        raise
+    finally:
+        progress.close()
+    pool.shutdown()
+
+
+def _pool(jobs: int | None) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
+
+
+def _abandon(pool: ProcessPoolExecutor) -> None:
+    """End its processes in the middle of what they do."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in multiprocessing.active_children():
+        process.terminate()
+
+
 def dead(task: Task, why: str) -> RunResult:
     """The result of a run whose workers died."""
     return RunResult(task.run.number, task.run.seed, "error", "failed", why, task.run.values)
@@ -56,7 +94,7 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
     """
     waiting, attempts = list(reversed(tasks)), {}
     while waiting:
-        pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
+        pool = _pool(jobs)
         under_way: dict[Future, Task] = {}
         try:
             while waiting or under_way:
@@ -80,9 +118,7 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
                 else:
                     waiting.append(task)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
+            _abandon(pool)
             raise
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import Results, RunResult
-from perch_eval.campaign.workers import in_pool
+from perch_eval.campaign.workers import in_pool, spread
 from perch_eval.evaluation.sections import Effort
 from perch_eval.page import finite
 from perch_eval.revision import digest
@@ -59,13 +57,9 @@ def computed(effort: Effort, name: str, jobs: Sequence[Any], carry_out: Callable
     known: dict[str, dict[str, Any]] = json.loads(file.read_text()) if file.exists() else {}
     missing = [job for job in jobs if str(job) not in known]
     progress = Progress(len(jobs), len(jobs) - len(missing), what=name)
-    # Not forked: BLAS threads of the parent do not survive a fork.
-    with ProcessPoolExecutor(effort.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for job, result in zip(missing, pool.map(carry_out, missing)):
-            known[str(job)] = finite(result)
-            temporary = file.with_suffix(".part")
-            temporary.write_text(json.dumps(known))
-            temporary.replace(file)
-            progress.add(good(result))
-    progress.close()
+    for result, job in zip(spread(carry_out, effort.jobs, progress, missing, good=good), missing):  # the results first: all are asked for
+        known[str(job)] = finite(result)
+        temporary = file.with_suffix(".part")
+        temporary.write_text(json.dumps(known))
+        temporary.replace(file)
     return [known[str(job)] for job in jobs]
