@@ -20,10 +20,10 @@ from perch_planner.linear_bounds import no_bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
-RIM_ROOM = 1.1     # times the rim's reach at the present tilt, as the tilt changes with the cut
+_RIM_ROOM = 1.1    # times the rim's reach at the present tilt, as the tilt changes with the cut
 _KEEP_RATE = 0.95   # of the body rate's limit
 _RAISE = 1.02       # cuts of the thrust from below
-HEIGHT_ROOM = 2e-3  # [m]
+_HEIGHT_ROOM = 2e-3  # [m]
 _BESIDE = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
 _FLAT = 0.97        # of the limit; a peak is cut beside its place where the thrust is above this share
 
@@ -119,13 +119,13 @@ def limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, hi
                     direction[t, d] = x[1, d] / norm
             elif row == HEIGHT:
                 orders[t], direction[t, 2] = 0, 1.0
-                lower[r], upper[r] = low_height + HEIGHT_ROOM, high_height - HEIGHT_ROOM
+                lower[r], upper[r] = low_height + _HEIGHT_ROOM, high_height - _HEIGHT_ROOM
             elif row == CLEARANCE:
                 # The rim's distance at the present tilt: right to first order where the tilt does not change.
                 tilt = np.sqrt(max(1.0 - dot(f, s3) ** 2 / squared, 0.0))
                 time = durations[:i].sum() + s * durations[i]
                 orders[t] = 0
-                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + RIM_ROOM * extension * tilt + HEIGHT_ROOM
+                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + _RIM_ROOM * extension * tilt + _HEIGHT_ROOM
                 for d in range(3):
                     direction[t, d] = s3[d]
             else:

@@ -1,17 +1,17 @@
-"""What stands in the way of a plan: the smallest set of limits whose relaxation gives one, and how little of it.
+"""What stands in the way of a plan: a small set of limits whose relaxation gives one, and how little of it.
 
-Only limits that acted on the search can be the cause: without one that did not, it would go the same way. These are taken away one
-at a time, in the order of `_LIMITS`: first what a caller can change, last what the vehicle has. The first one without which there is
-a plan gives way, and bisection finds how little is enough. Where no limit alone is enough, all are taken away, and put back one by
-one where there is a plan with them (the deletion filter of Chinneck and Dravnieks, 1991). Every value that is named was tried: with
-it there is a plan.
+Only limits that acted on the search can be the cause: without one that did not, it would go the same way. Those that alone may
+do are taken away one at a time: what a caller can change first, then the range of the single rotors, which binds before other
+limits of the vehicle. Where none is enough, all are taken away, and put back one by one where there is a plan with them (the
+deletion filter of Chinneck and Dravnieks, 1991). Bisection finds how little is enough. With every value that is named there was a
+plan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
-from math import ceil, floor, inf, log10
+from math import ceil, floor, inf, log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +24,11 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
-_PROGRAMS = 30   # of each search with relaxed limits
-_HALVINGS = 4    # of what a limit gives
+PROGRAMS = 200
+"""Quadratic programs of all searches with relaxed limits."""
+_EACH = 30       # of one of them
+_HALVINGS = 4    # of the logarithm of what a limit gives
+_LEAST = 1 / 64  # of what a plan takes beyond a limit that was taken away; less is not tried
 
 
 class _Limit(NamedTuple):
@@ -48,13 +51,14 @@ _LIMITS = {
     "height_max": _Limit(1e3, refusals.BOX, "height limits", "m"),
     "duration_max": _Limit(600.0, refusals.BOX, "duration_max", "s"),
     "speed_max": _Limit(1e3, refusals.BOX, "speed limit", "m/s"),
+    "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
     "thrust_max": _Limit(1e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "thrust_min": _Limit(1e-3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "body_rate_max": _Limit(1e3, refusals.BODY_RATE, "body-rate limit", "rad/s"),
     "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m"),
     "tangential_speed_max": _Limit(20.0, refusals.INFEASIBLE_WINDOW, "slip over the surface at contact [M:eq14]", "m/s"),
-    "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
 }
+_ALONE = ("height_min", "height_max", "duration_max", "speed_max", "rotor_margin")  # tried one at a time
 
 
 def refusal(search: Search, best: Outcome) -> PerchRefusal:
@@ -65,17 +69,15 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
         best: its last outcome.
 
     Returns:
-        A refusal whose `relaxed` are the values of settings with which there is a plan; empty: none was found even without limits.
+        A refusal whose `relaxed` are values of settings with which there is a plan; empty: none was found even without limits.
     """
     settings, vehicle = search.settings, search.vehicle
     asked = _asked(settings, Limits.of(settings, vehicle))
     proofs = () if best.results is None else certificates(best.results, Limits.of(settings, vehicle), vehicle.mass)
     longest = max((attempt.duration for attempt in search.attempts), default=float(search.first.sum()))
     tried = f"{search.iterations} programs up to {longest:.2f} s"
-    names = [name for name in _LIMITS if name in search.acted and asked[name] != _LIMITS[name].free]
     least, most = vehicle.thrust_min, vehicle.thrust_max
-    ways = (_relaxed(search, asked, (name,)) for name in names)
-    way = next((way for way in ways if way), None) or _relaxed(search, asked, _smallest(search, asked))
+    way = _Trials(search, asked).way()
     if way is None:
         return PerchRefusal(refusals.INFEASIBLE_WINDOW, "impact window and tube [M:eq14, M:eq15]", -inf,
                             f"no plan, even without the other limits ({tried}); widen the impact speeds or the tube", proofs,
@@ -110,49 +112,67 @@ def _free(names: Iterable[str]) -> dict[str, float]:
     return {name: _LIMITS[name].free for name in names}
 
 
-def _outcome(search: Search, changes: dict[str, float]) -> Outcome | None:
-    """The plan under changed settings, None where none is soon found."""
-    settings = replace(search.settings, iterations_max=_PROGRAMS, minimum_time=False, **changes)
-    try:
-        _, outcome = Search(search.problem, settings, search.vehicle, Limits.of(settings, search.vehicle)).run()
-    except PerchRefusal:
-        return None
-    return outcome if outcome.proved else None
+class _Trials:
+    """Searches with relaxed limits, with a bound on their programs."""
 
+    def __init__(self, search: Search, asked: dict[str, float]) -> None:
+        self._search, self._asked, self._left = search, asked, PROGRAMS
+        self._tried: dict[frozenset[str], dict[str, float] | None] = {}
 
-def _smallest(search: Search, asked: dict[str, float]) -> tuple[str, ...]:
-    """Limits without which there is a plan, and none of which can stay; those that give first are put back last."""
-    taken = list(_LIMITS)
-    if (outcome := _outcome(search, _free(taken))) is None:
-        return ()
-    used = _used(search.problem, outcome, search.vehicle)
-    beyond = [name for name in taken if (used[name] - asked[name]) * (_LIMITS[name].free - asked[name]) > 0.0]  # of that plan
-    if _outcome(search, _free(beyond)):
-        taken = beyond
-    for name in reversed(taken):
-        left = [n for n in taken if n != name]
-        if _outcome(search, _free(left)):
-            taken = left
-    return tuple(taken)
+    def _used(self, changes: dict[str, float]) -> dict[str, float] | None:
+        """What the plan under changed settings takes of each limit, None where none is soon found."""
+        if not changes or self._left <= 0:
+            return None
+        settings = replace(self._search.settings, iterations_max=min(_EACH, self._left), minimum_time=False, **changes)
+        trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle))
+        try:
+            _, outcome = trial.run()
+        except PerchRefusal:
+            return None
+        finally:
+            self._left -= trial.iterations
+        return _used(trial.problem, outcome, trial.vehicle) if outcome.proved else None
 
+    def _without(self, names: Iterable[str]) -> dict[str, float] | None:
+        """What the plan without some limits takes of each, None where none is soon found."""
+        taken = frozenset(names)
+        if taken not in self._tried:
+            self._tried[taken] = self._used(_free(names))
+        return self._tried[taken]
 
-def _relaxed(search: Search, asked: dict[str, float], names: Sequence[str]) -> dict[str, float] | None:
-    """Values of some limits with which there is a plan, as near to what was asked as bisection finds them; None: no such values."""
-    free = _free(names)
-    outcome = _outcome(search, free)
-    if outcome is None:
-        return None
-    used = _used(search.problem, outcome, search.vehicle)
-    values, low, high = None, 0.0, 2.0  # shares of the way to what the plan takes; a plan under a limit may take another way
-    for _ in range(_HALVINGS):
-        share = 0.5 * (low + high)
-        tried = {name: _outward(asked[name], asked[name] + share * (used[name] - asked[name]))
-                 for name in free}
-        if _outcome(search, tried):
-            values, high = tried, share
-        else:
-            low = share
-    return values
+    def _smallest(self) -> tuple[list[str], dict[str, float]] | None:
+        """Limits without which there is a plan, none of which can stay, and what it takes; None: no plan without any limit."""
+        for name in _ALONE:
+            if name in self._search.acted and (used := self._without([name])):
+                return [name], used
+        taken = [name for name in _LIMITS if name != "thrust_min"]  # where the thrust may vanish, proofs fail
+        if not (used := self._without(taken)):
+            taken = list(_LIMITS)
+            if not (used := self._without(taken)):
+                return None
+        for name in reversed(_LIMITS):
+            beyond = [n for n in taken if (used[n] - self._asked[n]) * (_LIMITS[n].free - self._asked[n]) > 0.0]
+            if found := self._without(beyond):
+                taken, used = beyond, found
+            left = [n for n in taken if n != name]
+            if found := self._without(left):
+                taken, used = left, found
+        return taken, used
+
+    def way(self) -> dict[str, float] | None:
+        """Values of some limits with which there is a plan, as near to what was asked as bisection finds them; None: none."""
+        if (smallest := self._smallest()) is None:
+            return None
+        names, used = smallest
+        values, low, high = _free(names), _LEAST, 2.0  # under a limit a plan may need more than it took without
+        for _ in range(_HALVINGS):
+            share = sqrt(low * high)
+            tried = {name: _outward(asked, asked + share * (used[name] - asked)) for name in names for asked in [self._asked[name]]}
+            if self._used(tried):
+                values, high = tried, share
+            else:
+                low = share
+        return values
 
 
 def _outward(asked: float, value: float) -> float:
@@ -171,7 +191,7 @@ def _used(problem: PerchProblem, outcome: Outcome, vehicle: Vehicle) -> dict[str
     s3, mass, least, most = problem.surface.normal, vehicle.mass, vehicle.thrust_min, vehicle.thrust_max
     rotors = rows["rotor_thrust"]
     return {"thrust_max": mass * rows["thrust"][MAXIMUM], "thrust_min": mass * rows["thrust"][MINIMUM],
-            "height_min": rows["height"][MINIMUM], "height_max": rows["height"][MAXIMUM], "body_rate_max": rows["body_rate"][MAXIMUM],
-            "speed_max": rows["speed"][MAXIMUM], "duration_max": float(outcome.durations.sum()),
+            "height_min": rows["height"][MINIMUM], "height_max": rows["height"][MAXIMUM],
+            "body_rate_max": rows["body_rate"][MAXIMUM], "speed_max": rows["speed"][MAXIMUM], "duration_max": float(outcome.durations.sum()),
             "clearance_min": rows["clearance"][MINIMUM], "tangential_speed_max": float(np.linalg.norm(v - (v @ s3) * s3)),
             "rotor_margin": min(rotors[MINIMUM] - least, most - rotors[MAXIMUM]) / (most - least)}

@@ -7,7 +7,6 @@ import numpy as np
 from perch_core.jit import compiled
 from perch_planner import solvers
 from perch_planner.contact_constraints import Contact, conditions
-from perch_planner.cuts_ahead import cuts_ahead
 from perch_planner.judgement import Judgement, Question, judge
 from perch_planner.linear_bounds import Bounds
 from perch_planner.problem import PerchSettings
@@ -19,15 +18,11 @@ COST_ORDER = {"snap": 4, "jerk": 3}
 
 
 @compiled
-def _prepare(durations, velocity, problem, everywhere, gram, cost_order, question):
-    """Program and rows of tube, window and cuts ahead in one call: several calls cost more than they compute."""
+def _prepare(durations, velocity, problem, everywhere, gram, cost_order):
+    """Program and rows of tube and window in one call: several calls cost more than they compute."""
     given, values, bubbles, bounds = conditions(durations, everywhere, velocity, problem)
     program = assemble(durations, given, values, bubbles, gram, cost_order)
     rows, lower, upper = rows_of(*program, *bounds)
-    if len(durations) > 1:
-        p_S, v_S, s3, side, low, high, _, _, _, extension, clearance, rate, _, _ = question
-        ahead = cuts_ahead(durations, len(problem[0]) - 1, low, high, side, p_S, v_S, s3, extension, clearance, rate)
-        rows, lower, upper = appended(rows, lower, upper, program, ahead)
     return program[1:], rows, lower, upper
 
 
@@ -62,7 +57,7 @@ class SegmentProgram:
     def __init__(self, contact: Contact, durations: np.ndarray, settings: PerchSettings, question: Question) -> None:
         self._solver, self._question, cost_order = settings.solver, tuple(question), COST_ORDER[settings.objective]
         program, *self._rows = _prepare(durations, contact.velocity, contact.problem, settings.objective == "jerk", GRAMS[cost_order],
-                                        cost_order, self._question)
+                                        cost_order)
         self._program = (durations, *program)
         self._local: tuple[np.ndarray, ...] | None = None
         self._keys = np.empty(0, np.int64)
