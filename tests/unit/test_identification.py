@@ -165,6 +165,18 @@ def test_a_battery_curve_that_does_not_fit_is_refused(voltages, factors, sigma, 
     assert words in battery(voltages, gains(*factors, sigma=sigma)).refused
 
 
+def test_a_battery_curve_that_does_not_fit_is_one_line_and_writes_nothing(tmp_path, monkeypatch, capsys):
+    told = iter([gains(factor) for factor in (1.0, 1.0, 0.93, 0.99, 0.7)])  # the first flight tells all else, too
+    monkeypatch.setattr(command, "flights", lambda *_: [None] * 4)
+    monkeypatch.setattr(command, "record_of", lambda flight: flight)
+    monkeypatch.setattr(command, "identify", lambda *_: (next(told), []))
+    out = tmp_path / "identify"
+    monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", "--out", str(out), "--voltage", *map(str, VOLTAGES)])
+    assert command.main() == 2 and not out.exists()
+    line = capsys.readouterr().err
+    assert "no curve of the battery fits: a power of the voltage misses the thrust" in line and line.count("\n") == 1
+
+
 def test_a_gain_that_is_not_told_leaves_the_battery_untold():
     assert battery(VOLTAGES, gains(1.0, 0.9, 0.81, 0.73, refused="too small")).refused == "too small"
 

@@ -29,7 +29,8 @@ EXAMPLES = """examples:
   python3 scripts/identify.py --vehicle mine.yaml --recording full.mcap half.mcap low.mcap --voltage 16.4 15.2 14.0   with the battery's curve
 
 files: vehicle.yaml (extends the vehicle, with standard deviations), identify.png
-exit code: 0 everything is told, 1 something is not (the reasons beside it), 2 wrong arguments, or a flight that tells nothing"""
+exit code: 0 everything is told, 1 something is not (the reasons beside it), 2 wrong arguments, a flight that tells
+nothing, or a battery that no curve fits"""
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -92,6 +93,8 @@ def main() -> int:
             gains = [next(one for one in identify(record_of(one), vehicle)[0] if one.key == "actuation.thrust_gain") for one in flown]
             curve = vehicle.actuation.battery
             found.append(battery(arguments.voltage, gains, curve.exponent if curve.reference else 0.0))
+            if found[-1].refused:
+                raise PerchError(f"--voltage: no curve of the battery fits: {found[-1].refused}")
         arguments.out.mkdir(parents=True, exist_ok=True)
         is_file = arguments.vehicle.endswith((".yaml", ".yml"))
         base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
