@@ -167,7 +167,10 @@ class _Trials:
         values, low, high = _free(names), _LEAST, 2.0  # under a limit a plan may need more than it took without
         for _ in range(_HALVINGS):
             share = sqrt(low * high)
-            tried = {name: _outward(asked, asked + share * (used[name] - asked)) for name in names for asked in [self._asked[name]]}
+            tried = {}
+            for name in names:
+                asked, free = self._asked[name], _LIMITS[name].free
+                tried[name] = sorted((asked, _outward(asked, asked + share * (used[name] - asked)), free))[1]
             if self._used(tried):
                 values, high = tried, share
             else:
@@ -192,6 +195,7 @@ def _used(problem: PerchProblem, outcome: Outcome, vehicle: Vehicle) -> dict[str
     rotors = rows["rotor_thrust"]
     return {"thrust_max": mass * rows["thrust"][MAXIMUM], "thrust_min": mass * rows["thrust"][MINIMUM],
             "height_min": rows["height"][MINIMUM], "height_max": rows["height"][MAXIMUM],
-            "body_rate_max": rows["body_rate"][MAXIMUM], "speed_max": rows["speed"][MAXIMUM], "duration_max": float(outcome.durations.sum()),
-            "clearance_min": rows["clearance"][MINIMUM], "tangential_speed_max": float(np.linalg.norm(v - (v @ s3) * s3)),
+            "body_rate_max": rows["body_rate"][MAXIMUM], "speed_max": rows["speed"][MAXIMUM],
+            "duration_max": float(outcome.durations.sum()), "clearance_min": rows["clearance"][MINIMUM],
+            "tangential_speed_max": float(np.linalg.norm(v - (v @ s3) * s3)),
             "rotor_margin": min(rotors[MINIMUM] - least, most - rotors[MAXIMUM]) / (most - least)}
