@@ -30,3 +30,20 @@ def test_a_process_is_sampled():
     with open(os.devnull):
         after = soak.sample(os.getpid())
     assert after.descriptors == before.descriptors + 1 and before.rss > 1.0 and before.threads >= 1
+
+
+def test_what_was_flown_before_a_soak_was_killed_is_kept(tmp_path, monkeypatch):
+    class Killed(BaseException):
+        """As a signal that nothing stops."""
+
+    def fly(*arguments):
+        keep = arguments[-1]
+        keep(flights(lambda k: 100.0)[:20])
+        raise Killed
+
+    monkeypatch.setattr(soak, "fly", fly)
+    monkeypatch.setattr(soak, "plot", lambda _, file: file.touch())
+    with pytest.raises(Killed):
+        soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)])
+    assert "20 of 20 flights perched and departed" in (tmp_path / "README.md").read_text()
+    assert (tmp_path / "surface_90.json").exists() and (tmp_path / "surface_90.png").exists()

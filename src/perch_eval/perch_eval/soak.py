@@ -7,8 +7,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ SETTLED = 50          # flights after which memory must not grow any more
 BAR = 1.0             # growth of a process per 100 flights [MB]
 READY = 180.0         # [s]
 IN_A_ROW = 5          # failures after which it ends
+KEPT = 20             # flights after which what has been measured is written
 PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -88,7 +90,8 @@ def slope(values: Sequence[float], settled: int = SETTLED) -> float | None:
     return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
 
 
-def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: float, flights: int | None, folder: Path) -> list[Flight]:
+def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: float, flights: int | None, folder: Path,
+        keep: Callable[[Sequence[Flight]], object] = lambda _: None) -> list[Flight]:
     """Fly until there has been so much simulated time, or so many flights.
 
     Args:
@@ -99,6 +102,7 @@ def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: flo
         hours: of simulated time.
         flights: at most so many; None: as time allows.
         folder: receives logs and parameters.
+        keep: receives what has been flown, now and then: should this process be killed, that is not lost.
 
     Raises:
         PerchError: the stack does not come up, or breaks.
@@ -118,6 +122,8 @@ def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: flo
                 while pilot.time < 3600.0 * hours and (flights is None or len(found) < flights):
                     found.append(_once(pilot, scenario, stack))
                     progress.add(found[-1].departed)
+                    if len(found) % KEPT == 0:
+                        keep(found)
                     if len(found) >= IN_A_ROW and not any(flight.departed for flight in found[-IN_A_ROW:]):
                         print(f"\n{IN_A_ROW} failures in a row: {found[-1].words}", file=sys.stderr)
                         break
@@ -247,9 +253,9 @@ def main(arguments: list[str] | None = None) -> int:
         if not 0.0 < args.hours <= 1000.0:
             raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
         output_folder(args.out), output_folder(args.logs)
-        code = commit()
+        write = partial(_write, args, commit(), began)
         composed = sharing(args.composed, otherwise=FAST_NODES)
-        flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs)
+        flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs, write)
         if not flights:
             raise PerchError(f"no flight was flown; logs: {args.logs}")
     except (PerchError, OSError) as error:
@@ -258,6 +264,13 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+    problems = write(flights)
+    print(f"{args.out / 'README.md'}: {len(flights)} flights", *problems, sep="\n  ")
+    return 1 if problems else 0
+
+
+def _write(args: argparse.Namespace, code: str, began: float, flights: Sequence[Flight]) -> list[str]:
+    """Write figures and page of what has been flown; returns what is not as it should be."""
     name, problems = args.name or Path(args.scenario).stem, verdicts(flights)
     plot(flights, args.out / f"{name}.png")
     (args.out / f"{name}.json").write_text(json.dumps({
@@ -265,5 +278,4 @@ def main(arguments: list[str] | None = None) -> int:
         "wall_s": round(time.monotonic() - began, 1), "problems": problems, "growth": growth(flights),
         "flights": [asdict(flight) for flight in flights]}, separators=(",", ":")) + "\n")
     (args.out / "README.md").write_text(page(args.out))
-    print(f"{args.out / 'README.md'}: {len(flights)} flights", *problems, sep="\n  ")
-    return 1 if problems else 0
+    return problems
