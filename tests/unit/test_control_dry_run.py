@@ -48,3 +48,9 @@ def test_a_second_flight_loads_nothing_more():
     """In a process of its own: here other tests have loaded what it needs."""
     done = subprocess.run([sys.executable, "-c", _LOADED_LATER], env=os.environ, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_nodes_start_without_libraries_that_their_flight_does_not_need():
+    nodes = ("perch_sim.vio_model_node", "perch_control.controller_node", "perch_planner.perching_planner_node", "perch_eval.recorder_node")
+    program = f"import sys, {', '.join(nodes)}; print(*{{'scipy.optimize', 'scipy.stats', 'osqp', 'matplotlib'}} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout.strip() == ""

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
 
 from perch_core.arrays import Array, Numbers
 from perch_core.errors import PerchError
@@ -70,6 +69,8 @@ class Catenary:
         largest = cls(start, end, span / 60.0, down).sag
         if sag > largest:
             raise PerchError(f"cable: sag {sag:g} m is outside [0, {largest:g}] m for a span of {span:g} m")
+        from scipy.optimize import brentq  # 0.2 s of the start of a node that hangs no cable
+
         log_a = brentq(lambda x: math.log(cls(start, end, math.exp(x), down).sag / sag),
                        math.log(span / 60.0), math.log(span**2 / sag + span) + 2.0, xtol=1e-14)
         return cls(start, end, math.exp(log_a), down)

@@ -8,8 +8,6 @@ try:
     import daqp
 except ImportError:  # about ten times slower, the same solutions to 1e-6
     daqp = None
-import osqp
-from scipy import sparse
 
 _SOFT = 8  # DAQP's mark of a constraint that may be violated at a price
 
@@ -46,6 +44,9 @@ def solve(H: np.ndarray, h: np.ndarray, low: np.ndarray, high: np.ndarray, rows:
 
 def solve_osqp(H, h, low, high, rows, row_low, row_high, soft) -> np.ndarray:
     """The same with OSQP; soft rows get slacks."""
+    import osqp  # with scipy.sparse 0.1 s of a start that uses DAQP
+    from scipy import sparse
+
     n, m, k = len(h), len(row_low), int(np.count_nonzero(soft))
     slack = np.zeros((m, k))
     slack[np.flatnonzero(soft), np.arange(k)] = 1.0
