@@ -12,6 +12,7 @@ from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
     AdhesionLimits, AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
     Plan, Refusal, Result, State, SurfaceMission, Target)
+from perch_control.mission.moves import Moves
 
 TICK = 0.02
 SURFACE = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.2]), math.pi / 2)
@@ -214,3 +215,13 @@ def test_adhesion_needs_place_attitude_speed_and_force():
     assert not monitor.fallen_off(at_rest)  # rocking in what holds it: no force for a moment, and no speed gathered
     monitor.add(np.tile(g_B, (30, 1)))
     assert not monitor.fallen_off(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))
+
+
+@pytest.mark.parametrize("seen, home", [(True, [0.1, -0.2, 0.0]), (False, [0.1, -0.2, -1.2])])
+def test_goals_in_the_air_go_by_where_the_vehicle_took_off_and_not_by_where_it_is(seen, home):
+    """Nobody saw the take-off: by where it hovered at the first goal."""
+    moves, goal = Moves(MissionSettings()), Goal(takeoff_height=1.2, search_timeout=6.0)
+    for p in ([0.1, -0.2, 0.0], [1.0, 0.5, 2.0], [-3.0, 4.0, 3.0]):
+        moves.begin(goal, State(np.array(p), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)), on_ground=seen and p[2] == 0.0)
+        assert moves.hover[0] == pytest.approx(p) and moves.home[0] == pytest.approx(home)
+        assert moves.search[0] == pytest.approx(np.add(home, [0.0, 0.0, 1.2]))
