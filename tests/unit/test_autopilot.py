@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import socket
 import struct
 import time
@@ -22,6 +23,7 @@ from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
 from perch_autopilot.wire import Wire, WireError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
+from perch_core.values import RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from scipy.spatial.transform import Rotation
 
@@ -140,20 +142,27 @@ def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
 class Desk:
     """In the keeper's place: an autopilot that says who it is, and which battery it has."""
 
-    voltage = 16.0
+    voltage, silent = 16.0, False
 
     def __init__(self, address, settings, hover, descent) -> None:
         self.throttles, self._said, self._parser, self.closed = (hover, descent), b"", msp.Parser(), False
+        self.mode: list[str] = []
 
     def request(self, data: bytes) -> None:
         known = {msp.FC_VARIANT: b"BTFL", msp.FC_VERSION: bytes((4, 6, 0)),
-                 msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * Desk.voltage))}
+                 msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * Desk.voltage)),
+                 msp.RAW_IMU: struct.pack("<9h", 0, 0, 2048, *(0,) * 6), msp.STATUS: struct.pack("<HHHIBHBBBBIB", *(0,) * 9, 29, 0, 0)}
+        if self.silent:
+            return
         for frame in self._parser.feed(data.replace(b"$M<", b"$M>")):  # requests have the form of answers
             self._said += answer(frame.command, known[frame.command]) if frame.command in known else b""
 
     def receive(self, timeout: float = 0.0):
-        said, self._said = self._said, b""
-        return said, []
+        (said, mode), self._said, self.mode = (self._said, self.mode), b"", []
+        return said, mode
+
+    def command(self, armed: bool, sticks) -> None:
+        self.mode = ["following"]
 
     def carrying(self, hover: int, descent: int) -> None:
         self.throttles = hover, descent
@@ -196,6 +205,78 @@ def test_hover_and_descent_without_commands_follow_the_battery(flown_on, monkeyp
     dog.command(1.0, True, (1500, 1500, 1500, 1500))
     dog.carrying(*empty)
     assert (dog.channels(1.1)[2], dog.channels(1.6)[2]) == empty
+
+
+def polled(node: Betaflight, start: float, count: int, armed: bool = False) -> list[str]:
+    """What a node says in so many polls, 100 a second from a time [s]: lines of its log, each once."""
+    lines: list = []
+    node.log.receivers.append(lines.append)
+    for k in range(count):
+        if armed:
+            node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+        node.on_poll(round(start * 1e9) + k * 10_000_000)
+    node.log.receivers.remove(lines.append)
+    return [text for text in dict.fromkeys(line.text for line in lines) if text != "autopilot: following"]
+
+
+def test_a_pilot_who_has_not_handed_over_is_named_though_the_firmware_gives_no_reason(flown_on):
+    said, = polled(flown_on(16.0), 100.0, 200, armed=True)
+    assert said == "the autopilot refuses to arm: the pilot has not handed over: switch MSP OVERRIDE on"
+
+
+def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
+    node, reports, samples = flown_on(16.0), [], []
+    node.diagnostics.receivers.append(reports.append)
+    node.imu.receivers.append(samples.append)
+    assert polled(node, 5000.0, 100) == []
+    for start, words in ((1400.0, "went back by 3600.990 s"), (9000.0, "went on by 7599.010 s"), (8999.5, "went back by 1.490 s")):
+        before, taken = len(reports), len(samples)
+        said, = polled(node, start, 100)
+        assert words in said and len(reports) > before and len(samples) >= taken + 99
+        assert {report.level for report in reports[before:]} == {0}
+
+
+def test_of_samples_that_come_at_once_the_newest_counts(flown_on):
+    """A torn length keeps the frames behind it back: they come together, and all but one are old."""
+    node, samples = flown_on(16.0), []
+    node.imu.receivers.append(samples.append)
+    node._link._said = b"".join(answer(msp.RAW_IMU, struct.pack("<9h", 0, 0, 256 * k, *(0,) * 6)) for k in range(1, 9))
+    node.on_poll(0)
+    sample, = samples
+    assert sample.f_B[2] == pytest.approx(9.81)
+
+
+def test_an_autopilot_that_vanishes_is_one_line(flown_on, monkeypatch):
+    node = flown_on(16.0)
+    assert polled(node, 1.0, 100) == []
+    monkeypatch.setattr(Desk, "silent", True)
+    assert polled(node, 2.0, 400) == ["/dev/ttyACM0: the autopilot is silent: check its power and its wire"]
+
+
+@pytest.mark.parametrize("noise", [b"", b"\x00\xf8\x06\x9e" * 50])
+def test_a_serial_line_that_answers_at_another_rate_is_refused_and_motors_stay_off(noise, monkeypatch):
+    """What comes of another baud rate: bytes that are no MSP, or none. A pseudo-terminal has no rate of its own."""
+    ours, theirs = pty.openpty()
+    links: list[KeeperLink] = []
+
+    class Noisy(KeeperLink):
+        def __init__(self, *arguments) -> None:
+            super().__init__(*arguments)
+            links.append(self)
+            os.write(ours, noise)
+            assert not noise or select.select([self._control], [], [], 60.0)[0]  # it has been passed on
+
+    monkeypatch.setattr("perch_autopilot.betaflight.KeeperLink", Noisy)
+    monkeypatch.setattr("perch_autopilot.betaflight._HANDSHAKE", 0.1)
+    words = "bytes came that are no MSP: is the baud rate right" if noise else "no autopilot answers within 0.1 s$"
+    with pytest.raises(msp.MspError, match=words) as error:
+        Betaflight(BetaflightParameters(wire=f"{os.ttyname(theirs)}@9600"))
+    assert "\n" not in str(error.value) and links[0].process.wait(60.0) == 0
+    heard = msp.Parser().feed(os.read(ours, 1 << 16).replace(b"$M<", b"$M>"))
+    sent = [struct.unpack("<6H", frame.payload) for frame in heard if frame.command == msp.SET_RAW_RC]
+    assert sent and {channels[2:] for channels in sent} == {(1000, 1500, OFF, OFF)}
+    os.close(theirs)
+    os.close(ours)
 
 
 # -- axes ------------------------------------------------------------------------------------------------------------

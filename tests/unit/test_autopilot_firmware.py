@@ -293,11 +293,51 @@ def test_why_it_does_not_arm_is_said(vehicle):
         node.close()
 
 
+def refusals(running, radio=(1500, 1500, 1000, 1500, OFF), orders=(), cycles=100) -> tuple[str, ...]:
+    """Why a firmware in the loop does not arm after some cycles with a radio, pulse widths [us], and orders over MSP."""
+    for order in orders:
+        running.send(msp.request(*order))
+    for _ in range(cycles):
+        running.step(STILL, GRAVITY, LEVEL, radio)
+    running.receive(0.001)
+    running.send(msp.request(msp.STATUS))
+    parser = msp.Parser()
+    for _ in range(1000):
+        running.step(STILL, GRAVITY, LEVEL, radio)
+        for frame in parser.feed(running.receive(0.001)):
+            if frame.command == msp.STATUS:
+                return msp.status(frame).refusals
+    raise AssertionError("no status comes")
+
+
+def test_reasons_not_to_arm_that_can_be_provoked_are_named():
+    """In 4.6.0: MSP_SET_MODE_RANGE is 35, MSP_ACC_CALIBRATION 205; box 27 is FAILSAFE, 36 PREARM."""
+    def switched(box: int) -> tuple[int, bytes]:
+        return 35, bytes((5, box, 3, 32, 48))  # mode range 5: this box by AUX4 above 1700
+
+    running, low, high = started(lambda: Sitl(load_configuration("betaflight"))), (1500, 1500, 1000, 1500), (1500, 1500, 1500, 1500)
+    aux4 = (*low, OFF, OFF, OFF, ON)
+    throttle, radio = "throttle is not low: pull it down", "no radio signal (RX_FAILSAFE): switch the radio on, check the receiver"
+    try:
+        assert refusals(running, cycles=1) == (radio,)
+        assert refusals(running, cycles=300) == ()
+        assert refusals(running, (*high, OFF)) == (throttle,)
+        assert refusals(running, (*high, ON)) == (throttle, msp.TOO_EARLY)
+        assert refusals(running, (*low, ON)) == (msp.TOO_EARLY,)
+        assert refusals(running) == ()
+        assert refusals(running, orders=[switched(36)]) == ("no pre-arm: switch it on",)
+        assert refusals(running, aux4) == ()
+        assert refusals(running, aux4, [switched(27)]) == (radio, "box failsafe switch: switch it off")
+        assert refusals(running, orders=[(205, b"")], cycles=1)[-1] == "calibrating: keep the vehicle still"
+    finally:
+        running.close()
+
+
 def test_an_autopilot_that_does_not_answer_is_refused():
     import socket
     ours, theirs = socket.socketpair()
     theirs.send(b"\x00\xff\x13garbage")
-    with pytest.raises(msp.MspError, match="no autopilot answers .* bytes came that are no MSP"):
+    with pytest.raises(msp.MspError, match="no autopilot answers .* bytes came that are no MSP: is the baud rate right"):
         Betaflight(BetaflightParameters(wire=f"fd:{ours.fileno()}"))
     ours.close()
     theirs.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 
 import numpy as np
@@ -164,3 +165,93 @@ def test_it_arms_by_its_own_way_and_says_why_not(autopilot):
     autopilot.heard()
     said = " | ".join(line.text for line in autopilot.got["log"])
     assert "refuses arming: TEMPORARILY_REJECTED" in said and "Preflight Fail: Accel #0 uncalibrated" in said
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+def test_a_hosts_clock_that_jumps_is_one_line_and_everything_goes_on(autopilot):
+    m = autopilot.mavlink
+
+    def second() -> set[str]:
+        """What the node sends in a second with heartbeats, answers to its clock, commands and samples; its new lines."""
+        kinds: set[str] = set()
+        for k in range(200):
+            if k % 50 == 0:
+                autopilot.say(m.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+            autopilot.node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+            own = 5 * SECOND + 5_000_000 * (count := next(counter))
+            autopilot.say(m.highres_imu_encode(own // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+            said = autopilot.heard()
+            if "TIMESYNC" in said:
+                autopilot.say(m.timesync_encode(5 * SECOND + 5_000_000 * (count + 1), said["TIMESYNC"].ts1))
+            kinds |= set(said)
+        return kinds
+
+    counter = itertools.count()
+    wanted = {"HEARTBEAT", "TIMESYNC", "SET_ATTITUDE_TARGET", "COMMAND_LONG"}  # disarmed is wanted: it is ordered again and again
+    assert second() | second() >= wanted
+    assert autopilot.got["log"] == []
+    for jump, words in ((-3600, "went back by 3599.995 s"), (7200, "went on by 7200.005 s")):
+        autopilot.now += jump * SECOND
+        before = len(autopilot.got["imu"])
+        assert second() | second() >= wanted
+        samples = autopilot.got["imu"][before:]
+        assert len(samples) > 390 and all(abs(sample.stamp - autopilot.now) < 2.1 * SECOND for sample in samples)
+        assert (np.diff([sample.stamp for sample in samples]) > 0).all()
+        line, = autopilot.got["log"]
+        assert words in line.text
+        autopilot.got["log"].clear()
+
+
+def test_samples_of_an_autopilot_that_has_started_anew_wait_for_its_new_clock(autopilot):
+    m = autopilot.mavlink
+    autopilot.heard()
+    for own in (500 * SECOND, 2 * SECOND):
+        autopilot.say(m.highres_imu_encode(own // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+        autopilot.heard()
+        assert autopilot.got["imu"] == []
+        autopilot.say(m.timesync_encode(own, autopilot.now))
+        autopilot.say(m.highres_imu_encode(own // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+        autopilot.heard()
+        assert autopilot.got["imu"].pop().stamp == pytest.approx(autopilot.now, abs=10_000_000)
+    line, = autopilot.got["log"]
+    assert "the autopilot's clock went from 500.000 to 2.000 s at once" in line.text
+
+
+@pytest.mark.parametrize("noise, words", [(b"", "check its power, wire and system id"), (b"\x00\xf8\x06" * 9, "is the baud rate right?")])
+def test_an_autopilot_that_is_not_heard_is_named_and_nothing_is_asked_of_it(autopilot, noise, words):
+    sent: set[str] = set()
+    for _ in range(600):
+        autopilot.wire.sendall(noise)
+        autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+        sent |= set(autopilot.heard())
+    line, = autopilot.got["log"]
+    assert line.text.startswith("no heartbeat of the autopilot") and words in line.text
+    assert "COMMAND_LONG" not in sent
+
+
+def test_another_autopilot_is_refused_by_its_number(autopilot):
+    sent: set[str] = set()
+    for _ in range(600):
+        autopilot.say(autopilot.mavlink.heartbeat_encode(2, 8, 0, 0, 4))  # MAV_AUTOPILOT_INVALID
+        autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+        sent |= set(autopilot.heard())
+    assert {line.text for line in autopilot.got["log"]} == {"the autopilot is of MAVLink's type 8, not PX4 (12) or ArduPilot (3): not armed"}
+    assert "COMMAND_LONG" not in sent
+
+
+def test_any_bytes_leave_the_node_ready(autopilot):
+    """Frames torn at a random place, wrong bytes and noise between them: at last whole ones are read again."""
+    m, rng = autopilot.mavlink, np.random.default_rng(3)
+    whole = m.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4).pack(m)
+    for _ in range(200):
+        torn = bytearray(whole[:rng.integers(1, len(whole) + 1)])
+        torn[rng.integers(len(torn))] ^= int(rng.integers(1, 256))
+        autopilot.wire.sendall(bytes(torn) + rng.bytes(rng.integers(0, 9)))
+        autopilot.heard()
+    autopilot.node.offboard.armed = False
+    autopilot.wire.sendall(whole * 20)  # what had begun may swallow 280 bytes
+    autopilot.heard()
+    assert autopilot.node.offboard.armed
+    autopilot.heard(1.1)
+    assert autopilot.got["diagnostics"][-1].values["torn_frames"] > 0

@@ -10,6 +10,7 @@ from perch_core.config import part, quantity, text
 from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
 from perch_core.vehicle import load_vehicle
 from perch_autopilot import msp
+from perch_autopilot.clock import jumped
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.keeper import KeeperLink
 from perch_autopilot.rates import Sticks, rate_curves
@@ -67,7 +68,8 @@ class Betaflight(Component[BetaflightParameters]):
         self._battery: msp.Battery | None = None
         self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
         self._wanted = False
-        self._answered, self._diagnosed = 0, 0
+        self._now: int | None = None            # of the last poll [ns]
+        self._answered = self._diagnosed = 0
 
     def _carrying(self) -> tuple[int, int]:
         """Throttles of hover and descent [us]."""
@@ -77,17 +79,20 @@ class Betaflight(Component[BetaflightParameters]):
         """Who is at the other end, with which battery."""
         wanted = [msp.FC_VARIANT, msp.FC_VERSION, *([msp.ANALOG] if self._sticks.battery.reference else [])]
         answers: dict[int, msp.Frame] = {}
-        last = time.monotonic() + _HANDSHAKE
+        last, said = time.monotonic() + _HANDSHAKE, [""]
         while time.monotonic() < last:
             self._link.request(b"".join(map(msp.request, wanted)))
-            for frame in self._parser.feed(self._link.receive(0.2)[0]):
+            data, words = self._link.receive(0.2)
+            said += words
+            for frame in self._parser.feed(data):
                 answers[frame.command] = frame
             if answers.keys() >= set(wanted):
                 if msp.ANALOG in wanted:
                     self._take_battery(msp.battery(answers[msp.ANALOG]).voltage)
                 return msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
-        noise = f"; {self._parser.skipped} bytes came that are no MSP: is the baud rate right?" if self._parser.skipped else ""
-        raise msp.MspError(f"{self.config.wire}: no autopilot answers within {_HANDSHAKE:g} s{noise}")
+        noise = (f"{self._parser.skipped} bytes came that are no MSP: is the baud rate right, and the autopilot's command line closed?"
+                 if self._parser.skipped else "")
+        raise msp.MspError("; ".join(filter(None, (f"{self.config.wire}: no autopilot answers within {_HANDSHAKE:g} s", said[-1], noise))))
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
@@ -103,13 +108,18 @@ class Betaflight(Component[BetaflightParameters]):
     # -- from it -----------------------------------------------------------------------------------------------------
 
     def on_poll(self, now: int) -> None:
-        """Take what has come; ask for the next sample, and for the rest in turn."""
+        """Take what has come, the newest of each kind; ask for the next sample, and for the rest in turn."""
+        if self._now is None or (jump := jumped(self._now, now)):
+            self._answered, self._diagnosed, self._wanted_since = now, now - NANOSECONDS, None
+            if self._now is not None:
+                self.warn(jump)
+        self._now = now
         try:
             data, said = self._link.receive()
             for line in said:
                 self._mode = line
                 self.log(LogLine("info" if line in ("disarmed", "following") else "warning", f"autopilot: {line}"))
-            for frame in self._parser.feed(data):
+            for frame in {frame.command: frame for frame in self._parser.feed(data)}.values():
                 self._take(frame, now)
             self._polls += 1
             asked = msp.request(msp.RAW_IMU)
@@ -149,20 +159,23 @@ class Betaflight(Component[BetaflightParameters]):
                                    f"{low:g} to {high:g} V")
 
     def _judge_arming(self, now: int) -> None:
-        """Say why it does not arm."""
+        """Say why it does not arm; it names no reason where another one than we has the switch."""
         if not self._wanted or self._status.armed:
             self._wanted_since = None
         elif self._wanted_since is None:
             self._wanted_since = now
-        elif now - self._wanted_since > _REFUSED and self._status.refusals:
-            self.log(LogLine("error", f"the autopilot refuses to arm: {', '.join(self._status.refusals)}", 2.0))
+        elif now - self._wanted_since > _REFUSED:
+            reasons = "; ".join(self._status.refusals) or (
+                "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == "following" else "commands had stopped: disarm first")
+            self.log(LogLine("error", f"the autopilot refuses to arm: {reasons}", 2.0))
 
     def _diagnose(self, now: int) -> None:
-        silent = now - self._answered > NANOSECONDS
+        if silent := now - self._answered > NANOSECONDS:
+            self.log(LogLine("error", f"{self.config.wire}: the autopilot is silent: check its power and its wire", 5.0))
         values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn,
                   "skipped_bytes": self._parser.skipped}
         if self._status is not None:
-            values |= {"armed": self._status.armed, "refusals": ", ".join(self._status.refusals)}
+            values |= {"armed": self._status.armed, "refusals": "; ".join(self._status.refusals)}
         if self._battery is not None:
             values |= {"voltage_v": self._battery.voltage, "current_a": self._battery.current, "rssi": self._battery.rssi}
         if self._attitude is not None:

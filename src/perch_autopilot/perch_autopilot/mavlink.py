@@ -21,7 +21,8 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
 from perch_core.vehicle import load_vehicle
 from perch_autopilot import frames
-from perch_autopilot.offboard import Ask, Offboard
+from perch_autopilot.clock import JUMP, jumped
+from perch_autopilot.offboard import ARDUPILOT, PX4, SILENT, Ask, Offboard
 from perch_autopilot.wire import Wire, WireError
 
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
@@ -93,8 +94,9 @@ class Mavlink(Component[MavlinkParameters]):
         self._mavlink.robust_parsing = True
         self.offboard, self._clock = Offboard(), ClockOffset()
         self._command: RatesThrust | None = None
-        self._now = self._came = self._second = 0
-        self._torn = 0
+        self._now: int | None = None         # of the last poll [ns]
+        self._begun = self._came = self._second = self._torn = 0
+        self._sampled: int | None = None     # stamp of its last sample, by its own clock [ns]
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
@@ -103,7 +105,7 @@ class Mavlink(Component[MavlinkParameters]):
         if not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
             self.warn("rates_thrust_command: not finite, or beyond any vehicle: ignored", every=1.0)
             return
-        self._command, self._came = command, self._now
+        self._command, self._came = command, self._now or 0
 
     def on_odometry(self, state: OdometryState) -> None:
         """On to the autopilot's own estimator, in its axes."""
@@ -133,6 +135,10 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_poll(self, now: int) -> None:
         """Take what has come; send the command while it is fresh; once a second what keeps the connection."""
+        if self._now is None or (jump := jumped(self._now, now)):
+            self._command, self._clock, self._begun, self._second = None, ClockOffset(), now, now - NANOSECONDS
+            if self._now is not None:
+                self.warn(jump)
         self._now = now
         try:
             for message in self._mavlink.parse_buffer(self._wire.read()) or ():
@@ -165,7 +171,7 @@ class Mavlink(Component[MavlinkParameters]):
             return
         elif kind == "HEARTBEAT" and message.get_srcComponent() == 1:
             self.offboard.heartbeat(now * 1e-9, message.autopilot, message.base_mode, message.custom_mode)
-        elif kind == "HIGHRES_IMU" and self._clock.offset is not None:
+        elif kind == "HIGHRES_IMU" and self._known(message.time_usec * 1000):
             f = frames.body(np.array([message.xacc, message.yacc, message.zacc]))
             w = frames.body(np.array([message.xgyro, message.ygyro, message.zgyro]))
             self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
@@ -181,11 +187,29 @@ class Mavlink(Component[MavlinkParameters]):
             said = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
             self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {said}", 1.0))
 
+    def _known(self, stamp: int) -> bool:
+        """Whether the autopilot's clock is known at its time [ns]; after a jump it has to be asked anew."""
+        if self._sampled is not None and not 0 <= stamp - self._sampled < JUMP:
+            self.warn(f"the autopilot's clock went from {self._sampled * 1e-9:.3f} to {stamp * 1e-9:.3f} s at once: it has started anew?")
+            self._clock = ClockOffset()
+        self._sampled = stamp
+        return self._clock.offset is not None
+
+    def _trouble(self, now: int) -> str:
+        """Why it cannot follow; empty: it can."""
+        if not self.offboard.alive(now * 1e-9):
+            noise = f"; {self._torn} torn frames: is the baud rate right?" if self._torn else ": check its power, wire and system id"
+            return f"no heartbeat of the autopilot{noise}"
+        if self.offboard.autopilot not in (PX4, ARDUPILOT):
+            return f"the autopilot is of MAVLink's type {self.offboard.autopilot}, not PX4 ({PX4}) or ArduPilot ({ARDUPILOT}): not armed"
+        return ""
+
     def _diagnose(self, now: int) -> None:
-        alive = self.offboard.alive(now * 1e-9)
+        if (trouble := self._trouble(now)) and now - self._begun >= SILENT * NANOSECONDS:
+            self.log(LogLine("error", trouble, 5.0))
         self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following, "torn_frames": self._torn,
                                            "clock_offset_s": (self._clock.offset or 0) * 1e-9},
-                                     0 if alive else 2, "ok" if alive else "no heartbeat of the autopilot"))
+                                     2 if trouble else 0, trouble or "ok"))
 
     def close(self) -> None:
         """Close the wire; the autopilot's failsafe for the loss of set points counts from now on."""

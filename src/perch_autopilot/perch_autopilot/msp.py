@@ -20,14 +20,21 @@ GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000
 VERSIONS = ((4, 3), (4, 6))
 """Firmware with which the messages below have been read; later ones turn yaw's polarity."""
 ARMING_REASONS = (
-    "no gyro", "failsafe", "no radio signal (RX_FAILSAFE)", "not recovered from failsafe", "box failsafe switch", "runaway take-off",
-    "crash detected", "throttle is not low", "tilted beyond small_angle", "starting up (BOOT_GRACE_TIME)", "no pre-arm",
-    "processor overload", "calibrating", "CLI is open",
-    "CMS menu is open", "BST", "MSP connection blocks arming (configurator)", "paralyzed", "GPS rescue has no fix",
-    "RESC", "RPM filter without telemetry", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated",
-    "motor protocol is not set",
-    "crash flip", "altitude hold", "position hold")
-"""Why the firmware refuses to arm: by bit of its flags. Their number differs from 4.3 to 4.6, and the last one is always the same."""
+    "no gyro: check the sensor and the firmware's target", "failsafe: switch the radio on, and the arming switch off",
+    "no radio signal (RX_FAILSAFE): switch the radio on, check the receiver", "not recovered from failsafe: switch the arming switch off",
+    "box failsafe switch: switch it off", "runaway take-off: check the order of motors and propellers, and the board's orientation",
+    "crash detected: switch the arming switch off", "throttle is not low: pull it down",
+    "tilted beyond small_angle: stand it level, or set small_angle = 180", "starting up (BOOT_GRACE_TIME): wait",
+    "no pre-arm: switch it on", "processor overload: raise pid_process_denom, or switch features off",
+    "calibrating: keep the vehicle still", "CLI is open: leave it (exit), which restarts the autopilot", "CMS menu is open: leave it",
+    "BST: its other end blocks arming", "MSP connection blocks arming (configurator): close it",
+    "paralyzed: restart the autopilot", "GPS rescue has no fix: wait for it, or allow arming without", "GPS rescue is switched on: switch it off",
+    "RPM filter without telemetry: check the speed controllers and dshot_bidir", "reboot required: restart the autopilot",
+    "DSHOT bitbang: set dshot_bitbang, or other pins", "accelerometer is not calibrated: calibrate it",
+    "motor protocol is not set: set motor_pwm_protocol", "crash flip is switched on: switch it off",
+    "altitude hold is switched on: switch it off", "position hold is switched on: switch it off")
+"""Why the firmware refuses to arm, and what to do: by bit of its flags. Their number differs from 4.3 to 4.6, and the last one is always
+the same."""
 TOO_EARLY = "arming switch was on too early: switch it off first"
 
 

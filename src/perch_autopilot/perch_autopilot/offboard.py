@@ -53,7 +53,7 @@ class Offboard:
 
     def alive(self, now: float) -> bool:
         """Whether its heartbeat is of the present."""
-        return now - self._heard < SILENT
+        return 0.0 <= now - self._heard < SILENT
 
     def ask(self, now: float, wanted: bool, streaming: bool) -> Ask:
         """What to ask for now.
@@ -67,12 +67,12 @@ class Offboard:
         """
         if not streaming:
             self._streaming = None
-        elif self._streaming is None:
+        elif self._streaming is None or now < self._streaming:
             self._streaming = now
         if not self.armed and not wanted:
             self._was_following = False
         step = Ask.NOTHING
-        if not self.alive(now):
+        if not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return step
         if not wanted:
             step = Ask.DISARM if self.armed and self.following else step
@@ -81,7 +81,7 @@ class Offboard:
                 step = step if self.armed and self._was_following else Ask.MODE
             elif not self.armed:
                 step = Ask.ARM
-        if step is Ask.NOTHING or now - self._asked < AGAIN:
+        if step is Ask.NOTHING or 0.0 <= now - self._asked < AGAIN:
             return Ask.NOTHING
         self._asked = now
         return step
