@@ -73,7 +73,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
     return report
 
 
-UNITS = {"us": "us", "ms": "ms", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
+UNITS = {"per_s": "per s", "us": "us", "ms": "ms", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
 _UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/ControllerCommand
 
