@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, msp
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
-from perch_autopilot.configuration import differences, load_configuration
+from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
 from perch_autopilot.keeper import KeeperLink
 from perch_autopilot.rates import RateCurve, Sticks, rate_curves
 from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
@@ -417,6 +417,14 @@ def test_a_configuration_that_is_none_is_refused(tmp_path, text, words):
         load_configuration(str(file))
     with pytest.raises(ConfigError, match="cannot be read"):
         load_configuration(str(tmp_path / "none.txt"))
+
+
+@pytest.mark.parametrize("came, words", [(b"", "within 0 s$"), (b"\x00\xf8" * 40, "bytes came, at last .*: is the baud rate right")])
+def test_a_command_line_that_does_not_answer_is_one_line(came, words, monkeypatch):
+    monkeypatch.setattr("perch_autopilot.configuration._ANSWER_TIME", 0.0)
+    with pytest.raises(CliError, match=words) as error:
+        Cli(lambda data: None, lambda timeout: came)
+    assert len(str(error.value)) < 160
 
 
 def test_rates_of_another_type_are_refused():

@@ -89,7 +89,8 @@ class Cli:
         while not text.endswith(b"\n# "):
             text += self._receive(0.1)
             if time.monotonic() > last:
-                raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s: {text[-80:]!r}")
+                noise = f": {len(text)} bytes came, at last {text[-8:]!r}: is the baud rate right?" if text else ""
+                raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s{noise}")
         return text.decode("ascii", "replace")
 
     def apply(self, configuration: Configuration) -> None:
