@@ -10,7 +10,8 @@ import pytest
 from perch_core.component import Component, Input
 from perch_core.errors import ConfigError
 from perch_core.ros import topics
-from perch_core.values import ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, limits
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_core.values import ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, TrajectoryOrder, limits
 from perch_eval.limits_page import page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,6 +42,16 @@ def test_a_value_is_refused_with_field_value_and_range(value, said):
 def test_a_request_is_refused_with_its_source():
     with pytest.raises(ConfigError, match=r"request: lines\[0\].radius: 3 is outside \[0.0001, 1\] m"):
         limits.check("request", PowerlineMap(0, (LINE._replace(radius=3.0),), False, ""))
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_coefficients_that_no_trajectory_has_are_refused_without_a_sum_that_overflows():
+    order = TrajectoryOrder.of(1, FlatTrajectory(np.ones(1), np.full((1, 4, 8), 1e308)))
+    received = topics.topic("trajectory").read(topics.serialize_message(topics.topic("trajectory").to_message(order)))
+    assert limits.problem(received).startswith("trajectory: coefficients: 1e+308 is outside [-10000, 10000] m or rad")
+    assert not limits.problem(TrajectoryOrder.of(1, rest_to_rest((0.0,) * 3, (9e3,) * 3, 0.0, 1.0, 100.0)))
+    with pytest.raises(ConfigError, match=r"current: coefficients: 1e\+308 is outside"):
+        limits.check("current", order.trajectory, limits.CURRENT)
 
 
 ODD = (0.0, -1.0, 1.0, 99.0, 101.0, 2001.0, -1.1e4, 1e9, nan, inf, -inf)

@@ -10,7 +10,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
-from math import inf, isfinite
+from math import inf
 
 import numpy as np
 
@@ -69,9 +69,7 @@ class FlatTrajectory:
         if durations.ndim != 1 or not len(durations) or coefficients.shape[:2] != (len(durations), 4) or coefficients.ndim != 3:
             raise ValueError(f"durations {durations.shape} and coefficients {coefficients.shape}: need (n,) and (n, 4, degree + 1)")
         times = durations.tolist()
-        # A sum is finite only if every term is; the other way round it may overflow.
-        finite = isfinite(coefficients.sum()) or np.isfinite(coefficients).all()
-        if not (finite and all(0.0 < t < inf for t in times)):
+        if not (np.isfinite(coefficients).all() and all(0.0 < t < inf for t in times)):
             raise ValueError("coefficients must be finite and durations finite and > 0 s")
         for name, value in (("durations", durations), ("coefficients", coefficients)):
             value.setflags(write=False)

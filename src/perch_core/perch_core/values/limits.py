@@ -35,7 +35,7 @@ class Limit:
     Attributes:
         low, high: inclusive.
         unit: of the values.
-        shape: of the array, () a number; -1: any number of rows up to `most`.
+        shape: of the array, () a number; -1: any number, of rows up to `most`.
         most: rows.
         optional: NaN leaves the value to whoever takes it.
     """
@@ -56,7 +56,7 @@ class Limit:
         many = self.shape[:1] == (-1,)
         if many and len(array.shape) and not array.size:
             return ""
-        if array.ndim != len(self.shape) or array.shape[many:] != self.shape[many:]:
+        if array.ndim != len(self.shape) or any(n not in (-1, given) for n, given in zip(self.shape, array.shape)):
             wanted = " x ".join("n" if n < 0 else str(n) for n in self.shape) or "one"
             return f"shape {array.shape} is not {wanted}"
         if many and len(array) > self.most:
@@ -173,6 +173,10 @@ def _rows(size: float, unit: str, width: int, most: int) -> Limit:
     return Limit(-size, size, unit, (-1, width), most)
 
 
+def _coefficients(segments: int) -> Limit:
+    return Limit(-1e4, 1e4, "m or rad", (-1, 4, -1), segments)
+
+
 VARIANCE_MAX = 1e8  # of a variance beyond that nobody can say anything, and its square would not be a number
 SEGMENTS_MAX, DEGREE_MAX, SAMPLES_MAX = 1000, 20, 5000  # of a trajectory: 5 s at a sample per ms, 20 s at what the planner gives
 PLAN_LONGEST, PLAN_SEGMENTS_MAX = 600.0, 101  # of what is planned on [s]
@@ -217,7 +221,7 @@ LIMITS: dict[type, dict[str, Any]] = {
         "trajectory": Part((FlatTrajectory, SampledTrajectory))},
     FlatTrajectory: {
         "start_time": Limit(0.0, 2.0**31, "s"), "duration": Limit(0.0, 3600.0, "s"), "degree": Limit(0, DEGREE_MAX),
-        "durations": Limit(1e-6, 3600.0, "s", (-1,), SEGMENTS_MAX)},
+        "durations": Limit(1e-6, 3600.0, "s", (-1,), SEGMENTS_MAX), "coefficients": _coefficients(SEGMENTS_MAX)},
     SampledTrajectory: {
         "start_time": Limit(0.0, 2.0**31, "s"), "times": Limit(0.0, 3600.0, "s", (-1,), SAMPLES_MAX),
         "p": _rows(1e4, "m", 3, SAMPLES_MAX), "v": _rows(100.0, "m/s", 3, SAMPLES_MAX), "a": _rows(1e3, "m/s^2", 3, SAMPLES_MAX),
@@ -243,7 +247,8 @@ LIMITS: dict[type, dict[str, Any]] = {
 """Type of a value -> field -> what it may be; None is left to whoever takes it."""
 
 STATE = {name: LIMITS[PerchPlanRequest][name] for name in ("p", "v", "a", "j", "yaw", "yaw_rate")}
-CURRENT = {"durations": Limit(1e-3, PLAN_LONGEST, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX)}
+CURRENT = {"durations": Limit(1e-3, PLAN_LONGEST, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX),
+           "coefficients": _coefficients(PLAN_SEGMENTS_MAX)}
 """Of `PerchPlanRequest.current`, whose state at the start is limited as one that is given."""
 POSE = {"position": POSITION, "orientation": Unit(1e-2)}
 """Of `PowerlinePlanRequest.perch_pose`."""
