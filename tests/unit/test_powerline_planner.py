@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from perch_control.mission.requests import plan_answer
+from perch_control.mission.values import Refusal
 from perch_core import config, so3
 from perch_core.errors import ConfigError, PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance
@@ -67,7 +68,7 @@ def test_a_perch_after_which_no_recovery_is_found_is_given_without_one() -> None
     answer = service.answer(plan, planner.solver.model, 0.01, 0.25, 0)
     assert answer.success and answer.at_end == AtEnd.CONTACT and answer.recovery_start < 0.0
     assert "without recovery: no recovery" in answer.message
-    assert not plan_answer(answer).success and plan_answer(answer).message == answer.message
+    assert plan_answer(answer) == Refusal(answer.message)
 
 
 def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlanner, planned: PlannedProblem) -> None:

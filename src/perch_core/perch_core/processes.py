@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 
 _PR_SET_PDEATHSIG = 1
 _SET_THREADS = ("openblas_set_num_threads", "openblas_set_num_threads64_", "scipy_openblas_set_num_threads", "scipy_openblas_set_num_threads64_")
@@ -17,6 +19,23 @@ def end_with_parent(signal_number: int) -> None:
     """Have the operating system send this process a signal when the one that started it ends, however it ends (Linux)."""
     with suppress(OSError, AttributeError):  # elsewhere a process ends with its pipes
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal_number))
+
+
+def end_within(seconds: int) -> None:
+    """Have the operating system end this process by SIGALRM, unless it has ended by itself before."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(seconds)
+
+
+@contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Processes that are started meanwhile do not see Ctrl-C, which is this one's own matter, until they let it through."""
+    resource_tracker.ensure_running()  # it lets SIGINT through as it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def give_way(task: int, nice: int) -> None:

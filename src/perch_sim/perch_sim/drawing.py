@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Protocol
 
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 
 from perch_core.camera import CameraMount, Region
-from perch_core.processes import end_with_parent, give_way
+from perch_core.processes import end_with_parent, give_way, without_interrupts
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
@@ -138,12 +137,8 @@ class DrawnInProcesses:
         """
         self.cameras = tuple(cameras)
         seen = _seen(scenario, seed, cameras)
-        resource_tracker.ensure_running()  # it lets SIGINT through as it starts
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: Ctrl-C is the vehicle's own matter
-        try:
+        with without_interrupts():
             self._draftsmen = {name: _Draftsman(scene, mount, seed) for name, scene, mount in seen}
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
         """As `Drawing.draw`."""

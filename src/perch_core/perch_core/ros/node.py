@@ -15,7 +15,7 @@ from perch_core.ros.component_node import ComponentNode  # first: it sets the th
 import rclpy
 from perch_core.component import Component
 from perch_core.errors import ConfigError, PerchError
-from perch_core.processes import freeze_heap
+from perch_core.processes import end_within, freeze_heap
 from perch_core.registry import resolved
 from perch_core.ros.arrival import ArrivalNode
 from perch_core.ros.priority import priority
@@ -28,6 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 LOOK = 0.1  # [s] wall clock, between looks for a signal to stop
+END_LIMIT = 20  # for the end of a process whose nodes are told to stop [s]
 LOCKSTEP = "perch_sim.ros.participant_node:ParticipantNode"  # the host that the simulator brings; nothing here knows the simulator otherwise
 
 
@@ -155,7 +156,8 @@ def close_nodes(nodes: Sequence[ComponentNode]) -> None:
 def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | None) -> NoReturn:
     """Run the nodes that `create` makes until SIGINT or SIGTERM.
 
-    Exit code 0, or 2 when a parameter is refused.
+    Exit code 0, or 2 when a parameter is refused. Fast DDS 2.14 may wait for ever where a participant ends while one of its readers
+    is told of a message, in the C library's exit, too: after `END_LIMIT` SIGALRM ends the process.
     """
     nodes: list[ComponentNode] = []
     stop = StopSignal()
@@ -180,6 +182,7 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
             raise
         _refuse(" ".join(str(error).split()))  # rcl refuses command lines and parameter files with this one
     finally:
+        end_within(END_LIMIT)
         close_nodes(nodes)
         rclpy.try_shutdown()
     sys.exit(0)

@@ -12,7 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
 from perch_core.errors import PerchError
-from perch_core.processes import end_with_parent
+from perch_core.processes import end_with_parent, without_interrupts
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import RunResult
@@ -32,6 +32,7 @@ def _end(*_: object) -> None:
 def prepare_worker() -> None:
     """Ctrl-C is the campaign's own matter, and no worker outlives its campaign."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # what the worker starts has signals of its own
     signal.signal(signal.SIGTERM, _end)
     end_with_parent(signal.SIGTERM)
     campaign = multiprocessing.parent_process()
@@ -60,7 +61,9 @@ def spread(work: Callable[..., T], jobs: int | None, progress: Progress, *column
     """
     pool = _pool(jobs)
     try:
-        for result in pool.map(work, *columns):
+        with without_interrupts():  # a worker that has just been started would print where it was
+            results = pool.map(work, *columns)
+        for result in results:
             progress.add(good(result))
             yield result
     except BaseException:
@@ -100,7 +103,8 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
             while waiting or under_way:
                 while waiting and len(under_way) < 2 * jobs:
                     task = waiting[-1]
-                    under_way[pool.submit(_carry_out, task)] = task  # raises where the pool has broken: the task goes on waiting
+                    with without_interrupts():
+                        under_way[pool.submit(_carry_out, task)] = task  # raises where the pool has broken: the task goes on waiting
                     waiting.pop()
                 done, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in done:
