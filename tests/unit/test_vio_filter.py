@@ -68,6 +68,7 @@ class Run:
     start: float = 2.2
     turn_deg: float = 0.5
     offset: float = 0.010  # true; the file says 0.008
+    noise: float = 1.0     # of the tracks, over the declared
     steps: list = dataclasses.field(default_factory=list)
 
     def __post_init__(self):
@@ -96,11 +97,24 @@ class Run:
             ids, pixels = self.tracks(m.p_WB[0], m.R_WB[0], self.R_BC)
             exposed = round((stamp + s.time_offset) * 1e9)
             self.filter.propagate(self.imu.run(s.stamp, exposed), exposed)
-            report = self.filter.add_frame(frame, ids, observe(MOUNT.camera, pixels))
+            bearings = dataclasses.replace(observe(MOUNT.camera, pixels), noise=np.full(len(ids), self.noise))
+            report = self.filter.add_frame(frame, ids, bearings)
             truth = self.motion.sample(np.array([exposed * 1e-9]))
             error = np.concatenate([so3.log(s.R_WB.T @ truth.R_WB[0]), truth.p_WB[0] - s.p_WB, truth.v_WB[0] - s.v_WB])
             frame, stamp = frame + 1, stamp + 1 / 30
             yield report, error
+
+
+def test_noisier_observations_are_as_if_declared_so():
+    """Tracks with twice the declared noise give the state and the covariance of a filter that is told twice the noise."""
+    declared = Run(2).config
+    config = dataclasses.replace(declared, filter=dataclasses.replace(declared.filter, pixel_noise=2.0 * declared.filter.pixel_noise))
+    runs = Run(2, noise=2.0), Run(2, config)
+    used = [[report.used for report, _ in run.frames(14)] for run in runs]
+    a, b = (run.filter.state for run in runs)
+    assert used[0] == used[1] and sum(used[0]) > 50 and a.landmarks
+    np.testing.assert_allclose(a.p_WB, b.p_WB, atol=1e-9)
+    np.testing.assert_allclose(a.P, b.P, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -7,13 +7,16 @@ import cv2
 import numpy as np
 import pytest
 from perch_core.values import ImuSample
+from perch_core.vehicle import load_vehicle
 from perch_eval import estimation_flight as flights
 from perch_perception.ukf import Health
 from perch_perception.vio import FrameOutcome, VioConfig
 from perch_perception.vio.drawing import TrackPainter
-from perch_perception.vio.tracker import Features, Tracker
+from perch_perception.vio.odometry import VisualInertialOdometry
+from perch_perception.vio.tracker import Features, Tracker, _noise
 from perch_sim.scenario import load_scenario
 
+VEHICLE = load_vehicle("snapdragon")
 HOVER = 3.3  # the fault comes in the hover [s]
 
 
@@ -75,6 +78,25 @@ def test_vignetting_does_not_hold_the_tracks_back():
     """It stands still in the image, and what stands still pulls."""
     assert pulled(0.0) > 0.5
     assert abs(pulled(VioConfig().tracker.flatten)) < 0.2
+
+
+def test_a_blurred_patch_is_known_less_well_than_a_sharp_one():
+    """Foerstner: sigma_n^2 over the least eigenvalue of sum g g^T. Where that is below the declared noise, the declared one holds."""
+    rng, camera = np.random.default_rng(5), VEHICLE.mounts["down"].camera
+    noise, texture = rng.normal(0.0, 2.0, (camera.height, camera.width)), rng.normal(0.0, 1.0, (camera.height, camera.width))
+    vio, median = VisualInertialOdometry(VioConfig(), VEHICLE.mounts["down"], np.zeros(3)), []
+    window = vio.config.tracker.window
+    for blur, contrast in ((2.0, 30.0), (6.0, 3.0)):
+        smooth = cv2.GaussianBlur(texture, (0, 0), blur)
+        image = np.clip(128.0 + smooth * contrast / smooth.std() + noise, 0, 255).astype(np.uint8)
+        features = Tracker(replace(vio.config.tracker, flatten=0.0, noise_factor=0.0), camera).track(image, np.eye(3))
+        assert len(features.ids) > 20
+        for (x, y), sigma in zip(features.pixels, features.sigma):
+            patch = cv2.getRectSubPix(image, (window + 2, window + 2), (float(x), float(y))).astype(float)
+            g = np.stack([cv2.Scharr(patch, cv2.CV_64F, 1, 0), cv2.Scharr(patch, cv2.CV_64F, 0, 1)])[:, 1:-1, 1:-1].reshape(2, -1) / 32.0
+            assert sigma == pytest.approx(_noise(image) / np.sqrt(np.linalg.eigvalsh(g @ g.T)[0]), rel=0.1)
+        median.append(np.median(vio._observe(features).noise))
+    assert median[0] == 1.0 < median[1]
 
 
 # -- the whole perch -----------------------------------------------------------------------------------------------------
@@ -284,7 +306,7 @@ def test_tracks_stay_on_their_points():
 def test_the_debug_image_shows_the_features():
     painter, image = TrackPainter(), np.full((480, 640), 100, np.uint8)
     for shift in range(3):
-        features = Features(np.array([1, 2]), np.array([[100.0 + 5 * shift, 200.0], [300.0, 220.0]]), 0)
+        features = Features(np.array([1, 2]), np.array([[100.0 + 5 * shift, 200.0], [300.0, 220.0]]), 0, np.zeros(2))
         drawn = painter.paint(image, features, {2}, "caption")
     assert drawn.shape == (480, 640, 3)
     assert tuple(drawn[217, 300]) == (0, 220, 0)     # landmark: green

@@ -25,9 +25,10 @@ def test_whitened_observations_of_walking_points_are_white():
     steps = rng.normal(size=(20000, len(q))) * np.sqrt(q)
     # the point is where it is seen last: earlier observations are off by what it has walked since
     walk = -np.concatenate([np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros((20000, 1))], axis=1)
-    seen = walk + rng.normal(size=walk.shape) * CONFIG.pixel_noise / FOCAL
+    noise = np.linspace(1.0, 3.0, len(b))
+    seen = walk + rng.normal(size=walk.shape) * noise * CONFIG.pixel_noise / FOCAL
     sliding = Sliding(CONFIG, FOCAL)
-    white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), seen.T) / (CONFIG.pixel_noise / FOCAL)
+    white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), seen.T, noise) / (CONFIG.pixel_noise / FOCAL)
     assert np.cov(white) == pytest.approx(np.eye(len(b)), abs=0.06)
 
 

@@ -32,7 +32,7 @@ class GivenTracks(Tracker):
 
     def track(self, image, R_now_before, slack=0.0):
         ids, pixels = self.see()
-        self.latest = Features(ids, pixels, 0)
+        self.latest = Features(ids, pixels, 0, np.zeros(len(ids)))
         return self.latest
 
 

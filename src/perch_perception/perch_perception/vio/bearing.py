@@ -23,10 +23,12 @@ class Bearings:
     Attributes:
         b_C: unit vectors in C, shape (n, 3).
         shape: of the lens there, d theta / d r and r / theta, with r the radius in the normalised image at the angle theta, shape (n, 2).
+        noise: 1 sigma of each over the declared `pixel_noise`, shape (n,); None: 1.
     """
 
     b_C: np.ndarray
     shape: np.ndarray
+    noise: np.ndarray | None = None
 
 
 # columns of a residual's derivatives

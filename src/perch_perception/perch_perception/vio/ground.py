@@ -53,9 +53,11 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
     n = len(chosen)
     seen = Bearings(bearings.b_C[chosen], bearings.shape[chosen])
     linear = residuals(np.broadcast_to(s.R_WB, (n, 3, 3)), np.broadcast_to(s.p_WB, (n, 3)), X, s.R_BC, s.p_BC, seen)
-    columns, variance = np.r_[_CALIBRATION, _POSE], np.diag([filter.sigma**2, filter.sigma**2, sigma**2])
+    columns = np.r_[_CALIBRATION, _POSE]
+    noise = np.ones(n) if bearings.noise is None else bearings.noise[chosen]
     for k, i in enumerate(chosen):
         inverse = np.linalg.inv(np.vstack([linear.J[k, :, POINT], [0.0, 0.0, 1.0]]))
+        variance = np.diag([(noise[k] * filter.sigma) ** 2, (noise[k] * filter.sigma) ** 2, sigma**2])
         J = -inverse[:, :2] @ linear.J[k, :, : POINT.start]
         cross = J @ s.P[columns]
         own = J @ s.P[np.ix_(columns, columns)] @ J.T + inverse @ variance @ inverse.T

@@ -115,6 +115,7 @@ class Msckf:
         m, clone = len(s.landmarks), s.clones[-1]
         tracks = [self.tracks.by_id[i] for i in s.landmarks]
         seen = Bearings(np.array([t.b_C[-1] for t in tracks]), np.array([t.shape[-1] for t in tracks]))
+        noise = np.array([t.noise[-1] for t in tracks])[:, None]
         now = self._residuals(clone.R_WB, clone.p_WB, np.array([k.X_W for k in s.landmarks.values()]), seen)
         k = s.clone_at(len(s.clones) - 1)
         columns = np.concatenate([_CALIBRATION, np.arange(k, k + 6), np.arange(s.landmark_start, s.size)])
@@ -123,7 +124,7 @@ class Msckf:
         for i in range(m):
             k = POINT.start + 3 * i
             H[i, :, k : k + 3] = now.J[i, :, POINT]
-        r = now.r
+        H, r = H / noise[:, :, None], now.r / noise
         self._let_slide(tracks, now.distance)
         P = s.P[np.ix_(columns, columns)]
         HP = (H.reshape(2 * m, -1) @ P).reshape(H.shape)
@@ -244,13 +245,14 @@ class Msckf:
         js = np.array([place[track.frames[k]] for _, track, ks in chosen for k in ks])
         bearings = Bearings(np.array([track.b_C[k] for _, track, ks in chosen for k in ks]),
                             np.array([track.shape[k] for _, track, ks in chosen for k in ks]))
+        noise = np.array([track.noise[k] for _, track, ks in chosen for k in ks])
         centres = (p + R @ s.p_BC)[js]
         rays = np.einsum("nij,nj->ni", (R @ s.R_BC)[js], bearings.b_C)
         X, parts, begin, least = np.zeros((len(js), 3)), [], 0, np.radians(limits.least_parallax_deg)
         for number, _, ks in chosen:
             rows = slice(begin, begin + len(ks))
             begin = rows.stop
-            X_W = triangulate(centres[rows], rays[rows], least, self.sliding.spread(bearings.b_C[rows]))
+            X_W = triangulate(centres[rows], rays[rows], least, self.sliding.spread(bearings.b_C[rows], noise[rows]))
             if X_W is None:
                 report.refused += int(rays[rows.start] @ rays[rows.stop - 1] < np.cos(least))
             else:
@@ -267,7 +269,7 @@ class Msckf:
             A[:, :, :n] = now.J[rows, :, :n]
             A[:, :, n:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = now.J[rows, :, n : POINT.start]
             A[:, :, -4:-1], A[:, :, -1] = now.J[rows, :, POINT], now.r[rows]
-            A = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1)).reshape(2 * m, -1)
+            A = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
             out[number] = X_W, A[:, :-4], A[:, -4:-1], A[:, -1]
         return out
 

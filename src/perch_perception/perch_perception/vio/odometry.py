@@ -18,7 +18,7 @@ from perch_perception.ukf.stillness import energy, still, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
-from perch_perception.vio.bearing import POINT, observe, residuals
+from perch_perception.vio.bearing import POINT, Bearings, observe, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.msckf import FrameReport, Msckf
 from perch_perception.vio.preintegration import preintegrate
@@ -206,7 +206,7 @@ class VisualInertialOdometry:
             self._stand_on(features)
         self._resting = False
         self.filter.propagate(self._imu.run(self.filter.state.stamp, exposed), exposed)
-        report = self.filter.add_frame(self._frame, features.ids, observe(self.mount.camera, features.pixels))
+        report = self.filter.add_frame(self._frame, features.ids, self._observe(features))
         if report.used:
             self._sight, self._told = exposed, False
         return self._judge(exposed, features, report)
@@ -274,8 +274,14 @@ class VisualInertialOdometry:
         known = np.isin(view.ids, features.ids)
         known[len(view.ids) - view.new:] = False
         s = self.config.start
-        ground.take_in(self.filter, view.ids[known], observe(self.mount.camera, view.pixels[known]), self._floor,
+        seen = self._observe(view)
+        ground.take_in(self.filter, view.ids[known], Bearings(seen.b_C[known], seen.shape[known], seen.noise[known]), self._floor,
                        s.ground_sigma, s.ground_least_height)
+
+    def _observe(self, features: Features) -> Bearings:
+        """Bearings; 1 sigma of each is the declared `pixel_noise` or, where that is larger, what the image's noise makes of its patch."""
+        return replace(observe(self.mount.camera, features.pixels),
+                       noise=np.maximum(features.sigma / self.config.filter.pixel_noise, 1.0))
 
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
         """Whether the filter still sees, or has to start again."""

@@ -49,21 +49,22 @@ class Sliding:
         q = self.steps(b_before, b_now, d_before, d_now) * d_now**2
         return q[:, None, None] * (np.eye(3) - u[:, :, None] * u[:, None, :])
 
-    def whitened(self, steps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def whitened(self, steps: np.ndarray, rows: np.ndarray, noise: np.ndarray | float = 1.0) -> np.ndarray:
         """Rows of one track's observations, transformed so that their noise is white with the variance sigma^2.
 
         Args:
             steps: variance of the walk between neighbouring observations, see `steps` [rad^2], shape (m - 1,).
             rows: one row for each observation, shape (m, k).
+            noise: white noise of each observation, 1 sigma over `pixel_noise`, shape (m,).
         """
         to_end = np.zeros(len(rows))
         to_end[-2::-1] = np.cumsum(steps[::-1] / self._sigma**2)
         covariance = np.minimum(to_end[:, None], to_end)
-        covariance.flat[:: len(rows) + 1] += 1.0
+        covariance.flat[:: len(rows) + 1] += noise**2
         factor, _ = lapack.dpotrf(covariance, lower=1, clean=0)
         return lapack.dtrtrs(factor, rows, lower=1)[0]
 
-    def spread(self, b_C: np.ndarray) -> float:
-        """1 sigma of a track's bearings (m, 3) about one point [rad], as far as the bearings tell."""
+    def spread(self, b_C: np.ndarray, noise: np.ndarray) -> float:
+        """1 sigma of a track's bearings (m, 3) with a `noise` (m,) about one point [rad], as far as the bearings tell."""
         chords = np.linalg.norm(np.diff(b_C, axis=0), axis=1)
-        return float(np.sqrt(self._sigma**2 + self._turn * chords.sum()))
+        return float(np.sqrt(self._sigma**2 * np.mean(noise**2) + self._turn * chords.sum()))

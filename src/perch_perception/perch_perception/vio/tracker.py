@@ -30,6 +30,7 @@ _HALVING = 1.0  # sigma of the smoothing in cv2.pyrDown [px]
 # strength (least eigenvalue over 3 x 3 px, as OpenCV scales it) of the corners that unit white noise makes in an image of half
 # the size, smoothed with sigma = 1.5 px before: measured on 640 x 480 images of 5 grey levels of noise
 _NOISE_CORNER = 2.3e-6
+_KLT_EIGENVALUE = 1024.0  # least eigenvalue of the mean of g g^T over a patch, in what OpenCV's KLT gives for it
 _FLAT_STEP, _MID_GREY = 8, 128.0  # the average is taken in an image of 1 / step the size
 
 
@@ -55,11 +56,13 @@ class Features:
         ids: numbers, shape (n,); the last `new` of them are new in this frame.
         pixels: shape (n, 2).
         new: how many are new.
+        sigma: of each patch's fit by the image's noise [px], shape (n,).
     """
 
     ids: np.ndarray
     pixels: np.ndarray
     new: int
+    sigma: np.ndarray
 
 
 class Tracker:
@@ -104,7 +107,7 @@ class Tracker:
         if len(self._pixels) < self.config.features * self.config.refill:
             new = self._refill(image)
         self._choose_reference(image)
-        self.latest = Features(self._ids, self._pixels.astype(float), new)
+        self.latest = Features(self._ids, self._pixels.astype(float), new, self._fit_sigma(image))
         return self.latest
 
     def _follow(self, image: np.ndarray, R_now_before: np.ndarray, slack: float) -> None:
@@ -185,6 +188,21 @@ class Tracker:
         out = np.zeros(len(good), bool)
         out[index[best]] = True
         return out
+
+    def _fit_sigma(self, image: np.ndarray) -> np.ndarray:
+        """1 sigma of the least squares fit of each feature's patch, along the axis in which it is known worst [px], shape (n,).
+
+        sigma^2 = sigma_n^2 / lambda_min(sum g g^T), with sigma_n the image's noise [grey levels] and g the gradients over the
+        patch [grey levels/px] (Foerstner and Guelch 1987). Where noise is all that is in the image its own gradients bound it.
+        """
+        if not len(self._pixels):
+            return np.zeros(0)
+        # KLT has the matrix; from an image to itself there is nothing to search for
+        _, _, least = cv2.calcOpticalFlowPyrLK(
+            image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(self.config.window,) * 2, maxLevel=0,
+            flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
+        information = _KLT_EIGENVALUE * self.config.window**2 * least.ravel().astype(float)
+        return _noise(image) / np.sqrt(np.maximum(information, np.finfo(np.float32).tiny))
 
     def _refill(self, image: np.ndarray) -> int:
         """Detect corners away from the features there are; those that noise alone would make are not taken.

@@ -16,10 +16,12 @@ class Track:
     frames: list[int] = field(default_factory=list)
     b_C: list[np.ndarray] = field(default_factory=list)
     shape: list[np.ndarray] = field(default_factory=list)
+    noise: list[float] = field(default_factory=list)
 
     def bearings(self, places: list[int]) -> Bearings:
         """The bearings at given places of the lists."""
-        return Bearings(np.array([self.b_C[k] for k in places]), np.array([self.shape[k] for k in places]))
+        return Bearings(np.array([self.b_C[k] for k in places]), np.array([self.shape[k] for k in places]),
+                        np.array([self.noise[k] for k in places]))
 
 
 @dataclass
@@ -30,11 +32,13 @@ class Tracks:
 
     def observe(self, frame: int, ids: np.ndarray, bearings: Bearings) -> None:
         """Add the bearings of a frame, ids (n,)."""
-        for i, b, d in zip(ids.tolist(), bearings.b_C, bearings.shape):
+        noise = np.ones(len(ids)) if bearings.noise is None else bearings.noise
+        for i, b, d, sigma in zip(ids.tolist(), bearings.b_C, bearings.shape, noise.tolist()):
             track = self.by_id.setdefault(i, Track())
             track.frames.append(frame)
             track.b_C.append(b)
             track.shape.append(d)
+            track.noise.append(sigma)
 
     def take_ended(self, ids: np.ndarray) -> dict[int, Track]:
         """Remove and return the tracks that are not among the present ids."""
@@ -51,4 +55,4 @@ class Tracks:
             while k < len(track.frames) and track.frames[k] < frame:
                 k += 1
             if k:
-                del track.frames[:k], track.b_C[:k], track.shape[:k]
+                del track.frames[:k], track.b_C[:k], track.shape[:k], track.noise[:k]
