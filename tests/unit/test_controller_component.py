@@ -311,7 +311,7 @@ def too_long(flight):
 @pytest.mark.parametrize("make, changes, word", [
     (None, {"contact_time": NAN}, "contact_time"), (None, {"contact_time": -1.0}, "contact_time"), (None, {"recovery_start": NAN}, "recovery_start"),
     (None, {"recovery_start": 1e9}, "recovery_start"), (None, {"at_end": 9}, "at_end: 9"), (None, {"id": -3}, "id: -3"),
-    (many_coefficients, {}, "degree: 1099"), (with_rates, {}, "w: 1e+09"), (far_away, {}, "position"), (in_no_time, {}, "durations"),
+    (many_coefficients, {}, "degree: 1099"), (with_rates, {}, "w: 1e+09"), (far_away, {}, "coefficients: 1e+300"), (in_no_time, {}, "durations"),
     (too_long, {}, "duration"), (lambda f: samples(f, q=np.tile([0.0, 0.0, 0.0, 0.9], (40, 1))), {}, "norm 0.9"),
     (lambda f: samples(f, rotor_thrust=np.full((40, 4), 1e6)), {}, "rotor_thrust"),
     (lambda f: samples(f, times=np.linspace(-1.0, 1.0, 40)), {}, "times: -1"),
