@@ -10,12 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from oracles.ray_caster import cast
-from perch_core.camera import CameraMount, EquidistantCamera, looking_along
+from perch_core.camera import CameraMount, EquidistantCamera
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
 from perch_sim.rendering import Box, Renderer, Scene
 from perch_sim.rendering.sensor import PSF_SIGMA
+from unit.camera_mounts import looking_along
 
 CAMERA = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.003908, -0.009574, 0.010173, -0.003329))
 FRONT = CameraMount("front", CAMERA, [0.05, 0, 0], looking_along([1, 0, 0], [0, 0, 1]))

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera, looking_along
+from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
 from perch_core.catenary import Catenary
 from perch_core.surface import PerchSurface
 from perch_sim.rendering import CableCurve, Renderer, Scene, build_scene
 from perch_sim.scenario import Cable, Scenario, World
+from unit.camera_mounts import looking_along
 
 FISHEYE = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.003908, -0.009574, 0.010173, -0.003329))
 PINHOLE = PinholeCamera(640, 480, 385.0, 385.0, 320.0, 240.0)

@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera, looking_along
+from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
 from perch_core.tag_board import load_board
 from perch_sim.rendering import textures
 from perch_sim.rendering.grid import build_grid, sample_weights
 from perch_sim.rendering.renderer import spread
 from perch_sim.rendering.sensor import BASE_GAIN, READ_NOISE, SHOT_NOISE, Sensor, control_exposure
+from unit.camera_mounts import looking_along
 
 CAMERA = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.003908, -0.009574, 0.010173, -0.003329))
 MOUNT = CameraMount("front", CAMERA, np.zeros(3), looking_along([1, 0, 0], [0, 0, 1]))

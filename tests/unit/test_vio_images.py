@@ -257,7 +257,7 @@ def test_imu_faults_leave_a_finite_estimate_with_a_larger_covariance(fault, leng
 
 def test_a_lost_filter_says_so_and_starts_again_in_motion():
     """Blind for so long that velocity is unknown (the bound is lowered for the test): lost, then found by motion."""
-    config = flights.with_settings(VioConfig(), loss={"restart_velocity": 0.03})
+    config = VioConfig(loss=replace(VioConfig().loss, restart_velocity=0.03))
     cover = (1.9, 2.6)
     steps = flights.run_vio(until(4.4), config, tamper=lambda t, stamp, image: [
         (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)])

@@ -374,12 +374,3 @@ class CameraMount:
     def pose(self, p_WB: Array, R_WB: Array) -> tuple[Array, np.ndarray]:
         """Pose of the camera in W: p_WC (..., 3) [m] and R_WC (..., 3, 3), from the body's."""
         return p_WB + (R_WB @ self.p_BC), R_WB @ self.R_BC
-
-
-def looking_along(forward_B: Array, up_B: Array) -> Array:
-    """R_BC of a camera that looks along `forward_B` with the image's upper side towards `up_B`, shape (3, 3)."""
-    z = np.asarray(forward_B, dtype=float) / np.linalg.norm(forward_B)
-    y = -np.asarray(up_B, dtype=float)
-    y = y - (y @ z) * z
-    y /= np.linalg.norm(y)
-    return np.stack([np.cross(y, z), y, z], axis=1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -307,8 +307,3 @@ def run_estimator(flight: Flight, steps: list[VioStep], config: UkfConfig = UkfC
 
 def _state(e: VioPoseEstimate) -> InertialState:
     return InertialState(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, e.gyro_bias, e.accel_bias, e.P)
-
-
-def with_settings(config: VioConfig, **changes: dict) -> VioConfig:
-    """A VIO configuration with changed parts: `with_settings(VioConfig(), filter={"landmarks": 10})`."""
-    return replace(config, **{part: replace(getattr(config, part), **values) for part, values in changes.items()})

@@ -133,9 +133,3 @@ class ImuBuffer:
         else:
             rows[[0, -1], 7:] *= (whole / rows[[0, -1], 0])[:, None]
         return rows
-
-    def recent(self, duration: float) -> np.ndarray:
-        """Steps of the last `duration` seconds, shape (m, 9)."""
-        if self.last is None:
-            return np.empty((0, 9))
-        return self.run(max(self.oldest, self.last.stamp - round(duration * 1e9)), self.last.stamp)
