@@ -22,7 +22,7 @@ LATE = 0.25       # of camera frames behind IMU samples of the same stamp [s]
 CAMERA = 0.03     # share by which focal lengths may differ from the file's
 EXTRINSICS = (0.02, 3.0)  # what a transform may differ from the file [m, deg]
 SHAKE = 5.0       # what the rotation from camera to IMU may differ from the file [deg]
-TURNED = 0.3      # root mean square of the rates about the second axis that shaking needs [rad/s]
+TURNED = 0.3      # root mean square of the rates about each axis that shaking needs [rad/s]
 ANSWER = 2.0      # from an order to its effect, heard by a program that shares the machine with others [s]
 STOPPED = 1.0     # from the last command to the motors' stop [s]
 RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
@@ -146,18 +146,19 @@ def frames(odometry: OdometryState | None, imu: ImuSample | None) -> list[Check]
 
 
 def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rotation from camera to body that best turns the camera's rates into the gyroscope's (Wahba's problem).
+    """Orthogonal matrix that best turns the camera's rates into the gyroscope's (Procrustes' problem).
+
+    A rotation where both are right-handed; of determinant -1 where one axis has the wrong sign.
 
     Args:
         turned_B: mean rates of the gyroscope between frames in B [rad/s], (n, 3).
         turned_C: of the camera in C [rad/s], (n, 3).
 
     Returns:
-        R_BC, (3, 3), and the root mean square of the rates about the second axis that was turned about [rad/s].
+        R_BC, (3, 3), and the root mean square of the rates about the axis that was turned about least [rad/s].
     """
     U, _, Vt = np.linalg.svd(turned_B.T @ turned_C)
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return R, float(np.linalg.svd(turned_B, compute_uv=False)[1] / np.sqrt(max(len(turned_B), 1)))
+    return U @ Vt, float(np.linalg.svd(turned_B, compute_uv=False)[2] / np.sqrt(max(len(turned_B), 1)))
 
 
 def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
@@ -166,9 +167,12 @@ def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehic
         "turn the vehicle to and fro about all axes, by 20 deg, over something with texture (--shake)")
     if len(turned_B) < 20:
         return Check(title, Verdict.OPEN, f"{len(turned_B)} pairs of frames", advice)
-    R, second = camera_rotation(turned_B, turned_C)
-    if second < TURNED:
-        return Check(title, Verdict.OPEN, f"{second:.2f} rad/s about the second axis, {TURNED:g} are needed", advice)
+    R, least = camera_rotation(turned_B, turned_C)
+    if least < TURNED:
+        return Check(title, Verdict.OPEN, f"{least:.2f} rad/s about the axis turned about least, {TURNED:g} are needed", advice)
+    if np.linalg.det(R) < 0.0:
+        return Check(title, Verdict.FAILED, f"left-handed: R_BC would be {np.round(R, 2).tolist()}",
+                     "the sign of one axis of the gyroscope is wrong (or of all three): correct it in its driver")
     off = degrees(float(np.linalg.norm(so3.log(vehicle.mounts[name].R_BC.T @ R))))
     return judged(title, off < SHAKE, f"{off:.1f} deg from the file",
                   f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
