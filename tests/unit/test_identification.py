@@ -12,7 +12,7 @@ from perch_core.vehicle import Battery, load_vehicle
 from perch_eval import loop_plots
 from perch_eval.flight import Flight
 from perch_eval.identification import command, page
-from perch_eval.identification.fit import Found, battery, identify
+from perch_eval.identification.fit import Found, battery, identify, rates, thrust
 from perch_eval.identification.record import Record, record_of
 
 VEHICLE = load_vehicle("snapdragon_rates")
@@ -66,6 +66,17 @@ def test_what_a_record_was_made_with_is_found(found):
         assert abs(one.value - value) < max(4.0 * one.sigma, 0.01 * value), str(one)
         if not key.startswith("drag"):
             assert not one.refused and one.sigma < 0.1 * value, str(one)
+
+
+def test_what_the_delay_leaves_open_is_open_for_the_lags():
+    """What an answer is later by is told, and not how it is shared between the two."""
+    one = record()
+    (early, _), _ = rates(one, 0, 0.010)
+    (late, _), _ = rates(one, 0, 0.014)
+    assert early.value - late.value == pytest.approx(0.004, rel=0.2)
+    (open_, _), _ = rates(one, 0, 0.012, 0.002)
+    assert open_.sigma > 0.002 > late.sigma
+    assert thrust(one, VEHICLE, 0.012, 0.002)[0][0].sigma > 0.002 > thrust(one, VEHICLE, 0.012)[0][0].sigma
 
 
 def test_a_hover_tells_nothing_and_says_so():

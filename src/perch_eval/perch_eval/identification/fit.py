@@ -101,8 +101,15 @@ def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: fl
     return Found(key, float(value), float(sigma), unit, why)
 
 
-def rates(record: Record, axis: int, delay: float | None = None) -> tuple[list[Found], Answer]:
-    """Lag and gain of one axis of the rate loop with a delay, or with the delay that fits it best, which is then the third."""
+def rates(record: Record, axis: int, delay: float | None = None, spread: float = 0.0) -> tuple[list[Found], Answer]:
+    """Lag and gain of one axis of the rate loop with a delay, or with the delay that fits it best, which is then the third.
+
+    Args:
+        record: the flight.
+        axis: x, y or z.
+        delay, spread: with its standard deviation [s]. Of commands that are slow against the lag an answer tells the sum of both, so
+            that the delay's uncertainty is the lag's, too.
+    """
     h, w, free = record.period, record.gyro[:, axis], delay is None
 
     def model(x: np.ndarray, samples: slice) -> np.ndarray:
@@ -118,13 +125,13 @@ def rates(record: Record, axis: int, delay: float | None = None) -> tuple[list[F
         why = f"commands of {size:.2g} rad/s (1 sigma) are too small; {LEAST_RATE:g} are needed"
     elif answer.explained < EXPLAINED:
         why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
-    found = [_judged(f"actuation.rate_lag[{axis}]", x[0], sigma[0], "s", why),
+    found = [_judged(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", why),
              _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
     return found + ([_judged("actuation.delay", max(x[3], 0.0), sigma[3], "s", why, DELAY_CERTAIN)] if free else []), answer
 
 
-def thrust(record: Record, vehicle: Vehicle, delay: float) -> tuple[list[Found], Answer]:
-    """Lag and gain of the thrust, and the drag along z; of the rotors where their speeds are commanded."""
+def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) -> tuple[list[Found], Answer]:
+    """Lag and gain of the thrust, and the drag along z; of the rotors where their speeds are commanded. For `spread` see `rates`."""
     h, f, rotors = record.period, record.accel[:, 2], record.rotor_speeds is not None
     keys = ("motor_time_constant", "thrust_coefficient") if rotors else ("actuation.thrust_lag", "actuation.thrust_gain")
     unit = vehicle.thrust_coefficient / vehicle.mass if rotors else 1.0
@@ -144,7 +151,7 @@ def thrust(record: Record, vehicle: Vehicle, delay: float) -> tuple[list[Found],
         why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
     scale = vehicle.thrust_coefficient if rotors else 1.0
     certain = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's own offset looks like thrust
-    return [_judged(keys[0], x[0], sigma[0], "s", why),
+    return [_judged(keys[0], x[0], float(np.hypot(sigma[0], spread)), "s", why),
             _judged(keys[1], scale * x[1], scale * certain, "N s^2/rad^2" if rotors else "", why),
             _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], answer
 
@@ -197,18 +204,19 @@ def identify(record: Record, vehicle: Vehicle) -> tuple[list[Found], list[Answer
     """Everything that the record can tell of a vehicle, and the answers for the page."""
     found: list[Found] = []
     answers: list[Answer] = []
-    delay = vehicle.actuation.delay
+    delay, spread = vehicle.actuation.delay, 0.0
     if record.rates is not None:
         # One delay for all: that of roll and pitch, which turn the thrust; what yaw is later counts as its lag.
         tilt = [part[2] for part, _ in (rates(record, axis) for axis in (0, 1)) if not part[2].refused]
         if tilt:
             delay = float(np.mean([one.value for one in tilt]))
-        axes = [rates(record, axis, delay) for axis in range(3)]
+            spread = float(np.hypot(np.std([one.value for one in tilt]), max(one.sigma for one in tilt)))
+        axes = [rates(record, axis, delay, spread) for axis in range(3)]
         answers += [answer for _, answer in axes]
         found += [one for part, _ in axes for one in part]
-        sigma = float(np.hypot(np.std([one.value for one in tilt]), max(one.sigma for one in tilt))) if tilt else inf
-        found.append(_judged("actuation.delay", delay, sigma, "s", "" if tilt else "neither roll nor pitch tells it", DELAY_CERTAIN))
+        found.append(_judged("actuation.delay", delay, spread if tilt else inf, "s", "" if tilt else "neither roll nor pitch tells it",
+                             DELAY_CERTAIN))
     if record.thrust is not None or record.rotor_speeds is not None:
-        part, answer = thrust(record, vehicle, delay)
+        part, answer = thrust(record, vehicle, delay, spread)
         found, answers = [*found, *part[:2], drag(record, vehicle, 0), drag(record, vehicle, 1), part[2]], [*answers, answer]
     return found, answers

@@ -68,8 +68,8 @@ def draw(file: Path, found: Sequence[Found], answers: Sequence[Answer], title: s
         right.set(xlabel=f"model [{answer.unit}]", ylabel=f"measured [{answer.unit}]")
     for axis in axes[-1]:
         axis.axis("off")
-    axes[-1][0].text(0.0, 1.0, "\n".join(map(str, found)), family="monospace", fontsize=8, va="top")
+    axes[-1][0].text(0.0, 1.0, "\n".join(map(str, found)), family="monospace", fontsize=8, va="top").set_in_layout(False)  # over both columns
     figure.suptitle(title)
-    figure.tight_layout()
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.99))
     figure.savefig(file, dpi=95)
     plt.close(figure)
