@@ -1,7 +1,7 @@
 """Bars of the powerline planner: solve times, share of random starts solved, limits between the nodes, published durations.
 
-    python3 scripts/bench.py powerline            1,000 random starts, some five minutes
-    python3 scripts/bench.py powerline --quick    50 random starts
+    python3 scripts/bench.py powerline            1,000 starts of the five cases and 2,000 anywhere, some ten minutes
+    python3 scripts/bench.py powerline --quick    50 and 100
 
 Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
 """
@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import os
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 from harness import Figure, figure
 
-from perch_core import compiled
+from perch_core import compiled, so3
 from perch_core.errors import PlanningRefusal
+from perch_core.rotor_model import P, Q, V
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.progress import Progress
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
-from perch_planner.powerline.request import PowerlineRequest
+from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.solving import Solver
 from perch_planner.powerline.starts import random_start
 from perch_planner.powerline.visibility import visibility
@@ -47,7 +49,12 @@ def figures(quick: bool) -> list[Figure]:
             figure("limits violated at 1 ms", "-", [sum(plan["violated"] for plan in plans)], bar=0, comparison="max ==")]
     out += [figure(name, {"end_tilt": "deg", "end_speed": "m/s"}.get(name, "m"), [plan[name] for plan in plans], bar=END_BARS[name],
                    comparison="max <=") for name in END_BARS]
-    for answer in answers:
+    anywhere = _anywhere(vehicle, 100 if quick else 2000)
+    plans = [answer for answer in anywhere if not answer["refusal"]]
+    out += [figure("starts anywhere, 0-180 deg, solved", "%", [100.0 * len(plans) / len(anywhere)], bar=99.5, comparison="min >="),
+            figure("starts anywhere, limits violated", "-", [sum(plan["violated"] for plan in plans)], bar=0, comparison="max =="),
+            figure("starts anywhere, perch and recovery", "ms", [plan["perch_ms"] + plan["recovery_ms"] for plan in plans])]
+    for answer in answers + anywhere:
         if answer["refusal"]:
             print(f"refused: {answer['case']}: {answer['refusal']}")
     return out + _published() + _perception()
@@ -63,6 +70,26 @@ def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
         for _ in range(starts):
             found.append({"case": case, **_answer(planner, random_start(nominal, setup, vehicle, rng))})
             progress.add(not found[-1]["refusal"])
+    progress.close()
+    return found
+
+
+def _anywhere(vehicle: Vehicle, starts: int) -> list[dict]:
+    """What the planner says to perches at 0 to 180 deg on any of three wires, from anywhere 2 to 5 m before them, with and without perception."""
+    setup, found, planner = problem.load("powerline_line_80"), [], PowerlinePlanner(vehicle)
+    nominal, progress = setup.request(vehicle), Progress(starts, what="starts")
+    for number in range(starts):
+        rng = np.random.default_rng([2027, number])
+        line, start = nominal.lines[rng.integers(len(nominal.lines))], nominal.start.copy()
+        start[P] = line.centre + [-rng.uniform(2.0, 5.0), rng.uniform(-1.5, 1.5), 0.0]
+        start[2] = rng.uniform(2.0, 6.0)
+        start[Q] = so3.quat_exp(np.array([0.0, 0.0, rng.uniform(-0.8, 0.8)]))
+        start[V] = rng.uniform(-0.5, 0.5, 3)
+        point, pitch = line.centre + rng.uniform(-0.5, 0.5) * line.direction, rng.uniform(0.0, np.pi)
+        perch = PerchPose.on_line(line, point, pitch, vehicle.wire_offset, start[P])
+        request = replace(nominal, start=start, target_line=line.id, perch=perch, perception=bool(rng.integers(2)), deadline=10.0)
+        found.append({"case": f"anywhere {number}, line {line.id}, {np.degrees(pitch):.0f} deg", **_answer(planner, request)})
+        progress.add(not found[-1]["refusal"])
     progress.close()
     return found
 

@@ -42,6 +42,20 @@ def planned(planner: PowerlinePlanner) -> PlannedProblem:
     return PlannedProblem(SETUP, VEHICLE, REQUEST, planner, planner.plan(REQUEST))
 
 
+@pytest.mark.parametrize("why, target, pitch_deg, along, position, yaw, velocity, perception", [
+    ("between two nodes the body cuts a wire that it passes", 2, 138.1, -0.27, (2.28, 1.48, 5.57), -0.2, (-0.04, 0.03, 0.15), True),
+    ("the perch pose is nearer to another wire than the margin", 2, 150.76, -0.17, (1.57, -1.11, 5.38), 0.56, (0.46, 0.34, 0.01), False),
+    ("with 30 intervals the end is missed by millimetres", 0, 172.47, 0.18, (0.89, 0.47, 2.29), 0.7, (0.35, 0.46, -0.06), True)])
+def test_a_plan_is_found_where(planner: PowerlinePlanner, why: str, target: int, pitch_deg: float, along: float,
+                               position: tuple, yaw: float, velocity: tuple, perception: bool) -> None:
+    start = REQUEST.start.copy()
+    start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
+    line = SETUP.segments()[target]
+    perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
+    plan = planner.plan(replace(REQUEST, start=start, target_line=target, perch=perch, perception=perception, deadline=10.0))
+    assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), why
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.8, 1.0])
 def test_an_abort_at_any_time_finds_a_recovery(planner: PowerlinePlanner, planned: PlannedProblem, share: float) -> None:
     perch = planned.plan.perch

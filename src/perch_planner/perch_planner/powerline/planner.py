@@ -11,7 +11,6 @@ from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, STATES, THRUST
 from perch_core.so3 import quat_from_matrix
-from perch_core.values import Certificate
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import certify, certify_end
@@ -25,7 +24,7 @@ from perch_planner.powerline.stage_functions import line_parameters
 from perch_planner.powerline.validation import check_request
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
-ATTEMPTS = 6  # solves of one manoeuvre: margins raised, then N, then another guess and solver
+ATTEMPTS = 6  # solves of one manoeuvre: with a larger N, or from another guess and with another solver
 RADIUS_REDUCTION = 0.02  # the paper's, for a recovery that starts at the wire: part of a wire's radius is safety [m]
 
 
@@ -43,9 +42,10 @@ class _Task:
         weights: of the first phase.
         pinned: factors on the end weights in the later phases, shape (6,).
         duration: bounds of T [s].
-        margins: to begin with.
+        margins: by which the nodes keep away from the limits.
         leaving: clearance that the margins grow to within a quarter of the time; 0: they stay as they are.
         approaching: clearance that they have until a tenth of the time before the end; 0: the same.
+        at_end: clearance that the wanted pose leaves, which no margin exceeds there; 1: any.
         radius_reduction: taken off the wires' radius [m].
         guess: attempt and N -> states and inputs.
         accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
@@ -65,6 +65,7 @@ class _Task:
     margins: Margins
     leaving: float
     approaching: float
+    at_end: float
     radius_reduction: float
     guess: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
     accuracy: tuple[float, float, float]
@@ -123,8 +124,9 @@ class PowerlinePlanner:
                                      T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn, aside)
 
         approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
+        at_end = _share(0.5 * self._clearance(np.concatenate([pose.p_WB, pose.q_WB]), request.lines))
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
-                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, approaching, 0.0, first_guess,
+                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, approaching, at_end, 0.0, first_guess,
                      (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver,
                      request.deadline or s.deadline)
 
@@ -141,7 +143,7 @@ class PowerlinePlanner:
         nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
         pinned = np.array([1.0, 1.0, *[s.end_factor] * 4])  # upright and at rest, but not at one place
         return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
-                     False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, reduction, first_guess,
+                     False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, 1.0, reduction, first_guess,
                      (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver, request.deadline or s.deadline)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
@@ -187,7 +189,7 @@ class PowerlinePlanner:
                 height_min=s.height_min + margins.height,
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
                 body_rate=vehicle.body_rate_max - margins.body_rate, states=states, inputs=inputs,
-                clearance=_clearances(margins.clearance, task.leaving, task.approaching, intervals),
+                clearance=_clearances(margins.clearance, task.leaving, task.approaching, task.at_end, intervals),
                 defects=np.zeros((intervals, STATES + 1)))
             structure = Structure(intervals, len(lines), task.perception, solver_name)
             found = self.solver.solve(structure, numbers, numbers.end_weights * task.pinned, phase)
@@ -205,11 +207,11 @@ class PowerlinePlanner:
                 return Manoeuvre(times, flown, dense_rates, bounds, intervals, solver_name, iterations, time, cpu_time,
                                  found.cost)
             worst = broken[0]
-            only_end = all(bound.quantity.startswith("end_") for bound in broken)
-            margins, lines = _tightened(margins, broken), _joined(lines, task.known, flown, max(vehicle.body_radii))
-            if attempt >= 2 and not only_end:
+            lines = _joined(lines, task.known, flown, max(vehicle.body_radii))
+            drifted = phase != "polish" and all(bound.quantity.startswith("end_") for bound in broken)
+            if not drifted:
                 intervals = int(np.ceil(1.5 * intervals))
-            previous, phase = _resampled(found, intervals), "polish" if only_end else "second"
+            previous, phase = _resampled(found, intervals), "polish" if drifted else "second"
         if worst is not None:
             raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {task.name} within the limits: {worst}")
         raise PlanningRefusal("infeasible", task.name, -1.0,
@@ -222,18 +224,11 @@ def _share(clearance: float) -> float:
     return 1.0 if np.isinf(clearance) else ((1 + clearance) ** 2 - 1) / ((1 + clearance) ** 2 + 1)
 
 
-def _clearances(least: float, leaving: float, approaching: float, intervals: int) -> np.ndarray:
+def _clearances(least: float, leaving: float, approaching: float, at_end: float, intervals: int) -> np.ndarray:
     """Clearance margins of all nodes but the first, shape (N,): `least` where a wire is left or met, more in the open."""
     past = np.arange(1, intervals + 1) / intervals
     open_air = np.maximum(np.minimum(4.0 * past, 1.0) * (leaving - least), np.minimum(10.0 * (1.0 - past), 1.0) * (approaching - least))
-    return least + np.maximum(open_air, 0.0)
-
-
-def _tightened(margins: Margins, broken: list[Certificate]) -> Margins:
-    """Margins raised by half more than what is violated."""
-    raised = {bound.quantity: getattr(margins, bound.quantity) + 1.5 * abs(bound.margin) + 1e-3
-              for bound in broken if hasattr(margins, bound.quantity)}
-    return replace(margins, **raised)
+    return np.minimum(least + np.maximum(open_air, 0.0), at_end + 10.0 * (1.0 - past))
 
 
 def _relevant(lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> tuple[Segment, ...]:

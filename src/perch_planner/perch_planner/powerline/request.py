@@ -27,6 +27,15 @@ class PerchPose:
     s3_W: np.ndarray
     v_W: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
+    @property
+    def q_WB(self) -> np.ndarray:
+        """An attitude with that b3, xyzw, shape (4,): the body's ellipsoid is round about it where its x and y radii are equal."""
+        half = E3 + self.s3_W
+        if np.linalg.norm(half) < 1e-6:
+            return np.array([1.0, 0.0, 0.0, 0.0])
+        half /= np.linalg.norm(half)
+        return np.array([*np.cross(E3, half), half[2]])
+
     @classmethod
     def at(cls, p_WB: np.ndarray, q_WB: np.ndarray, v_W: np.ndarray | None = None) -> PerchPose:
         """From a full pose (quaternion xyzw); of its attitude only b3 counts, as the gripper may turn about it."""

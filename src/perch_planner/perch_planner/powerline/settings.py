@@ -54,7 +54,7 @@ class PerceptionWeights:
 class Margins:
     """By how much the nodes keep away from the limits, so that these hold between the nodes too.
 
-    A plan whose 1 ms trajectory violates a limit is solved again with the violated margin raised.
+    A plan whose 1 ms trajectory violates a limit is solved again with a larger N. [P:V-B]
     """
 
     height: float = quantity(0.05, unit="m", low=0.0, high=1.0)

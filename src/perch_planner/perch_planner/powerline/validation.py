@@ -106,9 +106,8 @@ def _perch(request: PowerlineRequest, target: Segment, vehicle: Vehicle, setting
                 f"the perch is {far:.1f} m away; in {settings.duration[1]:g} s no more than {reach:.1f} m can be flown; start nearer")
     grip = perch.p_WB - vehicle.wire_offset * perch.s3_W
     miss = float(target.distance(grip))
-    q_WB = _attitude(perch.s3_W)
     for line in request.lines:
-        clearance = float(scaled_clearance(perch.p_WB[None], q_WB[None], line, vehicle.body_radii)[0])
+        clearance = float(scaled_clearance(perch.p_WB[None], perch.q_WB[None], line, vehicle.body_radii)[0])
         if clearance < 0:
             _refuse("perch_in_collision", "clearance [P:eq14j]", clearance,
                     f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
@@ -122,15 +121,6 @@ def _reach(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSetti
     duration = settings.duration[1]
     most = 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY
     return float(np.linalg.norm(request.start[V])) * duration + 0.5 * most * duration**2
-
-
-def _attitude(s3_W: np.ndarray) -> np.ndarray:
-    """Any attitude with that b3: the body's ellipsoid is round about it for every vehicle whose x and y radii are equal."""
-    half = np.array([0.0, 0.0, 1.0]) + s3_W
-    if np.linalg.norm(half) < 1e-6:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    half /= np.linalg.norm(half)
-    return np.array([*np.cross([0.0, 0.0, 1.0], half), half[2]])
 
 
 def _ahead(request: PowerlineRequest, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
