@@ -28,6 +28,7 @@ from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.identification import command
 from perch_eval.in_process import fly
 from perch_sim.scenario import load_scenario
+from scipy.spatial.transform import Rotation
 
 try:
     firmware.found()
@@ -329,6 +330,34 @@ def test_reasons_not_to_arm_that_can_be_provoked_are_named():
         assert refusals(running, aux4) == ()
         assert refusals(running, aux4, [switched(27)]) == (radio, "box failsafe switch: switch it off")
         assert refusals(running, orders=[(205, b"")], cycles=1)[-1] == "calibrating: keep the vehicle still"
+    finally:
+        running.close()
+
+
+def test_samples_and_attitude_come_in_the_axes_that_are_read():
+    """Angular velocity in FLU; roll, pitch, heading of FRD in NED, against scipy's."""
+    running, parser = started(lambda: Sitl(load_configuration("betaflight"))), msp.Parser()
+    rng, turned = np.random.default_rng(2), Rotation.from_euler("x", 180.0, degrees=True)
+    try:
+        for _ in range(300):
+            running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
+        for _ in range(6):
+            R = Rotation.from_euler("ZYX", rng.uniform((-170, -70, -170), (170, 70, 170)), degrees=True)
+            gyro, force, q = rng.uniform(-2.0, 2.0, 3), R.inv().apply(GRAVITY), R.as_quat()[[3, 0, 1, 2]]
+            got: dict = {}
+            for _ in range(100):
+                running.step(gyro, force, q, (1500, 1500, 1000, 1500))
+            running.send(msp.request(msp.RAW_IMU) + msp.request(msp.ATTITUDE))
+            for _ in range(1000):
+                running.step(gyro, force, q, (1500, 1500, 1000, 1500))
+                got |= {frame.command: frame for frame in parser.feed(running.receive(0.001))}
+                if len(got) == 2:
+                    break
+            felt, rate = msp.inertial(got[msp.RAW_IMU], 256.0)
+            assert rate == pytest.approx(gyro, abs=0.01) and felt @ force > 0.9 * GRAVITY[2]**2  # its accelerometer is filtered
+            roll, pitch, heading = np.degrees(msp.attitude(got[msp.ATTITUDE]))
+            true = (turned * R * turned.inv()).as_euler("ZYX", degrees=True)  # heading, pitch, roll; whole degrees of heading are told
+            assert (roll, pitch) == pytest.approx(true[:0:-1], abs=0.2) and abs((heading - true[0] + 180.0) % 360.0 - 180.0) < 1.1
     finally:
         running.close()
 

@@ -3,7 +3,7 @@
     '$' 'M' direction  size  command  payload  checksum        direction: '<' request, '>' answer, '!' refused
                        u8    u8       size     xor of size, command and payload
 
-Numbers are little-endian. Axes of `RAW_IMU` are FLU, those of `ATTITUDE` FRD.
+Numbers are little-endian. Axes of `RAW_IMU` are FLU; angles of `ATTITUDE` count roll to the right, nose down, and clockwise from north.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def attitude(frame: Frame) -> tuple[float, float, float]:
         MspError: it is too short.
     """
     roll, pitch, heading = _unpacked("<3h", frame)
-    return radians(roll / 10.0), radians(pitch / 10.0), radians(heading)
+    return radians(roll / 10.0), radians(-pitch / 10.0), radians(heading)
 
 
 def inertial(frame: Frame, one_g: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
