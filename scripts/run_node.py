@@ -16,6 +16,7 @@ from perch_setup import ROOT, enter
 EXAMPLES = """examples:
   python3 scripts/run_node.py vehicle
   python3 scripts/run_node.py controller --ros-args -r __ns:=/quad1 -p type:=nmpc
+  python3 scripts/run_node.py betaflight --ros-args -p vehicle:=my_vehicle.yaml -p wire:=/dev/ttyACM0@115200
   python3 scripts/run_node.py estimator --no-config --ros-args --params-file my.yaml
 """
 
@@ -38,12 +39,13 @@ def main() -> int:
     from perch_eval.node_launch import NODES
     from perch_eval.nodes import executable
 
-    if arguments.node not in NODES:
-        print(f"error: node {arguments.node!r} is not one of {', '.join(NODES)}", file=sys.stderr)
+    packages = {name: node.package for name, node in NODES.items()} | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
+    if arguments.node not in packages:
+        print(f"error: node {arguments.node!r} is not one of {', '.join(packages)}", file=sys.stderr)
         return 2
     try:
         open_network(arguments.network)
-        path = executable(NODES[arguments.node].package, arguments.node)
+        path = executable(packages[arguments.node], arguments.node)
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

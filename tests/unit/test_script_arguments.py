@@ -65,3 +65,27 @@ def test_what_can_be_is_accepted(run, name, arguments):
     with pytest.raises(Entered):
         run(name, *arguments)
     assert [path.name for path in Path().iterdir()] == ["file"]  # nothing is left of the trial
+
+
+# -- nodes -----------------------------------------------------------------------------------------------------------
+
+class Became(Exception):
+    """The process would have become this program."""
+
+
+@pytest.mark.parametrize("node, package", [("betaflight", "perch_autopilot"), ("mavlink", "perch_autopilot"), ("controller", "perch_control")])
+def test_every_node_can_be_started_without_the_ros2_command(node, package, monkeypatch):
+    def become(path: str, words: list[str]) -> None:
+        raise Became(path, words)
+
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    spec = importlib.util.spec_from_file_location("script_run_node", SCRIPTS / "run_node.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    monkeypatch.setattr(script, "enter", lambda *_: None)
+    monkeypatch.setattr(script.os, "execv", become)
+    monkeypatch.setattr(sys, "argv", ["run_node.py", node, "--ros-args", "-p", "wire:=/dev/ttyACM0"])
+    with pytest.raises(Became) as started:
+        script.main()
+    path, words = started.value.args
+    assert Path(path).name == node and Path(path).parent.name == package and words[-1] == "wire:=/dev/ttyACM0"
