@@ -246,6 +246,16 @@ def test_of_samples_that_come_at_once_the_newest_counts(flown_on):
     assert sample.f_B[2] == pytest.approx(9.81)
 
 
+def test_torn_frames_in_flight_are_one_line_and_the_whole_ones_count(flown_on):
+    node, samples, whole = flown_on(16.0), [], answer(msp.RAW_IMU, bytes(18))
+    node.imu.receivers.append(samples.append)
+    assert polled(node, 1.0, 100) == []
+    node._link._said += whole[:-1] + bytes((whole[-1] ^ 0x55,))
+    assert polled(node, 2.0, 150) == ["/dev/ttyACM0: torn frames come from the autopilot: check the wire and its baud rate"]
+    assert len(samples) > 240
+    assert polled(node, 3.5, 150) == []
+
+
 def test_an_autopilot_that_vanishes_is_one_line(flown_on, monkeypatch):
     node = flown_on(16.0)
     assert polled(node, 1.0, 100) == []

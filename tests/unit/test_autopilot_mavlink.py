@@ -255,3 +255,4 @@ def test_any_bytes_leave_the_node_ready(autopilot):
     assert autopilot.node.offboard.armed
     autopilot.heard(1.1)
     assert autopilot.got["diagnostics"][-1].values["torn_frames"] > 0
+    assert "torn frames come from the autopilot: check the wire and its baud rate" in {line.text for line in autopilot.got["log"]}

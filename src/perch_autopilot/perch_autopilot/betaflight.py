@@ -69,7 +69,7 @@ class Betaflight(Component[BetaflightParameters]):
         self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
         self._wanted = False
         self._now: int | None = None            # of the last poll [ns]
-        self._answered = self._diagnosed = 0
+        self._answered = self._diagnosed = self._torn = 0
 
     def _carrying(self) -> tuple[int, int]:
         """Throttles of hover and descent [us]."""
@@ -172,6 +172,9 @@ class Betaflight(Component[BetaflightParameters]):
     def _diagnose(self, now: int) -> None:
         if silent := now - self._answered > NANOSECONDS:
             self.log(LogLine("error", f"{self.config.wire}: the autopilot is silent: check its power and its wire", 5.0))
+        if self._parser.torn > self._torn:
+            self._torn = self._parser.torn
+            self.warn(f"{self.config.wire}: torn frames come from the autopilot: check the wire and its baud rate", every=5.0)
         values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn,
                   "skipped_bytes": self._parser.skipped}
         if self._status is not None:

@@ -95,7 +95,7 @@ class Mavlink(Component[MavlinkParameters]):
         self.offboard, self._clock = Offboard(), ClockOffset()
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
-        self._begun = self._came = self._second = self._torn = 0
+        self._begun = self._came = self._second = self._torn = self._named = 0
         self._sampled: int | None = None     # stamp of its last sample, by its own clock [ns]
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
@@ -207,6 +207,9 @@ class Mavlink(Component[MavlinkParameters]):
     def _diagnose(self, now: int) -> None:
         if (trouble := self._trouble(now)) and now - self._begun >= SILENT * NANOSECONDS:
             self.log(LogLine("error", trouble, 5.0))
+        elif not trouble and self._torn > self._named:
+            self.warn("torn frames come from the autopilot: check the wire and its baud rate", every=5.0)
+            self._named = self._torn
         self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following, "torn_frames": self._torn,
                                            "clock_offset_s": (self._clock.offset or 0) * 1e-9},
                                      2 if trouble else 0, trouble or "ok"))
