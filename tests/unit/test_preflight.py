@@ -155,6 +155,13 @@ def test_motors_that_go_on_without_commands_fail(motion, verdict):
     assert checks.stopped(10.0, motion).verdict is verdict
 
 
+def test_an_autopilot_may_descend_before_its_motors_stop():
+    graph = Graph()
+    graph.await_end_of_commands = lambda patience: (10.0, 14.2)  # its watchdog's four seconds
+    assert verdicts(command.exercised(graph, True, True))["watchdog"] is FAILED
+    assert verdicts(command.exercised(graph, True, True, checks.DESCENDED))["watchdog"] is PASSED
+
+
 @pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),
                                               (["--vehicle", "rpg_published", "--listen", "0"], "[1, 300] s")])
 def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):

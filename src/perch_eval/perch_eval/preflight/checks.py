@@ -24,7 +24,8 @@ EXTRINSICS = (0.02, 3.0)  # what a transform may differ from the file [m, deg]
 SHAKE = 5.0       # what the rotation from camera to IMU may differ from the file [deg]
 TURNED = 0.3      # root mean square of the rates about each axis that shaking needs [rad/s]
 ANSWER = 2.0      # from an order to its effect, heard by a program that shares the machine with others [s]
-STOPPED = 1.0     # from the last command to the motors' stop [s]
+STOPPED = 1.0     # from the last command to the motors' stop [s] ...
+DESCENDED = 5.0   # ... and where an autopilot levels and descends first [s]
 RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
          "camera_front/camera_info": (5.0, 120.0)}
 """Channel -> lowest and highest rate of its stamps [Hz]; a tenth is forgiven."""

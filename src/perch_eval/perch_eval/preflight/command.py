@@ -65,7 +65,7 @@ def shaken(visitor: Any, vehicle: Vehicle, camera: str) -> Check:
     return checks.shaken(camera, *pairs, vehicle)
 
 
-def exercised(visitor: Any, allowed: bool, watchdog: bool) -> list[Check]:
+def exercised(visitor: Any, allowed: bool, watchdog: bool, bound: float = checks.STOPPED) -> list[Check]:
     """Arming, disarming, killing, and the watchdog, where the propellers are off."""
     takeover = Check("pilot's takeover", Verdict.OPEN, "this program has no switch",
                      "props off, armed: flip the pilot's switch, and see the autopilot's `mode` in /diagnostics")
@@ -83,7 +83,7 @@ def exercised(visitor: Any, allowed: bool, watchdog: bool) -> list[Check]:
         print("armed: stop the controller's process now (within 60 s) ...", flush=True)
         last = visitor.await_end_of_commands(60.0)
         visitor.order(KILL, FAILED)
-    return [*found, checks.stopped(*last), takeover]
+    return [*found, checks.stopped(*last, bound), takeover]
 
 
 def main() -> int:
@@ -107,7 +107,8 @@ def main() -> int:
         visitor.await_first("imu/data_raw", arguments.listen)
         visitor.listen(arguments.listen)
         found = [*listened(visitor, vehicle), shaken(visitor, vehicle, arguments.shake or ""),
-                 *exercised(visitor, arguments.props_off, arguments.watchdog)]
+                 *exercised(visitor, arguments.props_off, arguments.watchdog,
+                            checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
     finally:
         visitor.close()
     print("\n".join(map(str, found)))
