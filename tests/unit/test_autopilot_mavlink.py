@@ -73,7 +73,7 @@ class Autopilot:
     """The other end of the wire."""
 
     def __init__(self) -> None:
-        common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (requirements/autopilot.lock)")
+        common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (scripts/setup.py --extra mavlink)")
         ours, self.wire = socket.socketpair()
         self.mavlink = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self.mavlink.robust_parsing = True

@@ -5,7 +5,7 @@
 | from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT |
 
 Where commands cease, so do set points: the autopilot's own failsafe for their loss then counts. The messages are those of `pymavlink`, an
-optional extra (requirements/autopilot.lock).
+optional extra (`python3 scripts/setup.py --extra mavlink`).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Mavlink(Component[MavlinkParameters]):
         try:
             from pymavlink.dialects.v20 import common
         except ImportError:
-            raise PerchError("the node mavlink needs pymavlink (an optional extra): pip install pymavlink==2.4.50") from None
+            raise PerchError("the node mavlink needs pymavlink (an optional extra): python3 scripts/setup.py --extra mavlink") from None
         vehicle = load_vehicle(config.vehicle)
         self._thrust_max = 4.0 * vehicle.thrust_max / vehicle.mass
         self._wire = Wire(config.wire)
