@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perch_core.camera import (CameraMount, EquidistantCamera, PinholeCamera, RadialTangentialCamera, camera_of, camera_parameters,
-                               looking_along)
+from perch_core.camera import (CameraMount, EquidistantCamera, PinholeCamera, RadialTangentialCamera, camera_of, camera_parameters)
 from perch_core.errors import ConfigError
+from unit.camera_mounts import looking_along
 
 SNAPDRAGON = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.003908, -0.009574, 0.010173, -0.003329))
 PINHOLE = PinholeCamera(640, 480, 615.0, 612.0, 319.0, 241.0)
