@@ -3,11 +3,11 @@ but the vehicle's numbers."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from perch_core.component import Component, Input, Output
 from perch_core.values import NANOSECONDS, ImuSample, MotorCommand, OdometryState, rotated
@@ -34,11 +34,29 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def turn(phi: np.ndarray) -> np.ndarray:
     """Rotation matrix of a small rotation vector (Rodrigues)."""
-    angle = float(np.sqrt(phi @ phi))
-    K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
-    if angle < 1e-9:
-        return np.eye(3) + K
-    return np.eye(3) + np.sin(angle) / angle * K + (1 - np.cos(angle)) / angle**2 * (K @ K)
+    x, y, z = phi.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    a, b = (1.0, 0.5) if angle < 1e-9 else (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2)
+    return np.array([[1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+                     [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+                     [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)]])
+
+
+def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
+    """(x, y, z, w) of a rotation matrix, by its largest component (Shepperd); SciPy's takes longer than a step of the controller."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    k = max(range(4), key=(a, e, i, a + e + i).__getitem__)
+    q = ((1.0 + a - e - i, b + d, c + g, h - f), (b + d, 1.0 + e - a - i, f + h, c - g), (c + g, f + h, 1.0 + i - a - e, d - b),
+         (h - f, c - g, d - b, 1.0 + a + e + i))[k]
+    n = math.hypot(*q)
+    return q[0] / n, q[1] / n, q[2] / n, q[3] / n
+
+
+def rotation_vector(R: np.ndarray) -> np.ndarray:
+    """Of a rotation matrix, [rad], shape (3,)."""
+    x, y, z, w = quaternion(R)
+    sine = math.hypot(x, y, z)
+    return np.array([x, y, z]) * (2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, abs(w)) / sine) * math.copysign(1.0, w)
 
 
 @dataclass
@@ -77,10 +95,11 @@ class Plant:
         share = 1 - np.exp(-dt / (vehicle.motor_time_constant * dist.lag_factor))
         mass = vehicle.mass * dist.mass_factor
         J = np.array(vehicle.inertia) * dist.inertia_factor
+        command, wind, drag, factor = np.asarray(command), np.array(dist.wind), -np.array(vehicle.drag), np.array(dist.rotor_factor)
         for _ in range(substeps):
-            self.speed = self.speed + (np.asarray(command) - self.speed) * share
-            thrust = vehicle.thrust_coefficient * self.speed**2 * np.array(dist.rotor_factor)
-            force = -np.array(vehicle.drag) * (self.R.T @ (self.v - np.array(dist.wind)))
+            self.speed = self.speed + (command - self.speed) * share
+            thrust = vehicle.thrust_coefficient * self.speed**2 * factor
+            force = drag * (self.R.T @ (self.v - wind))
             force[2] += thrust.sum()
             a = self.R @ force / mass + G
             dw = (self._levers @ thrust - cross(self.w, J * self.w)) / J
@@ -88,7 +107,7 @@ class Plant:
                 self.impact_speed = max(self.impact_speed, -self.v[2])
                 a = np.array([0.0, 0.0, -self.v[2] / dt])
                 self.v[:2] = 0
-                tilt = Rotation.from_matrix(self.R).as_rotvec() * (1, 1, 0)
+                tilt = rotation_vector(self.R) * (1, 1, 0)
                 self.w, dw = np.zeros(3), -tilt * 0.2 / dt
             self.acceleration = a
             self.w = self.w + dw * dt
@@ -110,7 +129,7 @@ class Plant:
     @property
     def state(self) -> tuple[float, ...]:
         """p, v, q (xyzw), w as the controller takes them, 13 floats."""
-        return tuple(float(x) for x in (*self.p, *self.v, *Rotation.from_matrix(self.R).as_quat(), *self.w))
+        return (*self.p.tolist(), *self.v.tolist(), *quaternion(self.R), *self.w.tolist())
 
 
 @dataclass(frozen=True)
@@ -174,4 +193,4 @@ class EstimationError:
         R = plant.R @ turn(self._slow[6:] + rng.normal(size=3) * 0.0009 * k)
         return tuple(float(x) for x in (*(plant.p + self._slow[:3] + rng.normal(size=3) * 0.002 * k),
                                         *(plant.v + self._slow[3:6] + rng.normal(size=3) * 0.005 * k),
-                                        *Rotation.from_matrix(R).as_quat(), *(plant.w + rng.normal(size=3) * 0.01 * k)))
+                                        *quaternion(R), *(plant.w + rng.normal(size=3) * 0.01 * k)))
