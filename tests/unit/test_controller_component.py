@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +88,16 @@ class Flight:
         return " | ".join(line.text for line in self.lines)
 
 
+@cache
+def _hover() -> bytes:
+    return pickle.dumps(Flight().take_off())
+
+
+def hovering() -> Flight:
+    """A flight with the usual parameters that has taken off: a copy of its own, of one take-off."""
+    return pickle.loads(_hover())
+
+
 # -- rates -------------------------------------------------------------------------------------------------------------
 
 
@@ -149,7 +161,7 @@ def test_an_imu_that_is_alone_before_the_first_odometry_is_not_answered():
 
 
 def test_where_both_stop_the_watchdog_goes_on_by_the_clock():
-    flight = Flight().take_off()
+    flight = hovering()
     clock, last, count = 77 * NANOSECONDS, flight.motors[-1].stamp, len(flight.motors)
     for _ in range(4):  # 60 ms after the wake that saw the last input
         flight.component.on_watchdog(clock)
@@ -190,7 +202,7 @@ NAN = float("nan")
     {"p_WB": (NAN, 0.0, 0.0)}, {"v_B": (0.0, float("inf"), 0.0)}, {"q_WB": (0.0, 0.0, 0.0, 0.0)}, {"q_WB": (0.0, 0.0, 0.0, 0.4)},
     {"p_WB": (1e300, 0.0, 0.0)}, {"w_B": (0.0, 0.0, 1e200)}])
 def test_odometry_that_cannot_be_used_is_answered_bridged_and_then_descended_without(changes):
-    flight = Flight().take_off()
+    flight = hovering()
     count = len(flight.motors)
     flight.step(0.04, **changes)
     assert len(flight.motors) == count + 20 and flight.state is State.HOVERING and "refused" in flight.said
@@ -200,14 +212,14 @@ def test_odometry_that_cannot_be_used_is_answered_bridged_and_then_descended_wit
 
 @pytest.mark.parametrize("variance, state", [(0.01, State.HOVERING), (1e4, State.LANDING)])
 def test_odometry_that_jumps_and_does_not_know_where_it_is_is_not_followed(variance, state):
-    flight = Flight().take_off()
+    flight = hovering()
     flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=variance * np.eye(6))
     assert flight.state is state and "position jumped" in flight.said
     assert (flight.component.flight.maneuvers.belief[0] > 0.9) == (state is State.HOVERING)
 
 
 def test_odometry_in_another_frame_is_ignored():
-    flight = Flight().take_off()
+    flight = hovering()
     count = len(flight.motors)
     flight.component.on_odometry(flight.odometry(frame="odom"))
     assert len(flight.motors) == count and "'odom'" in flight.said
@@ -215,7 +227,7 @@ def test_odometry_in_another_frame_is_ignored():
 
 @pytest.mark.parametrize("offset", [-2000 * NANOSECONDS, -2 * NANOSECONDS, 2 * NANOSECONDS, 10**18])
 def test_stamps_of_another_time_are_ignored_however_many_come_between(offset):
-    flight = Flight().take_off()
+    flight = hovering()
     for _ in range(300):
         flight.step(0.002)
         for _ in range(3):
@@ -227,7 +239,7 @@ def test_stamps_of_another_time_are_ignored_however_many_come_between(offset):
 
 
 def test_a_little_older_stamps_are_refused_by_the_flight_and_move_nothing():
-    flight = Flight().take_off()
+    flight = hovering()
     for _ in range(50):
         flight.step(0.002)
         flight.component.on_odometry(flight.odometry(stamp=flight.stamp - 300_000_000))
@@ -237,7 +249,7 @@ def test_a_little_older_stamps_are_refused_by_the_flight_and_move_nothing():
 
 @pytest.mark.parametrize("changes", [{"f_B": (NAN, 0.0, 9.8)}, {"w_B": (1e300, 0.0, 0.0)}, {"frame": "camera_down_optical_frame"}])
 def test_imu_samples_that_cannot_be_used_are_ignored(changes):
-    flight = Flight().take_off()
+    flight = hovering()
     ratio = flight.component.flight.health.ratio
     for _ in range(50):
         flight.component.on_imu(flight.imu(**changes))
@@ -247,7 +259,7 @@ def test_imu_samples_that_cannot_be_used_are_ignored(changes):
 
 
 def test_a_vehicle_that_was_started_again_is_answered_again():
-    flight = Flight().take_off()
+    flight = hovering()
     flight.order(Command.LAND)
     flight.step(5.0)
     assert flight.state is State.DISARMED
@@ -263,7 +275,7 @@ def test_a_vehicle_that_was_started_again_is_answered_again():
 
 
 def test_a_vehicle_that_was_killed_in_flight_and_started_again_is_answered_again():
-    flight = Flight().take_off()
+    flight = hovering()
     for k in range(100):
         flight.component.on_watchdog(k * 20_000_000)
     assert flight.state is State.FAILED and "neither odometry nor IMU" in flight.said
@@ -324,7 +336,7 @@ def too_long(flight):
     (lambda f: f.path((2, 0, 0.6), (3, 0, 0.6), 2.0), {}, "away"),
 ])
 def test_nonsense_on_trajectory_is_refused_and_said(make, changes, word):
-    flight = Flight().take_off()
+    flight = hovering()
     trajectory = make(flight) if make else flight.path((0, 0, 0.6), (1, 0, 0.6), 2.0)
     flight.component.on_trajectory(TrajectoryOrder(99, trajectory)._replace(**changes))
     flight.step(0.3)
@@ -337,14 +349,14 @@ def test_nonsense_on_trajectory_is_refused_and_said(make, changes, word):
 
 
 def test_a_way_out_of_another_time_is_refused():
-    flight = Flight().take_off()
+    flight = hovering()
     trajectory = replace(samples(flight), start_time=flight.stamp * 1e-9 + 3600.0)
     flight.component.on_recovery(TrajectoryOrder(99, trajectory))
     assert "way out of trajectory 99 refused: it starts at" in flight.said
 
 
 def test_samples_are_flown_by_their_normalised_quaternions():
-    flight = Flight().take_off()
+    flight = hovering()
     q = np.tile([0.0, 0.0, 0.0, 1.0005], (40, 1))
     flight.follow(samples(flight, q=q), at_end=AtEnd.HOLD)
     flight.step(0.1)
@@ -360,7 +372,7 @@ def test_attached_before_any_odometry_is_refused():
 
 @pytest.mark.parametrize("command, stamp, said", [(77, 0, "77"), (int(Command.DISARM), 0, "land first"), (int(Command.LAND), 1000, "too old")])
 def test_commands_that_are_none_or_not_now_are_refused(command, stamp, said):
-    flight = Flight().take_off()
+    flight = hovering()
     flight.component.on_command(ControllerCommand(stamp, command, "x" * 10_000))
     flight.step(0.2)
     assert flight.state is State.HOVERING and said in flight.said
@@ -372,7 +384,7 @@ def test_commands_that_are_none_or_not_now_are_refused(command, stamp, said):
     (EstimatorHealth(-1, 2, NAN, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""), State.HOVERING),
     (EstimatorHealth(-1, 3, 0.0, 0, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, "now"), State.LANDING)])
 def test_an_estimators_status_counts_where_it_is_of_now(health, state):
-    flight = Flight().take_off()
+    flight = hovering()
     flight.component.on_estimator(health._replace(stamp=flight.stamp if health.stamp < 0 else health.stamp))
     flight.step(0.1)
     assert flight.state is state
@@ -389,7 +401,7 @@ def test_a_map_with_lines_that_are_none_is_ignored():
 
 @pytest.mark.parametrize("ahead, said", [(2 * 10**9, True), (-(10**9) * 3600, False)])
 def test_a_map_of_the_future_is_ignored_with_a_word_and_an_old_one_is_taken(ahead, said):
-    flight = Flight().take_off()
+    flight = hovering()
     flight.component.on_powerlines(PowerlineMap(flight.stamp + ahead, (), False, ""))
     assert ("to come" in flight.said) == said
 
@@ -455,7 +467,7 @@ def test_a_law_that_could_not_be_built_says_why():
 
 
 def test_gains_change_in_flight_and_what_is_fixed_is_refused():
-    flight = Flight().take_off()
+    flight = hovering()
     component = flight.component
     old = component.config
     component.reconfigure(replace(old, snapdragon=replace(old.snapdragon, position=(5.0, 5.0, 6.0))))
@@ -473,7 +485,7 @@ def test_gains_change_in_flight_and_what_is_fixed_is_refused():
 
 
 def test_abort_brakes_to_a_hover():
-    flight = Flight().take_off()
+    flight = hovering()
     flight.follow(flight.path((0, 0, 0.6), (2, 0, 0.6), 2.0), id=6)
     flight.step(1.0)
     answer = ask(flight.component, "abort", Ask())
