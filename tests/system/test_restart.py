@@ -69,6 +69,19 @@ def test_a_hanging_node_is_named_with_what_it_owes_and_goes_on(tmp_path):
         assert getattr(result, "outcome", "") == "perched", result
 
 
+def test_a_node_that_was_dropped_as_it_hung_comes_back_and_answers_to_its_goal(tmp_path):
+    with rig(tmp_path, ("mission",), scenario=BLIND.replace("lockstep_timeout: 300.0", "lockstep_timeout: 4.0")) as flight:
+        def acts():
+            yield "searching"
+            flight.signal("mission", signal.SIGSTOP)
+            yield lambda: flight.said("lockstep: mission is silent for .*: dropped") > 0
+            flight.signal("mission", signal.SIGCONT)
+            yield lambda: flight.said("lockstep: mission is back") > 0
+
+        result = flight.fly(acts())
+        assert flight.said("lockstep: mission is back") and getattr(result, "message", ""), result
+
+
 def test_in_real_time_every_flight_ends_safely_and_the_next_begins(tmp_path):
     """Deadlines are not judged here: on a busy machine a goal may end otherwise, but it ends, and the vehicle is at rest."""
     safe = (ControllerStatus.DISARMED, ControllerStatus.HOVERING, ControllerStatus.FAILED)  # the last one: motors off, and it says why

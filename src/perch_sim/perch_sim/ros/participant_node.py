@@ -105,7 +105,7 @@ class ParticipantNode(ComponentNode):
             self._busy = True
             self.participant.begin(stamp, batch)
             self._go_on()
-            if self._busy:
+            if self._busy or self._vehicle is None:
                 return
         self.wiring.from_thread(self._work_on)
 

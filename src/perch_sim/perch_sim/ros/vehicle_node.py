@@ -228,6 +228,9 @@ class VehicleNode(ComponentNode):
         self.get_logger().error(f"lockstep: {name} is {why}: dropped, the flight goes on without it")
         self._dropped.add(name)
         self._schedule.drop(name)
+        one = self._remote.pop(name)  # once it goes on, it finds its connection closed and comes again
+        self._links.remove(one.connection)
+        one.close()
 
     def _look_for_strangers(self) -> None:
         """Name who publishes on topics of the flight without taking part: in lockstep that has no influence."""
