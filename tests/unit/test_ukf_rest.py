@@ -28,11 +28,14 @@ class Resting:
                                        np.diag(np.repeat(SIGMA, 3) ** 2)))
 
     def run(self, duration, force=np.zeros(3)):
-        for walk, noise in self.rng.normal(size=(round(duration * RATE), 2, 6)):
-            self.bias = self.bias + self.walk * walk
-            read = self.bias + self.noise * noise
+        drawn = self.rng.normal(size=(round(duration * RATE), 2, 6))
+        biases = np.cumsum(np.vstack([self.bias, self.walk * drawn[:, 0]]), axis=0)[1:]
+        self.bias, reads = biases[-1], biases + self.noise * drawn[:, 1]
+        reads[:, 3:] += self.up_B
+        reads[:, 3:] += force
+        for read in reads.tolist():
             self.k += 1
-            self.estimator.add_imu(ImuSample(self.k * PERIOD, tuple(read[:3]), tuple(read[3:] + self.up_B + force)))
+            self.estimator.add_imu(ImuSample(self.k * PERIOD, tuple(read[:3]), tuple(read[3:])))
         return self
 
     @property
