@@ -45,8 +45,8 @@ def noiseless(scene: Scene, mount: CameraMount, pose, **arguments) -> np.ndarray
 
 @pytest.mark.parametrize("mount, pose, window", [
     (FRONT, level(0, 0, 1.2), (180, 300, 260, 380)),           # 1.7 m, head on
-    (DOWN, level(0.95, 0.05, 1.5, 45), (0, 220, 200, 480)),    # half way through the manoeuvre
-    (DOWN, level(1.45, 0.0, 1.3, 80), (0, 200, 60, 320)),      # 25 cm from the pad, tags in the corners of the lens
+    (DOWN, level(0.95, 0.05, 1.5, 45), (0, 220, 200, 340)),    # half way through the manoeuvre
+    (DOWN, level(1.45, 0.0, 1.3, 80), (0, 120, 60, 320)),      # 25 cm from the pad, tags in the corners of the lens
     (DOWN, level(0, 0, 1.2), (0, 120, 0, 160)),                # floor, corner of the image
     (FRONT, level(-1, 1, 1.6, 20), (200, 320, 200, 400))],     # panel, walls and floor meet
     ids=["pad", "manoeuvre", "close", "floor", "edges"])
