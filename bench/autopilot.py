@@ -1,9 +1,9 @@
 """The watchdog and the pilot's takeover on Betaflight's own firmware, in simulated time: commands stop in each phase of a perch.
 
-A perch on `surface_90` (modelled VIO and tags) through the firmware; the commands go to the process that holds the wire (`Keeper`), from
+A perch on `surface_90` (modelled VIO and tags) through the firmware; the commands go to the process that holds the link (`LinkSupervisor`), from
 it over MSP to the firmware, whose self-level mode levels the simulated body. They stop for 50 ms to 5 s, or for good: the node is killed,
 or hangs. A body that turns in free air, where no wall ends it, is found tilted and turning instead. Times count from the last command that
-has reached the keeper. Needs the firmware (`python3 scripts/betaflight.py build`).
+has reached the supervisor. Needs the firmware (`python3 scripts/betaflight.py build`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
-from closed_loop.kept_loop import Body, KeptLoop  # noqa: E402
+from closed_loop.supervised_loop import Body, SupervisedLoop  # noqa: E402
 from harness import Figure, figure  # noqa: E402
 
 from perch_autopilot.watchdog import OFF, Mode  # noqa: E402
@@ -58,12 +58,12 @@ class Stop:
     held: float
 
 
-def begun(seed: int = 1) -> tuple[Loop, KeptLoop]:
+def begun(seed: int = 1) -> tuple[Loop, SupervisedLoop]:
     """A flight before its first step, with the goal sent."""
     loop = arrange(SCENARIO, seed)
     simulation = loop.vehicle.simulation
     simulation.loop.close()
-    simulation.loop = kept = KeptLoop(load_vehicle(SCENARIO.vehicle))
+    simulation.loop = kept = SupervisedLoop(load_vehicle(SCENARIO.vehicle))
     loop.send("mission", goal_of(SCENARIO))
     return loop, kept
 
@@ -135,8 +135,8 @@ def levelled(vehicle: str, axis: int, tilt: float, rate: float) -> float:
         body.loop.close()
 
 
-def held_without_wire(watched: float = 1.5) -> float:
-    """How long the firmware goes on turning the body as it was told last, from when the wire is cut, at most `watched` [s]."""
+def held_without_link(watched: float = 1.5) -> float:
+    """How long the firmware goes on turning the body as it was told last, from when the link is cut, at most `watched` [s]."""
     body = Body(load_vehicle(SCENARIO.vehicle))
     try:
         body.hover()
@@ -189,6 +189,6 @@ def figures(quick: bool) -> list[Figure]:
                  for vehicle in (SCENARIO.vehicle, "rpg_betaflight") for axis in ((1,) if quick else (0, 1))]
         out.append(figure(f"level within {LEVEL:g} deg, from {tilt:g} deg and {rate:g} rad/s", "s", times, 0.3, "max <="))
     out.append(figure("descent or motors off", "s", [one.down for one in long if np.isfinite(one.down)], 1.0, "max <="))
-    out.append(figure("last command held by the firmware, wire cut", "s", [held_without_wire()], 0.05, "max <="))
+    out.append(figure("last command held by the firmware, link cut", "s", [held_without_link()], 0.05, "max <="))
     out.append(figure("pilot takes over", "s", [taken_over(at) for name, at in when.items() if name != "perched"], 0.05, "max <="))
     return out

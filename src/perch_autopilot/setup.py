@@ -7,7 +7,7 @@ PACKAGE = "perch_autopilot"
 setup(
     name=PACKAGE,
     version="0.1.0",
-    description="Autopilots over a wire, and Betaflight in the loop",
+    description="Autopilots over a link, and Betaflight in the loop",
     maintainer="The perch developers",
     maintainer_email="perch@users.noreply.github.com",
     license="Apache-2.0",

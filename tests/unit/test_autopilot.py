@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, msp
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
-from perch_autopilot.keeper import KeeperLink
+from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import RateCurve, Sticks, rate_curves
 from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
-from perch_autopilot.wire import Wire, WireError
+from perch_autopilot.link import Link, LinkError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
 from perch_core.values import RatesThrust
@@ -139,8 +139,8 @@ def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
     assert sticks.fits(voltage) == (13.6 <= voltage <= 16.8)
 
 
-class Desk:
-    """In the keeper's place: an autopilot that says who it is, and which battery it has."""
+class StubAutopilot:
+    """In the place of link and supervisor: an autopilot that answers with its version and its battery's voltage."""
 
     voltage, silent = 16.0, False
 
@@ -150,7 +150,7 @@ class Desk:
 
     def request(self, data: bytes) -> None:
         known = {msp.FC_VARIANT: b"BTFL", msp.FC_VERSION: bytes((4, 6, 0)),
-                 msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * Desk.voltage)),
+                 msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * StubAutopilot.voltage)),
                  msp.RAW_IMU: struct.pack("<9h", 0, 0, 2048, *(0,) * 6), msp.STATUS: struct.pack("<HHHIBHBBBBIB", *(0,) * 9, 29, 0, 0)}
         if self.silent:
             return
@@ -164,7 +164,7 @@ class Desk:
     def command(self, armed: bool, sticks) -> None:
         self.mode = ["following"]
 
-    def carrying(self, hover: int, descent: int) -> None:
+    def set_throttles(self, hover: int, descent: int) -> None:
         self.throttles = hover, descent
 
     def close(self) -> None:
@@ -174,13 +174,13 @@ class Desk:
 @pytest.fixture
 def flown_on(tmp_path, monkeypatch):
     """The node of a vehicle with a battery curve, on a desk with a voltage."""
-    monkeypatch.setattr("perch_autopilot.betaflight.KeeperLink", Desk)
+    monkeypatch.setattr("perch_autopilot.betaflight.SupervisedLink", StubAutopilot)
     file = tmp_path / "mine.yaml"
     file.write_text("name: mine\nextends: betaflight\nactuation:\n  type: rates_and_thrust\n"
                     "  battery: {reference: 16.0, exponent: 1.8, range: [13.6, 16.8]}\n")
 
     def make(voltage: float) -> Betaflight:
-        monkeypatch.setattr(Desk, "voltage", voltage)
+        monkeypatch.setattr(StubAutopilot, "voltage", voltage)
         return Betaflight(BetaflightParameters(vehicle=str(file)))
 
     return make
@@ -196,14 +196,14 @@ def test_hover_and_descent_without_commands_follow_the_battery(flown_on, monkeyp
     node = flown_on(16.0)
     full = node._link.throttles
     assert full[0] > full[1]
-    monkeypatch.setattr(Desk, "voltage", 14.0)
+    monkeypatch.setattr(StubAutopilot, "voltage", 14.0)
     for k in range(60):
         node.on_poll(k * 10_000_000)
     empty = node._link.throttles
     assert all(now > then for now, then in zip(empty, full))
     dog = Watchdog(WatchdogSettings(arming=0.0), *full)
     dog.command(1.0, True, (1500, 1500, 1500, 1500))
-    dog.carrying(*empty)
+    dog.set_throttles(*empty)
     assert (dog.channels(1.1)[2], dog.channels(1.6)[2]) == empty
 
 
@@ -251,7 +251,7 @@ def test_torn_frames_in_flight_are_one_line_and_the_whole_ones_count(flown_on):
     node.imu.receivers.append(samples.append)
     assert polled(node, 1.0, 100) == []
     node._link._said += whole[:-1] + bytes((whole[-1] ^ 0x55,))
-    assert polled(node, 2.0, 150) == ["/dev/ttyACM0: torn frames come from the autopilot: check the wire and its baud rate"]
+    assert polled(node, 2.0, 150) == ["/dev/ttyACM0: torn frames come from the autopilot: check the link and its baud rate"]
     assert len(samples) > 240
     assert polled(node, 3.5, 150) == []
 
@@ -259,28 +259,28 @@ def test_torn_frames_in_flight_are_one_line_and_the_whole_ones_count(flown_on):
 def test_an_autopilot_that_vanishes_is_one_line(flown_on, monkeypatch):
     node = flown_on(16.0)
     assert polled(node, 1.0, 100) == []
-    monkeypatch.setattr(Desk, "silent", True)
-    assert polled(node, 2.0, 400) == ["/dev/ttyACM0: the autopilot is silent: check its power and its wire"]
+    monkeypatch.setattr(StubAutopilot, "silent", True)
+    assert polled(node, 2.0, 400) == ["/dev/ttyACM0: the autopilot is silent: check its power and its link"]
 
 
 @pytest.mark.parametrize("noise", [b"", b"\x00\xf8\x06\x9e" * 50])
 def test_a_serial_line_that_answers_at_another_rate_is_refused_and_motors_stay_off(noise, monkeypatch):
     """What comes of another baud rate: bytes that are no MSP, or none. A pseudo-terminal has no rate of its own."""
     ours, theirs = pty.openpty()
-    links: list[KeeperLink] = []
+    links: list[SupervisedLink] = []
 
-    class Noisy(KeeperLink):
+    class Noisy(SupervisedLink):
         def __init__(self, *arguments) -> None:
             super().__init__(*arguments)
             links.append(self)
             os.write(ours, noise)
             assert not noise or select.select([self._control], [], [], 60.0)[0]  # it has been passed on
 
-    monkeypatch.setattr("perch_autopilot.betaflight.KeeperLink", Noisy)
+    monkeypatch.setattr("perch_autopilot.betaflight.SupervisedLink", Noisy)
     monkeypatch.setattr("perch_autopilot.betaflight._HANDSHAKE", 0.1)
     words = "bytes came that are no MSP: is the baud rate right" if noise else "no autopilot answers within 0.1 s$"
     with pytest.raises(msp.MspError, match=words) as error:
-        Betaflight(BetaflightParameters(wire=f"{os.ttyname(theirs)}@9600"))
+        Betaflight(BetaflightParameters(link=f"{os.ttyname(theirs)}@9600"))
     assert "\n" not in str(error.value) and links[0].process.wait(60.0) == 0
     heard = msp.Parser().feed(os.read(ours, 1 << 16).replace(b"$M<", b"$M>"))
     sent = [struct.unpack("<6H", frame.payload) for frame in heard if frame.command == msp.SET_RAW_RC]
@@ -367,45 +367,45 @@ def test_a_clock_that_jumps_back_turns_the_motors_off():
     assert dog.channels(50.0)[4] == OFF
 
 
-# -- wire ------------------------------------------------------------------------------------------------------------
+# -- link ------------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
 def test_a_wire_that_is_none_is_one_line(address):
-    with pytest.raises(WireError, match=address.replace("[", ".")) as error:
-        Wire(address)
+    with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
+        Link(address)
     assert "\n" not in str(error.value)
 
 
 def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
     ours, theirs = pty.openpty()
-    wire = Wire(os.ttyname(theirs) + "@921600")
+    link = Link(os.ttyname(theirs) + "@921600")
     try:
-        wire.write(b"$M<")
-        assert os.read(ours, 10) == b"$M<" and wire.read() == b""
+        link.write(b"$M<")
+        assert os.read(ours, 10) == b"$M<" and link.read() == b""
         os.write(ours, bytes(range(256)))
         got, last = b"", time.monotonic() + 60.0
         while len(got) < 256 and time.monotonic() < last:
-            got += wire.read(0.1)
+            got += link.read(0.1)
         assert got == bytes(range(256))  # raw: nothing is translated
         os.close(theirs)
         os.close(ours)
-        with pytest.raises(WireError, match="has ended"):
-            wire.read(1.0)
+        with pytest.raises(LinkError, match="has ended"):
+            link.read(1.0)
     finally:
-        wire.close()
+        link.close()
 
 
-def test_the_keeper_speaks_without_a_node_opens_the_wire_again_and_ends_with_the_motors_off():
+def test_the_supervisor_sends_without_a_node_reopens_the_link_and_ends_with_the_motors_off():
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(120.0)
-        link = KeeperLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", WatchdogSettings(), 1450, 1420)
+        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", WatchdogSettings(), 1450, 1420)
         frame = msp.channels((1500, 1500, 1000, 1500, OFF, OFF))
-        for _ in range(2):  # the first wire ends; the keeper opens another
-            with server.accept()[0] as wire:
-                wire.settimeout(120.0)
+        for _ in range(2):  # the first link ends; the supervisor opens another
+            with server.accept()[0] as peer:
+                peer.settimeout(120.0)
                 got = b""
                 while len(got) < 5 * len(frame):
-                    got += wire.recv(4096)
+                    got += peer.recv(4096)
                 assert got[:4 * len(frame)] == 4 * frame
         link.close()
         assert link.process.wait(120.0) == 0

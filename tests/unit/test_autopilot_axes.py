@@ -55,7 +55,7 @@ class Encoders:
 
 @pytest.fixture(scope="module")
 def node():
-    """The node `mavlink`, on a wire at whose other end nobody is."""
+    """The node `mavlink`, on a link at whose other end nobody is."""
     names = ["pymavlink", "pymavlink.dialects", "pymavlink.dialects.v20"]
     before = {name: sys.modules.get(name) for name in names}
     modules = {name: ModuleType(name) for name in names}
@@ -63,7 +63,7 @@ def node():
     sys.modules.update(modules)
     ours, theirs = socket.socketpair()
     try:
-        one = Mavlink(MavlinkParameters(wire=f"fd:{ours.detach()}"))
+        one = Mavlink(MavlinkParameters(link=f"fd:{ours.detach()}"))
     finally:
         for name in names:
             sys.modules.pop(name) if before[name] is None else sys.modules.update({name: before[name]})

@@ -20,7 +20,7 @@ from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.namespace import IsolatedProgram, NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
 from perch_autopilot.watchdog import OFF, ON, Mode
-from closed_loop.kept_loop import Body
+from closed_loop.supervised_loop import Body
 from perch_core import config
 from perch_core.component import Output, ports
 from perch_core.values import RatesThrust
@@ -246,7 +246,7 @@ def vehicle():
 
 
 def component(vehicle) -> tuple[Betaflight, dict]:
-    node = Betaflight(BetaflightParameters(wire=f"fd:{vehicle.sitl.file}", one_g=256.0))
+    node = Betaflight(BetaflightParameters(link=f"fd:{vehicle.sitl.file}", one_g=256.0))
     got: dict = {}
     for port in ports(Betaflight, Output):
         getattr(node, port.name).receivers.append(got.setdefault(port.name, []).append)
@@ -367,12 +367,12 @@ def test_an_autopilot_that_does_not_answer_is_refused():
     ours, theirs = socket.socketpair()
     theirs.send(b"\x00\xff\x13garbage")
     with pytest.raises(msp.MspError, match="no autopilot answers .* bytes came that are no MSP: is the baud rate right"):
-        Betaflight(BetaflightParameters(wire=f"fd:{ours.fileno()}"))
+        Betaflight(BetaflightParameters(link=f"fd:{ours.fileno()}"))
     ours.close()
     theirs.close()
 
 
-# -- commands that stop, and the pilot: the keeper, MSP, the firmware and a body in simulated time ------------------------
+# -- commands that stop, and the pilot: the supervisor, MSP, the firmware and a body in simulated time ------------------------
 
 @pytest.fixture
 def body():

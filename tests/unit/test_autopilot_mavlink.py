@@ -70,34 +70,34 @@ def test_the_clock_of_the_shortest_way_counts_and_a_jump_is_followed():
 # -- byte streams ----------------------------------------------------------------------------------------------------
 
 class Autopilot:
-    """The other end of the wire."""
+    """The other end of the link."""
 
     def __init__(self) -> None:
         common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (scripts/setup.py --extra mavlink)")
-        ours, self.wire = socket.socketpair()
+        ours, self.link = socket.socketpair()
         self.mavlink = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self.mavlink.robust_parsing = True
-        self.node = Mavlink(MavlinkParameters(wire=f"fd:{ours.detach()}"))
+        self.node = Mavlink(MavlinkParameters(link=f"fd:{ours.detach()}"))
         self.got: dict = {}
         for port in ports(Mavlink, Output):
             getattr(self.node, port.name).receivers.append(self.got.setdefault(port.name, []).append)
         self.now = SECOND
 
     def say(self, message) -> None:
-        self.wire.sendall(message.pack(self.mavlink))
+        self.link.sendall(message.pack(self.mavlink))
 
     def heard(self, seconds: float = 0.005) -> dict:
         """What the node says while it is polled for a time, the last of each kind."""
         for _ in range(max(round(seconds / 0.005), 1)):
             self.now += 5_000_000
             self.node.on_poll(self.now)
-        self.wire.setblocking(False)
+        self.link.setblocking(False)
         try:
-            data = self.wire.recv(1 << 20)
+            data = self.link.recv(1 << 20)
         except BlockingIOError:
             return {}
         finally:
-            self.wire.setblocking(True)
+            self.link.setblocking(True)
         return {message.get_type(): message for message in self.mavlink.parse_buffer(data) or ()}
 
 
@@ -106,7 +106,7 @@ def autopilot():
     one = Autopilot()
     yield one
     one.node.close()
-    one.wire.close()
+    one.link.close()
 
 
 def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
@@ -141,7 +141,7 @@ def test_imu_comes_in_by_the_hosts_clock_and_torn_frames_are_counted(autopilot):
     autopilot.say(m.timesync_encode(5 * SECOND, autopilot.now))
     torn = bytearray(imu.pack(m))
     torn[20] ^= 0xFF
-    autopilot.wire.sendall(bytes(torn))
+    autopilot.link.sendall(bytes(torn))
     autopilot.say(imu)
     autopilot.heard()
     sample, = autopilot.got["imu"]
@@ -218,11 +218,11 @@ def test_samples_of_an_autopilot_that_has_started_anew_wait_for_its_new_clock(au
     assert "the autopilot's clock went from 500.000 to 2.000 s at once" in line.text
 
 
-@pytest.mark.parametrize("noise, words", [(b"", "check its power, wire and system id"), (b"\x00\xf8\x06" * 9, "is the baud rate right?")])
+@pytest.mark.parametrize("noise, words", [(b"", "check its power, link and system id"), (b"\x00\xf8\x06" * 9, "is the baud rate right?")])
 def test_an_autopilot_that_is_not_heard_is_named_and_nothing_is_asked_of_it(autopilot, noise, words):
     sent: set[str] = set()
     for _ in range(600):
-        autopilot.wire.sendall(noise)
+        autopilot.link.sendall(noise)
         autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
         sent |= set(autopilot.heard())
     line, = autopilot.got["log"]
@@ -247,12 +247,12 @@ def test_any_bytes_leave_the_node_ready(autopilot):
     for _ in range(200):
         torn = bytearray(whole[:rng.integers(1, len(whole) + 1)])
         torn[rng.integers(len(torn))] ^= int(rng.integers(1, 256))
-        autopilot.wire.sendall(bytes(torn) + rng.bytes(rng.integers(0, 9)))
+        autopilot.link.sendall(bytes(torn) + rng.bytes(rng.integers(0, 9)))
         autopilot.heard()
     autopilot.node.offboard.armed = False
-    autopilot.wire.sendall(whole * 20)  # what had begun may swallow 280 bytes
+    autopilot.link.sendall(whole * 20)  # what had begun may swallow 280 bytes
     autopilot.heard()
     assert autopilot.node.offboard.armed
     autopilot.heard(1.1)
     assert autopilot.got["diagnostics"][-1].values["torn_frames"] > 0
-    assert "torn frames come from the autopilot: check the wire and its baud rate" in {line.text for line in autopilot.got["log"]}
+    assert "torn frames come from the autopilot: check the link and its baud rate" in {line.text for line in autopilot.got["log"]}

@@ -84,8 +84,8 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
     spec.loader.exec_module(script)
     monkeypatch.setattr(script, "enter", lambda *_: None)
     monkeypatch.setattr(script.os, "execv", become)
-    monkeypatch.setattr(sys, "argv", ["run_node.py", node, "--ros-args", "-p", "wire:=/dev/ttyACM0"])
+    monkeypatch.setattr(sys, "argv", ["run_node.py", node, "--ros-args", "-p", "link:=/dev/ttyACM0"])
     with pytest.raises(Became) as started:
         script.main()
     path, words = started.value.args
-    assert Path(path).name == node and Path(path).parent.name == package and words[-1] == "wire:=/dev/ttyACM0"
+    assert Path(path).name == node and Path(path).parent.name == package and words[-1] == "link:=/dev/ttyACM0"

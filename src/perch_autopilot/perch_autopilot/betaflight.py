@@ -12,10 +12,10 @@ from perch_core.vehicle import load_vehicle
 from perch_autopilot import msp
 from perch_autopilot.clock import jumped
 from perch_autopilot.configuration import load_configuration
-from perch_autopilot.keeper import KeeperLink
+from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import Sticks, rate_curves
 from perch_autopilot.watchdog import CENTRED, WatchdogSettings
-from perch_autopilot.wire import WireError
+from perch_autopilot.link import LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
 _REFUSED = NANOSECONDS               # an order to arm that has had no effect for so long is refused [ns]
@@ -27,7 +27,7 @@ class BetaflightParameters:
     """Parameters of the node `betaflight`; all are read once, at the start."""
 
     vehicle: str = text("betaflight", doc="config/vehicles/<name>.yaml, or a file")
-    wire: str = text("/dev/ttyACM0", doc="/dev/ttyACM0, /dev/ttyACM0@921600, tcp:HOST:PORT")
+    link: str = text("/dev/ttyACM0", doc="/dev/ttyACM0, /dev/ttyACM0@921600, tcp:HOST:PORT")
     configuration: str = text("betaflight", doc="what the autopilot is set to: config/autopilot/<name>.txt, or a file")
     one_g: float = quantity(2048.0, above=0.0, high=1e4, doc="reading of its accelerometer at rest (RAW_IMU): 2048, before 4.6 512")
     watchdog: WatchdogSettings = part(WatchdogSettings)
@@ -50,15 +50,15 @@ class Betaflight(Component[BetaflightParameters]):
         """
         Raises:
             ConfigError: there is no such vehicle or configuration.
-            WireError: the wire cannot be opened.
+            LinkError: the link cannot be opened.
             MspError: nobody answers, another firmware than this was written for, or a battery for which the vehicle has no thrust curve.
         """
         super().__init__(config)
         vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        self._link, self._parser = KeeperLink(config.wire, config.watchdog, *self._carrying()), msp.Parser()
+        self._link, self._parser = SupervisedLink(config.link, config.watchdog, *self._throttles()), msp.Parser()
         try:
-            self.version = self._greet()
+            self.version = self._identify()
         except BaseException:
             self._link.close()
             raise
@@ -71,19 +71,19 @@ class Betaflight(Component[BetaflightParameters]):
         self._now: int | None = None            # of the last poll [ns]
         self._answered = self._diagnosed = self._torn = 0
 
-    def _carrying(self) -> tuple[int, int]:
+    def _throttles(self) -> tuple[int, int]:
         """Throttles of hover and descent [us]."""
-        return self._sticks.carrying(1.0), self._sticks.carrying(self.config.watchdog.descent)
+        return self._sticks.throttle_for(1.0), self._sticks.throttle_for(self.config.watchdog.descent)
 
-    def _greet(self) -> msp.Version:
-        """Who is at the other end, with which battery."""
+    def _identify(self) -> msp.Version:
+        """Ask for the firmware's version and the battery's voltage."""
         wanted = [msp.FC_VARIANT, msp.FC_VERSION, *([msp.ANALOG] if self._sticks.battery.reference else [])]
         answers: dict[int, msp.Frame] = {}
         last, said = time.monotonic() + _HANDSHAKE, [""]
         while time.monotonic() < last:
             self._link.request(b"".join(map(msp.request, wanted)))
-            data, words = self._link.receive(0.2)
-            said += words
+            data, messages = self._link.receive(0.2)
+            said += messages
             for frame in self._parser.feed(data):
                 answers[frame.command] = frame
             if answers.keys() >= set(wanted):
@@ -92,7 +92,7 @@ class Betaflight(Component[BetaflightParameters]):
                 return msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
         noise = (f"{self._parser.skipped} bytes came that are no MSP: is the baud rate right, and the autopilot's command line closed?"
                  if self._parser.skipped else "")
-        raise msp.MspError("; ".join(filter(None, (f"{self.config.wire}: no autopilot answers within {_HANDSHAKE:g} s", said[-1], noise))))
+        raise msp.MspError("; ".join(filter(None, (f"{self.config.link}: no autopilot answers within {_HANDSHAKE:g} s", said[-1], noise))))
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
@@ -126,7 +126,7 @@ class Betaflight(Component[BetaflightParameters]):
             if self._polls % 10 == 0:
                 asked += msp.request(_SELDOM[self._polls // 10 % len(_SELDOM)])
             self._link.request(asked)
-        except WireError as error:
+        except LinkError as error:
             self.log(LogLine("error", str(error), 1.0))
         if now - self._diagnosed >= NANOSECONDS:
             self._diagnosed = now
@@ -152,7 +152,7 @@ class Betaflight(Component[BetaflightParameters]):
     def _take_battery(self, voltage: float) -> None:
         if self._sticks.battery.reference:
             self._sticks.measured(voltage)
-            self._link.carrying(*self._carrying())
+            self._link.set_throttles(*self._throttles())
             if not self._sticks.fits(voltage):
                 low, high = self._sticks.battery.range
                 raise msp.MspError(f"the battery has {voltage:g} V: the thrust curve of {self.config.vehicle} (actuation.battery) is of "
@@ -171,10 +171,10 @@ class Betaflight(Component[BetaflightParameters]):
 
     def _diagnose(self, now: int) -> None:
         if silent := now - self._answered > NANOSECONDS:
-            self.log(LogLine("error", f"{self.config.wire}: the autopilot is silent: check its power and its wire", 5.0))
+            self.log(LogLine("error", f"{self.config.link}: the autopilot is silent: check its power and its link", 5.0))
         if self._parser.torn > self._torn:
             self._torn = self._parser.torn
-            self.warn(f"{self.config.wire}: torn frames come from the autopilot: check the wire and its baud rate", every=5.0)
+            self.warn(f"{self.config.link}: torn frames come from the autopilot: check the link and its baud rate", every=5.0)
         values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn,
                   "skipped_bytes": self._parser.skipped}
         if self._status is not None:

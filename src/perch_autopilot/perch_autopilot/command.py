@@ -7,7 +7,7 @@ import sys
 
 from perch_autopilot import firmware
 from perch_autopilot.configuration import Cli, load_configuration
-from perch_autopilot.wire import Wire
+from perch_autopilot.link import Link
 from perch_core.errors import PerchError
 
 EXAMPLES = """examples:
@@ -25,7 +25,7 @@ def parser() -> argparse.ArgumentParser:
     verbs.add_parser("build", help="make the program where it is not there yet")
     for verb, text in (("configure", "send the settings, have them saved"), ("check", "read the settings back")):
         one = verbs.add_parser(verb, help=text)
-        one.add_argument("wire", help="/dev/ttyACM0, /dev/ttyACM0@921600 or tcp:HOST:PORT")
+        one.add_argument("link", help="/dev/ttyACM0, /dev/ttyACM0@921600 or tcp:HOST:PORT")
         one.add_argument("configuration", nargs="?", default="betaflight", help="of config/autopilot, or a file (default: %(default)s)")
     return out
 
@@ -38,8 +38,8 @@ def main(arguments: list[str] | None = None) -> int:
             print(firmware.ensured())
             return 0
         configuration = load_configuration(args.configuration)
-        wire = Wire(args.wire)
-        cli = Cli(wire.write, wire.read)
+        link = Link(args.link)
+        cli = Cli(link.write, link.read)
         if args.verb == "configure":
             cli.apply(configuration)
             print(f"sent {len(configuration.lines)} lines; the autopilot restarts with them")

@@ -55,7 +55,7 @@ class FirmwareLoop:
         self.sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
         self.sticks.measured(voltage_factor * vehicle.actuation.battery.reference)
         self._voltage_factor = voltage_factor
-        self.watchdog = Watchdog(_WATCHDOG, self.sticks.carrying(1.0), self.sticks.carrying(_WATCHDOG.descent))
+        self.watchdog = Watchdog(_WATCHDOG, self.sticks.throttle_for(1.0), self.sticks.throttle_for(_WATCHDOG.descent))
         self._low, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self._idle = float(loaded.settings.get("motor_idle", 550)) * 1e-4  # motors of an armed vehicle with the throttle down
         self._turning = False

@@ -23,7 +23,7 @@ from perch_core.vehicle import load_vehicle
 from perch_autopilot import frames
 from perch_autopilot.clock import JUMP, jumped
 from perch_autopilot.offboard import ARDUPILOT, PX4, SILENT, Ask, Offboard
-from perch_autopilot.wire import Wire, WireError
+from perch_autopilot.link import Link, LinkError
 
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
@@ -36,7 +36,7 @@ class MavlinkParameters:
     """Parameters of the node `mavlink`; all are read once, at the start."""
 
     vehicle: str = text("snapdragon_rates", doc="config/vehicles/<name>.yaml, or a file")
-    wire: str = text("/dev/ttyACM0@921600", doc="/dev/ttyACM0@921600, tcp:HOST:PORT")
+    link: str = text("/dev/ttyACM0@921600", doc="/dev/ttyACM0@921600, tcp:HOST:PORT")
     system: int = quantity(1, low=1, high=255, doc="the autopilot's system id; ours is the same, with a companion's component")
 
 
@@ -79,7 +79,7 @@ class Mavlink(Component[MavlinkParameters]):
         """
         Raises:
             ConfigError: there is no such vehicle.
-            WireError: the wire cannot be opened.
+            LinkError: the link cannot be opened.
             PerchError: pymavlink is not installed.
         """
         super().__init__(config)
@@ -89,7 +89,7 @@ class Mavlink(Component[MavlinkParameters]):
             raise PerchError("the node mavlink needs pymavlink (an optional extra): python3 scripts/setup.py --extra mavlink") from None
         vehicle = load_vehicle(config.vehicle)
         self._thrust_max = 4.0 * vehicle.thrust_max / vehicle.mass
-        self._wire = Wire(config.wire)
+        self._link = Link(config.link)
         self._mavlink = common.MAVLink(None, srcSystem=config.system, srcComponent=191)  # MAV_COMP_ID_ONBOARD_COMPUTER
         self._mavlink.robust_parsing = True
         self.offboard, self._clock = Offboard(), ClockOffset()
@@ -120,9 +120,9 @@ class Mavlink(Component[MavlinkParameters]):
 
     def _send(self, message: Any) -> None:
         try:
-            self._wire.write(message.pack(self._mavlink))
+            self._link.write(message.pack(self._mavlink))
             self._mavlink.seq = (self._mavlink.seq + 1) % 256
-        except WireError as error:
+        except LinkError as error:
             self.log(LogLine("error", str(error), 1.0))
 
     def _target(self, command: RatesThrust) -> None:
@@ -141,9 +141,9 @@ class Mavlink(Component[MavlinkParameters]):
                 self.warn(jump)
         self._now = now
         try:
-            for message in self._mavlink.parse_buffer(self._wire.read()) or ():
+            for message in self._mavlink.parse_buffer(self._link.read()) or ():
                 self._take(message, now)
-        except WireError as error:
+        except LinkError as error:
             self.log(LogLine("error", str(error), 1.0))
         command = self._command
         fresh = command is not None and 0 <= now - self._came <= _STALE
@@ -198,7 +198,7 @@ class Mavlink(Component[MavlinkParameters]):
     def _trouble(self, now: int) -> str:
         """Why it cannot follow; empty: it can."""
         if not self.offboard.alive(now * 1e-9):
-            noise = f"; {self._torn} torn frames: is the baud rate right?" if self._torn else ": check its power, wire and system id"
+            noise = f"; {self._torn} torn frames: is the baud rate right?" if self._torn else ": check its power, link and system id"
             return f"no heartbeat of the autopilot{noise}"
         if self.offboard.autopilot not in (PX4, ARDUPILOT):
             return f"the autopilot is of MAVLink's type {self.offboard.autopilot}, not PX4 ({PX4}) or ArduPilot ({ARDUPILOT}): not armed"
@@ -208,15 +208,15 @@ class Mavlink(Component[MavlinkParameters]):
         if (trouble := self._trouble(now)) and now - self._begun >= SILENT * NANOSECONDS:
             self.log(LogLine("error", trouble, 5.0))
         elif not trouble and self._torn > self._named:
-            self.warn("torn frames come from the autopilot: check the wire and its baud rate", every=5.0)
+            self.warn("torn frames come from the autopilot: check the link and its baud rate", every=5.0)
             self._named = self._torn
         self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following, "torn_frames": self._torn,
                                            "clock_offset_s": (self._clock.offset or 0) * 1e-9},
                                      2 if trouble else 0, trouble or "ok"))
 
     def close(self) -> None:
-        """Close the wire; the autopilot's failsafe for the loss of set points counts from now on."""
-        self._wire.close()
+        """Close the link; the autopilot's failsafe for the loss of set points counts from now on."""
+        self._link.close()
 
 
 def _mode_words(mode: int) -> tuple[float, ...]:

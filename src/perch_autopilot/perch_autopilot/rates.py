@@ -91,7 +91,7 @@ class Sticks:
         speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient * self._share))
         return min(max((speed - self._idle) / self._span, 0.0), 1.0)
 
-    def carrying(self, share: float) -> int:
+    def throttle_for(self, share: float) -> int:
         """Throttle [us] that carries a share of the weight."""
         return self.channels((0.0, 0.0, 0.0), share * GRAVITY)[2]
 

@@ -1,4 +1,4 @@
-"""What the autopilot is told while nobody says anything: level, descend, disarm. Pure: time is given to it."""
+"""What the autopilot receives when commands stop: level, descend, disarm. Without a clock: times are arguments."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Channels = tuple[int, ...]
 class WatchdogSettings:
     """When a command is stale, and what follows."""
 
-    rate: float = quantity(200.0, unit="Hz", low=50.0, high=250.0, doc="of the frames that the autopilot gets, whatever happens")
-    arming: float = quantity(0.2, unit="s", low=0.0, high=2.0, doc="the throttle stays down so long, as the firmware asks for it")
-    stale_after: float = quantity(0.04, unit="s", low=0.02, high=0.25, doc="a command that is older is not sent any more: level")
-    descend_after: float = quantity(0.5, unit="s", low=0.0, high=0.9, doc="after so long without a command, level: descend")
-    disarm_after: float = quantity(4.0, unit="s", low=0.5, high=60.0, doc="after so long without a command: motors off")
+    rate: float = quantity(200.0, unit="Hz", low=50.0, high=250.0, doc="of the frames to the autopilot, in every case")
+    arming: float = quantity(0.2, unit="s", low=0.0, high=2.0, doc="the throttle stays down for this time after arming, as the firmware requires")
+    stale_after: float = quantity(0.04, unit="s", low=0.02, high=0.25, doc="a command older than this is not sent; level instead")
+    descend_after: float = quantity(0.5, unit="s", low=0.0, high=0.9, doc="time without a command until the descent")
+    disarm_after: float = quantity(4.0, unit="s", low=0.5, high=60.0, doc="time without a command until the motors stop")
     descent: float = quantity(0.9, low=0.5, high=1.0, doc="thrust of the descent as a share of the weight")
 
 
 class Mode(Enum):
-    """What the watchdog does."""
+    """Modes of the watchdog."""
 
     DISARMED = "disarmed"
     FOLLOWING = "following"
@@ -38,7 +38,7 @@ class Watchdog:
     """Decides which channels go to the autopilot: roll, pitch, throttle, yaw, then the switches arm and level.
 
     Attributes:
-        mode: what it does.
+        mode: present mode.
     """
 
     def __init__(self, settings: WatchdogSettings, hover: int, descent: int) -> None:
@@ -48,14 +48,14 @@ class Watchdog:
             hover, descent: throttle that carries the weight, and that of the descent [us].
         """
         self._settings = settings
-        self.carrying(hover, descent)
+        self.set_throttles(hover, descent)
         self.mode = Mode.DISARMED
         self._sticks: Channels = CENTRED
         self._wanted, self._came, self._since = False, 0.0, 0.0
-        self._locked = False  # motors were taken away: only a command to disarm allows the next to arm
+        self._locked = False  # the motors were stopped: only a command to disarm allows arming again
 
-    def carrying(self, hover: int, descent: int) -> None:
-        """Take other throttles of hover and descent [us], as the battery empties."""
+    def set_throttles(self, hover: int, descent: int) -> None:
+        """Set the throttles of hover and descent [us]; they rise as the battery empties."""
         self._hover, self._descent = hover, descent
 
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
@@ -72,7 +72,7 @@ class Watchdog:
         self._locked = self._locked and armed
 
     def channels(self, now: float) -> Channels:
-        """What the autopilot gets now [us]; never a command that is stale."""
+        """Channels for the autopilot at a time [s], in us; never those of a stale command."""
         age = now - self._came
         limits = self._settings
         if not self._wanted or self._locked or age < 0.0:

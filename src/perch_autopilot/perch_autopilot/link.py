@@ -1,4 +1,4 @@
-"""The wire to an autopilot: a serial line, or TCP."""
+"""The link to an autopilot: a serial port, or TCP."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from perch_core.errors import PerchError
 CONNECT_TIMEOUT = 3.0  # [s]
 
 
-class WireError(PerchError):
-    """There is no such wire, or it has ended."""
+class LinkError(PerchError):
+    """The link cannot be opened, or it has ended."""
 
 
-class Wire:
+class Link:
     """Bytes to and from an autopilot."""
 
     def __init__(self, address: str) -> None:
@@ -28,7 +28,7 @@ class Wire:
                 this process has.
 
         Raises:
-            WireError: it cannot be opened.
+            LinkError: it cannot be opened.
         """
         self._socket: socket.socket | None = None
         try:
@@ -44,38 +44,38 @@ class Wire:
                 self._set_serial(baud or "115200", address)
             os.set_blocking(self.file, False)
         except (OSError, OverflowError) as error:
-            raise WireError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
+            raise LinkError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
 
     def _set_serial(self, baud: str, address: str) -> None:
         speed = getattr(termios, f"B{baud}", None)
         if speed is None:
-            raise WireError(f"{address}: {baud} baud is no rate of a serial line")
+            raise LinkError(f"{address}: {baud} is not a baud rate of a serial port")
         try:
             tty.setraw(self.file)
             attributes = termios.tcgetattr(self.file)
             attributes[4] = attributes[5] = speed
             termios.tcsetattr(self.file, termios.TCSANOW, attributes)
         except termios.error as error:
-            raise WireError(f"{address}: is no serial line: {error.args[-1]}") from None
+            raise LinkError(f"{address}: is not a serial port: {error.args[-1]}") from None
 
     def write(self, data: bytes) -> None:
-        """Send; what the line cannot take now is lost, as a stale command would be worse.
+        """Send; what the port cannot accept now is dropped, because a late command would be worse.
 
         Raises:
-            WireError: it has ended.
+            LinkError: it has ended.
         """
         try:
             os.write(self.file, data)
         except BlockingIOError:
             pass
         except OSError as error:
-            raise WireError(f"the wire to the autopilot has ended: {error.strerror}") from None
+            raise LinkError(f"the link to the autopilot has ended: {error.strerror}") from None
 
     def read(self, timeout: float = 0.0) -> bytes:
         """What has come within a time [s]; empty: nothing.
 
         Raises:
-            WireError: it has ended.
+            LinkError: it has ended.
         """
         if not select.select([self.file], [], [], timeout)[0]:
             return b""
@@ -84,9 +84,9 @@ class Wire:
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise WireError(f"the wire to the autopilot has ended: {error.strerror}") from None
+            raise LinkError(f"the link to the autopilot has ended: {error.strerror}") from None
         if not data:
-            raise WireError("the wire to the autopilot has ended")
+            raise LinkError("the link to the autopilot has ended")
         return data
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Betaflight's firmware as a simulated vehicle's autopilot, spoken to as on a vehicle: the node's commands go to a keeper, and from it
+"""Betaflight's firmware as a simulated vehicle's autopilot, spoken to as on a vehicle: the node's commands go to a supervisor, and from it
 over MSP to the firmware, whose receiver hears the pilot's radio. All of it in simulated time, so that the same flight is the same again."""
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from closed_loop.plant import Plant
 from perch_autopilot import msp
-from perch_autopilot.keeper import COMMAND, Keeper
+from perch_autopilot.supervised_link import COMMAND, LinkSupervisor
 from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.watchdog import OFF, ON, Watchdog, WatchdogSettings
 from perch_core import so3
@@ -22,12 +22,12 @@ from perch_core.vehicle import Vehicle
 _PATIENCE = 20.0  # for the firmware's answer to a frame [s]
 
 
-class KeptLoop(FirmwareLoop):
+class SupervisedLoop(FirmwareLoop):
     """Of a node that can be cut off, and be killed, and of a pilot.
 
     Attributes:
         radio: the pilot's channels [us]: sticks, arming, level, hand-over to the companion computer.
-        cut: commands do not reach the keeper.
+        cut: commands do not reach the supervisor.
         severed: nothing reaches the firmware's serial port.
         heard: time of the last command that has reached it [s].
         aimed: what the motors aim at, (4,) [rad/s].
@@ -37,11 +37,11 @@ class KeptLoop(FirmwareLoop):
         super().__init__(vehicle)
         self.severed = False
         self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
-        self.watchdog = Watchdog(settings, self.sticks.carrying(1.0), self.sticks.carrying(settings.descent))
+        self.watchdog = Watchdog(settings, self.sticks.set_throttles(1.0), self.sticks.set_throttles(settings.descent))
         self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._node.setblocking(False)
         self._time, self._parser = 0.0, msp.Parser()
-        self._keeper = Keeper(f"fd:{self.sitl.file}", theirs, self.watchdog, settings.rate, lambda: self._time)
+        self._supervisor = LinkSupervisor(f"fd:{self.sitl.file}", theirs, self.watchdog, settings.rate, lambda: self._time)
         self._killed = False
         self.aimed = np.zeros(4)
 
@@ -63,8 +63,8 @@ class KeptLoop(FirmwareLoop):
         self._time = now
         if self.severed:
             return tuple(self.radio)
-        spoken = now >= self._keeper._due
-        self._keeper.work(0.0)
+        spoken = now >= self._supervisor._due
+        self._supervisor.work(0.0)
         if spoken:  # a frame counts from the cycle on that follows its answer
             self._answered()
         return tuple(self.radio)
@@ -73,10 +73,10 @@ class KeptLoop(FirmwareLoop):
         last = time.monotonic() + _PATIENCE
         while time.monotonic() < last:
             if self._killed:  # nobody hears the answer
-                if self._keeper._wire.read(1.0):
+                if self._supervisor._link.read(1.0):
                     return
                 continue
-            self._keeper.work(1.0)
+            self._supervisor.work(1.0)
             while True:
                 try:
                     word = self._node.recv(8192)
@@ -84,7 +84,7 @@ class KeptLoop(FirmwareLoop):
                     break
                 if word[:1] == b"D" and any(frame.command == msp.SET_RAW_RC for frame in self._parser.feed(word[1:])):
                     return
-        raise AssertionError("the firmware does not answer the keeper")
+        raise AssertionError("the firmware does not answer the supervisor")
 
     def close(self) -> None:
         self._node.close()
@@ -100,7 +100,7 @@ class Felt:
 
 
 class Body:
-    """A free body with rotors behind a `KeptLoop`, 500 m up.
+    """A free body with rotors behind a `SupervisedLoop`, 500 m up.
 
     Attributes:
         loop: its autopilot.
@@ -109,7 +109,7 @@ class Body:
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self.loop, self.plant = KeptLoop(vehicle), Plant(vehicle, p=np.array([0.0, 0.0, 500.0]))
+        self.loop, self.plant = SupervisedLoop(vehicle), Plant(vehicle, p=np.array([0.0, 0.0, 500.0]))
         self._step, self._force = 0, np.array([0.0, 0.0, 9.81])
 
     @property

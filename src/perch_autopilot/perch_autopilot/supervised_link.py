@@ -1,0 +1,219 @@
+"""A separate process owns the link to the autopilot: it continues when the commanding node is killed, hangs, or is restarted.
+
+Betaflight before 2026.6 holds the last MSP command for ever. Commands therefore go through this process, which sends frames at a fixed
+rate in every case; without fresh commands the `Watchdog` decides what they contain. It ends when the node has gone and the motors are
+off.
+
+    node -> supervisor   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot       b"H" hover, descent: throttles
+    supervisor -> node   b"D" bytes: from the autopilot          b"M" text: the watchdog's mode, or an error
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+from perch_autopilot import msp
+from perch_autopilot.watchdog import Mode, Watchdog, WatchdogSettings
+from perch_autopilot.link import Link, LinkError
+
+COMMAND, THROTTLES = struct.Struct("<?4H"), struct.Struct("<2H")
+_REOPEN = 0.2   # from one attempt to open a link that has ended to the next [s]
+_FINAL_FRAMES = 10  # with the motors off, before it ends
+
+
+class LinkSupervisor:
+    """Sends the watchdog's channels at a fixed rate, and forwards bytes in both directions."""
+
+    def __init__(self, address: str, control: socket.socket, watchdog: Watchdog, rate: float,
+                 clock: Callable[[], float] = time.monotonic) -> None:
+        """
+        Args:
+            address: of the link, see `Link`.
+            control: to the node.
+            watchdog: decides what the frames contain.
+            rate: of the frames [Hz].
+            clock: [s].
+
+        Raises:
+            LinkError: the link cannot be opened.
+        """
+        self._address, self._control, self._watchdog, self._period, self._clock = address, control, watchdog, 1.0 / rate, clock
+        self._link: Link | None = Link(address)
+        self._due = self._opened = clock()
+        self._reported, self._node_gone, self._final_frames = Mode.DISARMED, False, 0
+
+    def run(self) -> None:
+        """Run until the node has gone and the motors are off."""
+        while self._final_frames < _FINAL_FRAMES:
+            self.work(max(0.0, self._due - self._clock()))
+
+    def work(self, timeout: float) -> None:
+        """Handle what arrives within a time [s]; send a frame when it is due."""
+        sources = [one for one in (None if self._node_gone else self._control, self._link and self._link.file) if one is not None]
+        ready = select.select(sources, [], [], timeout)[0]
+        if self._control in ready:
+            self._receive()
+        if self._link is not None and self._link.file in ready:
+            self._forward()
+        now = self._clock()
+        if now >= self._due:
+            self._due = max(self._due + self._period, now - self._period)
+            self._send_channels(now)
+
+    def _send_channels(self, now: float) -> None:
+        channels = self._watchdog.channels(now)
+        if self._watchdog.mode is not self._reported:
+            self._reported = self._watchdog.mode
+            self._notify(b"M" + self._reported.value.encode())
+        self._final_frames = self._final_frames + 1 if self._node_gone and self._reported is Mode.DISARMED else 0
+        if self._link is None and now - self._opened > _REOPEN:
+            self._opened = now
+            try:
+                self._link = Link(self._address)
+            except LinkError:
+                return
+        self._send(msp.channels(channels))
+
+    def _send(self, data: bytes) -> None:
+        try:
+            if self._link is not None:
+                self._link.write(data)
+        except LinkError as error:
+            self._close_link(error)
+
+    def _close_link(self, error: LinkError) -> None:
+        self._link.close()
+        self._link, self._opened = None, self._clock()
+        self._notify(b"M" + str(error).encode())
+
+    def _receive(self) -> None:
+        try:
+            packet = self._control.recv(4096)
+        except OSError:
+            packet = b""
+        if not packet:
+            self._node_gone = True
+        elif packet[:1] == b"C" and len(packet) == 1 + COMMAND.size:
+            armed, *sticks = COMMAND.unpack_from(packet, 1)
+            self._watchdog.command(self._clock(), armed, tuple(sticks))
+        elif packet[:1] == b"R":
+            self._send(packet[1:])
+        elif packet[:1] == b"H" and len(packet) == 1 + THROTTLES.size:
+            self._watchdog.set_throttles(*THROTTLES.unpack_from(packet, 1))
+
+    def _forward(self) -> None:
+        try:
+            self._notify(b"D" + self._link.read())
+        except LinkError as error:
+            self._close_link(error)
+
+    def _notify(self, packet: bytes) -> None:
+        try:
+            self._control.send(packet, socket.MSG_DONTWAIT)
+        except OSError:
+            pass  # the node has gone, or does not read: newer packets follow
+
+
+class SupervisedLink:
+    """The node's end."""
+
+    def __init__(self, address: str, settings: WatchdogSettings, hover: int, descent: int) -> None:
+        """
+        Args:
+            address: see `Link`.
+            settings, hover, descent: see `Watchdog`.
+
+        Raises:
+            LinkError: the link cannot be opened.
+        """
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        passed = [theirs.fileno()] + ([int(address[3:])] if address.startswith("fd:") else [])
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, str(theirs.fileno()),
+                                         json.dumps(asdict(settings)), str(hover), str(descent)],
+                                        pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
+                                        cwd=Path(__file__).parents[1], start_new_session=True)  # a Ctrl-C is not for it
+        theirs.close()
+        self._control.settimeout(20.0)
+        try:
+            begun = self._control.recv(64)
+        except OSError:
+            begun = b""
+        if begun != b"M":
+            self._control.close()
+            output = self.process.communicate(timeout=5.0)[1].decode(errors="replace").strip().splitlines()
+            raise LinkError(output[-1] if output else f"{address}: the process that holds the link does not start")
+        self.process.stderr.close()
+        self._control.setblocking(False)
+
+    def command(self, armed: bool, sticks: tuple[int, int, int, int]) -> None:
+        """Send a command; it is valid until it is stale."""
+        self._send(b"C" + COMMAND.pack(armed, *sticks))
+
+    def set_throttles(self, hover: int, descent: int) -> None:
+        """Set the throttles of hover and descent [us]."""
+        self._send(b"H" + THROTTLES.pack(hover, descent))
+
+    def request(self, data: bytes) -> None:
+        """Send bytes to the autopilot beside the commands."""
+        self._send(b"R" + data)
+
+    def _send(self, packet: bytes) -> None:
+        try:
+            self._control.send(packet)
+        except BlockingIOError:
+            pass
+        except OSError:
+            raise LinkError("the process that holds the link has ended") from None
+
+    def receive(self, timeout: float = 0.0) -> tuple[bytes, list[str]]:
+        """Bytes from the autopilot and messages of the supervisor that arrive within a time [s].
+
+        Raises:
+            LinkError: the process that holds the link has ended.
+        """
+        data, messages = b"", []
+        while select.select([self._control], [], [], timeout)[0]:
+            packet = self._control.recv(8192)
+            if not packet:
+                raise LinkError("the process that holds the link has ended")
+            if packet[:1] == b"D":
+                data += packet[1:]
+            else:
+                messages.append(packet[1:].decode(errors="replace"))
+            timeout = 0.0
+        return data, messages
+
+    def close(self) -> None:
+        """Stop commanding: the watchdog then levels, descends and stops the motors."""
+        self._control.close()
+
+
+def main() -> None:
+    """The process: address, file number, settings, hover, descent."""
+    address, number, words, hover, descent = sys.argv[1:]
+    for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ignored, signal.SIG_IGN)
+    settings = WatchdogSettings(**json.loads(words))
+    control = socket.socket(fileno=int(number))
+    try:
+        supervisor = LinkSupervisor(address, control, Watchdog(settings, int(hover), int(descent)), settings.rate)
+    except LinkError as error:
+        sys.exit(str(error))
+    control.send(b"M")
+    supervisor.run()
+
+
+if __name__ == "__main__":
+    main()
