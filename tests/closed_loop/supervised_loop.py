@@ -37,7 +37,7 @@ class SupervisedLoop(FirmwareLoop):
         super().__init__(vehicle)
         self.severed = False
         self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
-        self.watchdog = Watchdog(settings, self.sticks.set_throttles(1.0), self.sticks.set_throttles(settings.descent))
+        self.watchdog = Watchdog(settings, self.sticks.throttle_for(1.0), self.sticks.throttle_for(settings.descent))
         self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._node.setblocking(False)
         self._time, self._parser = 0.0, msp.Parser()
