@@ -8,6 +8,9 @@ considered. With the corners' derivative G by k, whitened and in k's sigmas, the
 
     W = (I + G G^T)^-1 = I - G (I + G^T G)^-1 G^T,   A = (J^T W J)^-1 J^T W,   cov = A A^T (noise) + A G G^T A^T (lens).
 
+What no pose and no lens explains is noise: prints and paper put corners elsewhere, too, and the corners' sigmas grow by it. Otherwise
+the lens, which has one sigma whatever the number of corners, is bent to fit what is not its own.
+
 Errors of a pose T_AB = (p_AB, R_AB) are (dp, dtheta) in the axes of A: p = p^ + dp, R = exp(dtheta) R^. That is also what
 the covariance of geometry_msgs/PoseWithCovariance means.
 """
@@ -29,7 +32,7 @@ MAX_ITERATIONS = 12
 SAME_POSE = np.radians(0.5)        # branches closer than this are one and the same minimum [rad]
 PRIOR_SIGMA = np.radians(10.0)     # how far the attitude may have turned since it was predicted [rad]
 CONSISTENT = 0.999                 # share of boards that pass where corners are off by what is expected
-MODEL_SHARE = 0.005                # print, paper and lens put corners where they belong within this share of the tag's longest side
+MODEL_SHARE = 0.02                 # print, paper and lens put corners where they belong within this share of the tag's longest side
 OUTLIER = 10.0                     # a tag that is so many times less consistent than the others is not where it should be
 SUSPECTS = 4                       # tags that are tried one by one as the one that is not
 EXACT_LENS = np.zeros(4)
@@ -50,6 +53,7 @@ class BoardPose:
         ids: tags used.
         rms: residual of the corners, per image axis [px].
         misfit: chi^2 over the degrees of freedom, 1 where the corners are off by their sigmas.
+        unexplained: the same of what neither pose nor lens explains, of corners or whole tags, where that is more than chance; else 1.
         by_intrinsics: derivative of (dp, dtheta) by errors of the lens's fx, fy (relative) and cx, cy [px] that the
             solution does not know of, shape (6, 4).
         branch_gap: by how much chi^2 of the second-best pose is worse; inf where there is only one.
@@ -65,6 +69,7 @@ class BoardPose:
     branch_gap: float = np.inf
     dropped: tuple[int, ...] = ()
     misfit: float = 1.0
+    unexplained: float = 1.0
 
 
 def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
@@ -88,7 +93,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
     keep, dropped = np.arange(len(ids)), []
     best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start)
     # of two tags that disagree, either may be wrong
-    while best.misfit > _limit(len(keep)) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
+    while best.misfit > _limit(_freedom(len(keep))) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
         expected, seen = camera.project(corners_S[keep] @ best.R_CS.T + best.p_CS)[0], camera.project(rays_C[keep])[0]
         off = np.linalg.norm(expected - seen, axis=2) / sigma[keep]
         trials = []
@@ -104,8 +109,11 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         dropped.append(ids[out])
     pixels = camera.project(rays_C[keep])[0]
     model = MODEL_SHARE * np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).max(axis=1, keepdims=True)
-    if best.misfit > _limit(len(keep)) * float(np.mean(1.0 + (model / sigma[keep]) ** 2)):
+    if best.misfit > _limit(_freedom(len(keep))) * float(np.mean(1.0 + (model / sigma[keep]) ** 2)):
         raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
+    if best.unexplained > 1.0:
+        noise = sigma[keep] * np.sqrt(best.unexplained)
+        best = replace(_solve(camera, corners_S[keep], rays_C[keep], noise, best.ids, lens_sigma, prior_R_CS, start), misfit=best.misfit)
     return replace(best, dropped=tuple(sorted(dropped)))
 
 
@@ -114,9 +122,9 @@ def _freedom(tags: int) -> int:
 
 
 @lru_cache(maxsize=256)
-def _limit(tags: int) -> float:
+def _limit(freedom: int) -> float:
     """chi^2 over its degrees of freedom that `CONSISTENT` of the boards keep."""
-    return float(chi2.ppf(CONSISTENT, _freedom(tags))) / _freedom(tags)
+    return float(chi2.ppf(CONSISTENT, freedom)) / freedom
 
 
 def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=None) -> BoardPose:
@@ -128,6 +136,7 @@ def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=
     corners = _Corners(camera, points, sigma.reshape(-1), pixels, lens_sigma)
     branches = []
     for p, R in [start] if start is not None else planar_branches(points, rays):
+        corners.start(p, R)
         refined = _refine(corners, p, R)
         if refined is None or refined[0][2] <= 0.0 and camera.max_angle <= np.pi / 2:
             continue
@@ -154,7 +163,7 @@ def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=
             share = 1.0 / (1.0 + np.exp(min(0.5 * gap, 500.0)))
             covariance = (1.0 - share) * covariance + share * (corners.errors(*branches[1][2:])[0] + np.outer(apart, apart))
     return BoardPose(p, R, covariance, tuple(ids), corners.rms(p, R), by_intrinsics, float(gap),
-                     misfit=chi_square / _freedom(len(ids)))
+                     misfit=chi_square / _freedom(len(ids)), unexplained=corners.unexplained(p, R))
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -207,12 +216,20 @@ class _Corners:
     """
 
     def __init__(self, camera: Camera, points_S: np.ndarray, noise: np.ndarray, pixels: np.ndarray, lens_sigma: np.ndarray) -> None:
-        self._camera, self._points, self._noise, self._pixels = camera, points_S, noise, pixels
-        by_lens = np.zeros((len(points_S), 2, 4))
-        by_lens[:, 0, 0], by_lens[:, 1, 1] = pixels[:, 0] - camera.cx, pixels[:, 1] - camera.cy
+        self._camera, self._points, self._noise, self._pixels, self._lens_sigma = camera, points_S, noise, pixels, lens_sigma
+        self._consider(pixels)
+
+    def start(self, p: np.ndarray, R: np.ndarray) -> None:
+        """Take the lens's derivatives at a pose: at the measured pixels their noise would correlate with the residuals', as a longer lens."""
+        pixels, seen = self._camera.project(self._points @ R.T + p)
+        self._consider(np.where(seen[:, None], pixels, self._pixels))
+
+    def _consider(self, pixels: np.ndarray) -> None:
+        by_lens = np.zeros((len(pixels), 2, 4))
+        by_lens[:, 0, 0], by_lens[:, 1, 1] = pixels[:, 0] - self._camera.cx, pixels[:, 1] - self._camera.cy
         by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
-        self._by_lens = (by_lens / noise[:, None, None]).reshape(-1, 4)
-        self._G = self._by_lens * lens_sigma
+        self._by_lens = (by_lens / self._noise[:, None, None]).reshape(-1, 4)
+        self._G = self._by_lens * self._lens_sigma
         self._back = np.linalg.solve(np.eye(4) + self._G.T @ self._G, self._G.T)
 
     def linearise(self, p: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
@@ -229,10 +246,26 @@ class _Corners:
 
         Pixels that a longer lens makes larger bring the solution nearer than the truth, which is ahead: -A dr/dk.
         """
-        jacobian, _ = self._jacobian(p, R)
+        jacobian, projected = self._jacobian(p, R)
+        self._consider(projected)
         weighed = self._weighed(jacobian)
         A = np.linalg.solve(jacobian.T @ weighed, weighed.T)
         return A @ A.T, -A @ self._by_lens
+
+    def unexplained(self, p: np.ndarray, R: np.ndarray) -> float:
+        """Mean square of the whitened residuals that no pose and no lens explains, of corners or of whole tags; 1 where it may be chance.
+
+        Pose and lens together move a plane's corners as the homographies do, which have eight parameters. Tags are printed or glued as
+        a whole, so what their corners have in common counts as one error.
+        """
+        jacobian, projected = self._jacobian(p, R)
+        residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
+        explaining = np.concatenate([jacobian, self._by_lens], axis=1)
+        explaining /= np.linalg.norm(explaining, axis=0)
+        rest = residual - explaining @ np.linalg.lstsq(explaining, residual, rcond=1e-6)[0]
+        of_tags = 2.0 * rest.reshape(-1, 4, 2).mean(axis=1).ravel()
+        means = [(float(part @ part) / (len(part) - 8), len(part) - 8) for part in (rest, of_tags) if len(part) > 8]
+        return max((mean for mean, freedom in means if mean > _limit(freedom)), default=1.0)
 
     def rms(self, p: np.ndarray, R: np.ndarray) -> float:
         """Residual per image axis [px]; corners that are known better count more."""
