@@ -17,7 +17,7 @@ from perch_eval.graph_faults.cases import (
     FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named)
 from perch_eval.graph_faults.flight import UNANSWERED, _Director
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
-from perch_eval.nursery import Nursery, alive, session
+from perch_eval.fork_server import ForkServer, alive, session
 
 CASE = Case("kill", "estimator", "climb", LOCKSTEP)
 
@@ -122,19 +122,19 @@ def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_ti
             director.follow()
 
 
-def test_processes_of_a_nursery_are_their_own_and_end_with_it(tmp_path, monkeypatch):
+def test_processes_of_a_fork_server_are_their_own_and_end_with_it(tmp_path, monkeypatch):
     (tmp_path / "sleeper.py").write_text(
         "import os, subprocess, sys, time\ndef sleeper():\n    print(sys.argv[1], os.environ['WORD'], flush=True)\n"
         "    subprocess.Popen(['sleep', '60'])\n    time.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
-    nursery = Nursery(("sleeper",))
-    pids = [nursery.start("sleeper:sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}) for k in range(2)]
+    server = ForkServer(("sleeper",))
+    pids = [server.start("sleeper:sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}) for k in range(2)]
     until(lambda: all(len(session(pid)) == 2 for pid in pids))
     assert [Path(tmp_path / f"{k}.log").read_text() for k in range(2)] == ["number 0 heard\n", "number 1 heard\n"]
     os.kill(pids[0], signal.SIGKILL)
     until(lambda: not alive(pids[0]))
     assert len(session(pids[0])) == 1  # what it has started is still found
-    os.killpg(pids[0], signal.SIGKILL), nursery.close()
+    os.killpg(pids[0], signal.SIGKILL), server.close()
     until(lambda: not alive(pids[1]))
     os.killpg(pids[1], signal.SIGKILL)
 

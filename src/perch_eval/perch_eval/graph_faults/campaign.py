@@ -18,9 +18,9 @@ from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import prepare_worker
 from perch_eval.evaluation.document import machine
+from perch_eval.fork_server import ForkServer
 from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
-from perch_eval.nursery import Nursery
 from perch_eval.revision import banner, commit, digest
 
 EXAMPLES = """examples:
@@ -35,9 +35,6 @@ EXAMPLES = """examples:
 exit code: 0 every flight ended safely and said so, 1 one did not, 2 the caller's mistake, 130 interrupted"""
 ROWS = "rows.jsonl"
 FALL = 1.5  # speed beyond which an end on the floor is a fall [m/s]
-MODULES = tuple(f"perch_{package}.{name}_node" for package, name in (
-    ("sim", "vehicle"), ("sim", "vio_model"), ("perception", "estimator"), ("planner", "perching_planner"), ("control", "controller"),
-    ("control", "mission"), ("core", "description"), ("eval", "modelled_sight"), ("eval", "composed"), ("eval.graph_faults", "relay")))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -125,10 +122,13 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
         progress.close()
 
 
+_server: ForkServer
+
+
 def _prepare() -> None:
-    global _nursery
+    global _server
     prepare_worker()
-    _nursery = Nursery(MODULES, ("surface_90",))
+    _server = ForkServer(("perch_eval.graph_faults.preload",))
 
 
 def _fly(case: Case, logs: Path) -> dict[str, Any] | str:
@@ -138,7 +138,7 @@ def _fly(case: Case, logs: Path) -> dict[str, Any] | str:
         old.unlink()
     code = digest()
     try:
-        return {**fly(case, _nursery, folder, commit()).as_json(), "code": code}
+        return {**fly(case, _server, folder, commit()).as_json(), "code": code}
     except PerchError as error:
         return f"not flown: {error}"
 

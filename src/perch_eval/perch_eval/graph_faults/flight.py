@@ -16,14 +16,14 @@ from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.domain import reserved_domain
+from perch_eval.fork_server import ForkServer, alive, session
 from perch_eval.graph_faults.cases import LOCKSTEP, NAMED, PROCESS, SAFE, TALKERS, Case, Situation, ending, named
 from perch_eval.graph_faults.relay_node import DIRECT
 from perch_eval.graph_faults.ros.watcher import Watcher
 from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS, blind_launches
 from perch_eval.node_launch import NodeLaunch
 from perch_eval.nodes import ros_arguments
-from perch_eval.nursery import Nursery, alive, session
-from perch_eval.ros.pilot import Pilot
+from perch_eval.ros.mission_client import MissionClient
 from perch_eval.shared_memory import SharedMemory
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
@@ -100,16 +100,16 @@ class Group:
         nodes: fully qualified names.
     """
 
-    def __init__(self, nursery: Nursery, launches: tuple[NodeLaunch, ...], case: Case, folder: Path, domain: int) -> None:
+    def __init__(self, server: ForkServer, launches: tuple[NodeLaunch, ...], case: Case, folder: Path, domain: int) -> None:
         """
         Args:
-            nursery: starts them.
+            server: starts them.
             launches: the nodes.
             case: says who has a process, and whose messages pass the relay.
             folder: receives parameters and logs.
             domain: ROS domain.
         """
-        self._nursery, self._folder, self._domain = nursery, folder, domain
+        self._server, self._folder, self._domain = server, folder, domain
         self._commands = {one.name: (self._place(one), ros_arguments(one, folder)) for one in launches}
         self.nodes = {f"/{name}" for name in self._commands}
         together = [] if case.alone else [one for one in launches if one.name not in (*SIGHTS, case.node)]
@@ -134,7 +134,7 @@ class Group:
     def start(self, name: str) -> None:
         """Start a node, for the first time or again."""
         what, arguments = self._commands[name]
-        pid = self._nursery.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)})
+        pid = self._server.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)})
         self.pids[name] = pid
         self._sessions.append(pid)
 
@@ -286,12 +286,12 @@ def _in_domain(domain: int) -> Iterator[None]:
         os.environ.pop("ROS_DOMAIN_ID") if before is None else os.environ.update(ROS_DOMAIN_ID=before)
 
 
-def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
+def fly(case: Case, server: ForkServer, folder: Path, commit: str = "") -> Row:
     """Fly one case.
 
     Args:
         case: what happens.
-        nursery: has loaded the nodes.
+        server: has loaded the nodes.
         folder: receives scenario, parameters and logs.
         commit: of the code, for the row.
 
@@ -306,7 +306,7 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
     hold = {"mission": {"lockstep_hold": "perch"}} if lockstep else None
     launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
     with reserved_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain, _in_domain(domain):
-        group, pilot = Group(nursery, launches, case, folder, domain), Pilot()
+        group, pilot = Group(server, launches, case, folder, domain), MissionClient()
         try:
             watcher = Watcher(pilot)
             director = _Director(case, group, watcher, scenario.mission.takeoff_height, pad_surface(scenario, 0.0))
@@ -337,11 +337,11 @@ def fly(case: Case, nursery: Nursery, folder: Path, commit: str = "") -> Row:
                round(max(touched, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
 
 
-def _settled(pilot: Pilot, watcher: Watcher, director: _Director) -> str:
+def _settled(pilot: MissionClient, watcher: Watcher, director: _Director) -> str:
     """Wait until an end lasts, and the fault has had its time to be named."""
     limit, since, last = time.monotonic() + LIMIT, watcher.time, ""
     while time.monotonic() < limit:
-        pilot.listen(0.05)
+        pilot.spin(0.05)
         director.look()
         director.said += [(time.time(), words) for words in pilot.news()]
         now = watcher.situation()
