@@ -16,8 +16,8 @@ from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.comparison import fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
-from perch_eval.control_flights.flight import ControlFlight
 from perch_eval.control_flights.way_out import search
+from perch_eval.scripted_flight import ScriptedFlight
 from perch_sim.scenario import load_scenario
 
 
@@ -110,7 +110,7 @@ def test_the_end_is_judged_by_the_truth():
     """A controller that believes to hover is not hovering on the floor."""
     from perch_eval.control_flights import faults
 
-    flight = ControlFlight(load_scenario("surface_90"), 1)
+    flight = ScriptedFlight(load_scenario("surface_90"), 1)
     assert faults._end(flight) == "landed"
     x = flight.simulation.state
     flight.simulation.plant.place(x.p_WB + (0.0, 0.0, 1.0), x.q_WB, x.v_WB, x.w_WB_B, np.zeros(4))
@@ -126,7 +126,7 @@ def test_l1_cuts_the_error_under_wind_and_mass():
 @pytest.mark.parametrize("w, saved", [((9.6, 14.8, 5.8), False), ((1.0, -1.0, 0.5), True)])
 def test_the_search_for_a_way_out_knows_hopeless_from_harmless(w, saved):
     """A blow on the floor: 18 rad/s tip a vehicle onto its rotors before they turn up, 1.4 rad/s do not."""
-    flight = ControlFlight(load_scenario("surface_90"), 1)
+    flight = ScriptedFlight(load_scenario("surface_90"), 1)
     plant, x = flight.simulation.plant, flight.simulation.state
     plant.place(x.p_WB, x.q_WB, x.v_WB, np.array(w), np.full(4, plant.body.speed_min))
     found = search(plant)

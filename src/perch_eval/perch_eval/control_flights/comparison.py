@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_eval.control_flights.flight import ControlFlight, scenario_of
-from perch_eval.control_flights.pilot import LEAD, TAKE_OFF_SPEED
+from perch_eval.control_flights.scenarios import scenario_of
+from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
 
 SCENARIO = "surface_90"
 CONTROLLERS = {"geometric": ("geometric", False), "geometric + L1": ("geometric", True),
@@ -46,21 +46,22 @@ class Compared:
 def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
     """Take off, hover until the adaptation has settled, then a line and a hover, or the perch on the wall; estimated state."""
     law, adaptive = CONTROLLERS[controller]
-    flight = ControlFlight(scenario_of(SCENARIO, CONDITIONS[condition], {"controller.type": law, "controller.adaptive": adaptive}), seed)
+    flight = ScriptedFlight(scenario_of(SCENARIO, CONDITIONS[condition], {"controller.type": law, "controller.adaptive": adaptive}), seed)
     flight.arm()
     flight.run(flight.time + 0.2)
-    pilot, height = flight.pilot, flight.scenario.mission.takeoff_height
-    place = pilot.p_WB + (0.0, 0.0, height)
-    pilot.go(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
+    mission, height = flight.mission, flight.scenario.mission.takeoff_height
+    place = mission.p_WB + (0.0, 0.0, height)
+    mission.go(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
     flight.run(flight.time + LEAD + height / TAKE_OFF_SPEED + SETTLE)
     begin = flight.time
+    order: int | None
     if maneuver == "line":
-        order = pilot.go(LINE, LINE_TIME)
+        order = mission.go(LINE, LINE_TIME)
         end = begin + LEAD + LINE_TIME
         flight.run(end + HOVER)
     else:
         order = flight.perch(place)
-        end = pilot.contact_due
+        end = mission.contact_due
         flight.run(min(end, flight.time + 10.0) + 1.0)
     if order is None or not flight.flew(order):
         return Compared((np.nan,) * 3, f"not begun: {flight.events[-1][2]}")
@@ -68,16 +69,18 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
     # A vehicle that has touched the wall follows no reference.
     touched = min([t for t, c in flown.values("contact") if t > begin], default=np.inf)
     wanted = flown.reference()
+    assert wanted is not None
     during = (wanted.t >= begin) & (wanted.t <= min(end if maneuver == "perch" else np.inf, touched))
     times, p = wanted.t[during], wanted.p[during]
     if maneuver == "perch":  # the controller's own reference differs from the plan by what its rehearsal adds
-        times = times[times >= flight.plan.start_time]
-        p = np.array([flight.plan.sample(t - flight.plan.start_time).p for t in times])
-    rmse = np.sqrt(np.mean((p - flown.states("ground_truth/odometry").at(times).p) ** 2, axis=0))
+        assert (plan := flight.plan) is not None
+        times = times[times >= plan.start_time]
+        p = np.array([plan.sample(t - plan.start_time).p for t in times])
+    rmse = np.sqrt(np.mean((p - flown.known_states("ground_truth/odometry").at(times).p) ** 2, axis=0))
     return Compared(tuple(rmse.tolist()), _outcome(flight, maneuver))
 
 
-def _outcome(flight: ControlFlight, maneuver: str) -> str:
+def _outcome(flight: ScriptedFlight, maneuver: str) -> str:
     if flight.simulation.plant.crashed:
         return "crashed"
     if maneuver == "perch":

@@ -16,9 +16,9 @@ from perch_control.modes import Command, State
 from perch_core import so3
 from perch_core.errors import PerchError
 from perch_core.values import Ask, OdometryState, seconds
-from perch_eval.control_flights.flight import ControlFlight, scenario_of
-from perch_eval.control_flights.pilot import LEAD, TAKE_OFF_SPEED
+from perch_eval.control_flights.scenarios import scenario_of
 from perch_eval.control_flights.way_out import Search, search
+from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
 
@@ -31,7 +31,7 @@ END_STATES = ("hovering", "landed", "perched")
 """What counts as a way out."""
 
 
-Strike = Callable[[ControlFlight, np.random.Generator], str]
+Strike = Callable[[ScriptedFlight, np.random.Generator], str]
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Fault:
     scenario: dict = field(default_factory=dict)
 
 
-def _stale(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _stale(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     if rng.random() < 0.5:
         flight.loop.filters["controller", "odometry"] = lambda now, state: None
         return "no odometry any more"
-    last = flight.pilot.believed
+    last = flight.mission.believed
     flight.loop.filters["controller", "odometry"] = lambda now, state: last
     return "the last sample again and again"
 
 
-def _jump(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _jump(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     offset = rng.normal(size=3)
     offset *= rng.uniform(0.3, 2.0) / np.linalg.norm(offset)
     lasting = rng.uniform(0.01, 1.0) if rng.random() < 0.5 else np.inf
@@ -73,22 +73,22 @@ def _jump(flight: ControlFlight, rng: np.random.Generator) -> str:
     return f"position jumps by ({offset[0]:.2f}, {offset[1]:.2f}, {offset[2]:.2f}) m" + (f" for {lasting:.2f} s" if np.isfinite(lasting) else " for good")
 
 
-def _lose_vio(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _lose_vio(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     for channel in ("vio/state", "vio/odometry"):
         flight.loop.filters["estimator", channel] = lambda now, value: None
     return "no VIO pose any more"
 
 
-def _lose_orders(flight: ControlFlight) -> None:
+def _lose_orders(flight: ScriptedFlight) -> None:
     flight.loop.filters["controller", "trajectory"] = lambda now, order: None
 
 
-def _silence(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _silence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     _lose_orders(flight)
     return "no trajectory any more"
 
 
-def _kick(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _kick(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     axis = rng.normal(size=3) * (1.0, 1.0, 0.3)
     w = axis / np.linalg.norm(axis) * rng.uniform(8.0, 20.0)
     x, plant = flight.simulation.state, flight.simulation.plant
@@ -96,7 +96,7 @@ def _kick(flight: ControlFlight, rng: np.random.Generator) -> str:
     return f"a blow turns the vehicle with ({w[0]:.1f}, {w[1]:.1f}, {w[2]:.1f}) rad/s"
 
 
-def _weaken(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _weaken(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     vehicle, plant = flight.simulation.vehicle, flight.simulation.plant
     hover = vehicle.mass * 9.81 / (4.0 * vehicle.thrust_max)
     share = rng.uniform(0.95, 1.3) * hover
@@ -104,29 +104,29 @@ def _weaken(flight: ControlFlight, rng: np.random.Generator) -> str:
     return f"all rotors give at most {100 * share / hover:.0f} % of the weight"
 
 
-def _fence(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _fence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     parameters = flight.controller.config
     limits, axis = parameters.flight, rng.integers(3)
-    low, high = list(limits.fence_low), list(limits.fence_high)
-    p, outside = flight.pilot.p_WB, rng.uniform(-0.3, 1.5)
+    low, high = np.array(limits.fence_low), np.array(limits.fence_high)
+    p, outside = flight.mission.p_WB, rng.uniform(-0.3, 1.5)
     if axis == 2 or rng.random() < 0.5:
-        high[axis] = float(p[axis] - outside)
+        high[axis] = p[axis] - outside
     else:
-        low[axis] = float(p[axis] + outside)
-    flight.controller.reconfigure(replace(parameters, flight=replace(limits, fence_low=tuple(low), fence_high=tuple(high))))
+        low[axis] = p[axis] + outside
+    flight.controller.reconfigure(replace(parameters, flight=replace(limits, fence_low=tuple(low.tolist()), fence_high=tuple(high.tolist()))))
     return f"the fence stands {abs(outside):.2f} m {'behind' if outside > 0 else 'ahead of'} the vehicle along {'xyz'[axis]}"
 
 
-def _nothing(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _nothing(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return "the velcro does not hold"
 
 
-def _abort(flight: ControlFlight, rng: np.random.Generator) -> str:
+def _abort(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     _lose_orders(flight)
     if rng.random() < 0.5:
         flight.loop.request("controller", "abort", Ask())
         return "abort"
-    flight.pilot.order(Command.HOVER, "the goal was cancelled")
+    flight.mission.order(Command.HOVER, "the goal was cancelled")
     return "cancel: hover"
 
 
@@ -178,13 +178,13 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
         seed: of the flight and of the fault's moment and size.
     """
     scenario = scenario_of(SCENARIO, fault.scenario, {"flight.silence_time": SILENCE_TIME})
-    flight = ControlFlight(scenario, seed)
+    flight = ScriptedFlight(scenario, seed)
     rng = seeding.stream(seed, f"fault {fault.name}")
     flight.arm()
     begin, height = flight.time + 0.2, flight.scenario.mission.takeoff_height
     rise = max(1.0, height / TAKE_OFF_SPEED)
     ready = begin + LEAD + rise + PAUSE
-    place = flight.pilot.p_WB + (0.0, 0.0, height)
+    place = flight.mission.p_WB + (0.0, 0.0, height)
     contact = ready + 2.0 * LEAD + flight.perch_plan(place, begin, np.zeros(3)).duration
     moment = rng.uniform(begin, contact)
 
@@ -192,7 +192,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
         with contextlib.suppress(PerchError):  # there is no plan from where the vehicle believes to be: the mission gives up, it hovers
             flight.perch(place)
 
-    script = [(begin, lambda: flight.pilot.go(np.array([0.0, 0.0, height]), rise)), (ready, perch)]
+    script = [(begin, lambda: flight.mission.go(np.array([0.0, 0.0, height]), rise)), (ready, perch)]
     struck, done, phase, before, first = False, "", "", (0.0,) * 4, 0
     resting = flight.time
     while flight.time < moment + LIMIT and not flight.simulation.plant.crashed:
@@ -219,13 +219,13 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
                   None if end in END_STATES else search(plant))
 
 
-def _situation(flight: ControlFlight) -> tuple[float, float, float, float]:
+def _situation(flight: ScriptedFlight) -> tuple[float, float, float, float]:
     x, pad = flight.simulation.state, flight.simulation.pad
     tilt = np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x.q_WB)[2, 2], -1.0, 1.0)))
     return float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt)
 
 
-def _end(flight: ControlFlight) -> str:
+def _end(flight: ScriptedFlight) -> str:
     """The end by the truth; the controller's word counts for a hover alone."""
     plant, x = flight.simulation.plant, flight.simulation.state
     if plant.crashed:

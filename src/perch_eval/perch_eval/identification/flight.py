@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from perch_control.mission.parameters import MissionParameters
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_core.errors import PerchError
 from perch_core.trajectory import rest_to_rest
-from perch_eval.control_flights.pilot import LEAD, ScriptedPilot
 from perch_eval.flight import Flight
-from perch_eval.in_process import arrange
-from perch_eval.in_process.parameters import NodeParameters
+from perch_eval.scripted_flight import LEAD, ScriptedFlight
 from perch_sim.scenario import Scenario
 
 HEIGHT = 1.5                                       # of the hover [m]
@@ -22,7 +19,6 @@ MOVES = (((0.8, 0.0, 0.0), 0.0, 0.9), ((0.0, 0.8, 0.0), 0.0, 0.9), ((0.0, 0.0, 0
 """Offset [m], turn [rad], duration [s]; each there and back."""
 ROUNDS = 2                                         # all of them
 PAUSE = 0.3                                        # between them [s]
-PATIENCE = 12.0                                    # for the estimator, and for the take-off [s]
 
 
 def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Flight:
@@ -37,32 +33,18 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
     Raises:
         PerchError: the vehicle does not fly with this file.
     """
-    scenario = replace(scenario, vehicle=vehicle)
-    pilot = ScriptedPilot(NodeParameters(scenario, seed).of("mission", MissionParameters))
-    loop = arrange(scenario, seed, without=("target_localizer", "powerline_mapper", "perching_planner", "powerline_planner"), pilot=pilot)
-    state = loop.components["controller"].flight.maneuvers
-
-    def go_on(duration: float) -> None:
-        until = loop.time + duration
-        while loop.time < until:
-            loop.step()
-
+    flight = ScriptedFlight(replace(scenario, vehicle=vehicle), seed, without=("powerline_mapper", "perching_planner", "powerline_planner"))
+    mission, state = flight.mission, flight.controller.flight.maneuvers
     try:
-        while not pilot.ready and loop.time < PATIENCE:
-            loop.step()
-        if not pilot.ready:
-            raise PerchError("the estimator is not ready")
-        go_on(0.2)
-        pilot.order(Command.ARM, "identification")
-        go_on(0.1)
-        place, yaw = pilot.p_WB, 0.0
+        flight.run(flight.arm() + 0.1)
+        place, yaw = mission.p_WB, 0.0
         for offset, turn, duration in (((0.0, 0.0, HEIGHT), 0.0, 2.5), *(
                 (sign * np.array(offset), sign * turn, stretch * T) for offset, turn, T in ROUNDS * MOVES for sign in (1.0, -1.0))):
-            pilot.follow(rest_to_rest(place, place + offset, yaw, yaw + turn, duration, pilot.time + LEAD))
+            mission.follow(rest_to_rest(place, place + offset, yaw, yaw + turn, duration, mission.time + LEAD))
             place, yaw = place + offset, yaw + turn
-            go_on(duration + LEAD + PAUSE)
+            flight.run(flight.time + duration + LEAD + PAUSE)
             if state.state is not State.HOVERING:
                 raise PerchError(f"the vehicle does not fly by its file: {state.message}; correct its mass or its lags")
     finally:
-        loop.close()
-    return loop.trace.flight
+        flight.loop.close()
+    return flight.loop.trace.flight

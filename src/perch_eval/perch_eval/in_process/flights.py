@@ -43,7 +43,7 @@ class Sensing:
 
 
 def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, replace: Mapping[str, Component[Any]] | None = None,
-            without: Collection[str] = (), pilot: Component[Any] | None = None) -> Loop:
+            without: Collection[str] = (), script: Component[Any] | None = None) -> Loop:
     """The flight of a scenario before its first step.
 
     Args:
@@ -52,7 +52,7 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
         sensing: which cameras are rendered.
         replace: name -> component in the place of the scenario's.
         without: names of components that do not take part.
-        pilot: leads the flight in the place of the mission: it works at every step before the controller.
+        script: leads the flight in the place of the mission: it works at every step before the controller.
 
     Raises:
         ConfigError: the scenario or a node's parameter is refused.
@@ -61,7 +61,7 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
     parameters, replace = NodeParameters(scenario, seed), replace or {}
     surface = scenario.mode == "surface"
     finder = "target_localizer" if surface else "powerline_mapper"
-    left_out = {*without, *(("mission",) if pilot is not None else ())}
+    left_out = {*without, *(("mission",) if script is not None else ())}
     names = [name for name in ("vio" if sensing.vio == "rendered" else "vio_model", "estimator", finder, "controller", "mission")
              if name not in left_out]
     front = "target_localizer" in names or sensing.target == "rendered"  # its frames start work, whether or not they are drawn
@@ -80,9 +80,9 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
     planner = PLANNERS.get(scenario.mode)
     servers = {} if planner is None or planner in without else {planner: replace.get(planner) or parameters.component(planner)}
     tasks = flight_tasks(scenario.latency)
-    if pilot is not None:
-        components["pilot"] = pilot
-        tasks = {"estimator": tasks["estimator"], "pilot": Task(), **tasks}
+    if script is not None:
+        components["script"] = script
+        tasks = {"estimator": tasks["estimator"], "script": Task(), **tasks}
     return Loop(vehicle, components, tasks, servers)
 
 

@@ -10,10 +10,8 @@ import numpy as np
 from perch_control.modes import State
 from perch_core.errors import PerchError
 from perch_core.trajectory import rest_to_rest
-from perch_eval.control_flights.flight import ControlFlight
-from perch_eval.control_flights.pilot import LEAD, TAKE_OFF_SPEED
-from perch_eval.inspection.measures import Inspected, reference_of
-from perch_eval.inspection.recorded import recorded
+from perch_eval.inspection.measures import Inspected, reference_of, recorded
+from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
 from perch_sim.scenario import Scenario
 
 SETTLE = 1.0  # hover before the line terms begin, and when they have grown [s]
@@ -32,20 +30,22 @@ def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
     """
     if scenario.mode != "inspection":
         raise PerchError(f"scenario {scenario.name}: mode {scenario.mode!r} is not inspection")
-    flight = ControlFlight(scenario, seed)
-    loop, pilot, first = flight.loop, flight.pilot, scenario.inspection.waypoints[0]
+    flight = ScriptedFlight(scenario, seed)
+    loop, mission, first = flight.loop, flight.mission, scenario.inspection.waypoints[0]
     loop.filters["controller", "powerlines"] = lambda now, lines: None
     flight.run(flight.arm() + 0.2)
     yaw, duration = float(np.radians(first.yaw_deg)), max(2.0, first.position[2] / TAKE_OFF_SPEED)
-    pilot.follow(rest_to_rest(pilot.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD))
+    mission.follow(rest_to_rest(mission.p_WB, np.array(first.position), yaw, yaw, duration, flight.time + LEAD))
     flight.run(flight.time + duration + LEAD + SETTLE)
-    if pilot.state is not State.HOVERING:
-        raise PerchError(f"did not take off: {pilot.message}")
+    if mission.state is not State.HOVERING:
+        raise PerchError(f"did not take off: {mission.message}")
     if with_lines:
         del loop.filters["controller", "powerlines"]
     flight.run(flight.time + flight.controller.config.nmpc.lines.ramp_time + SETTLE)
     reference = reference_of(scenario, flight.time + LEAD)
-    pilot.follow(reference)
+    mission.follow(reference)
     flight.run(flight.time + LEAD + reference.duration)
-    flying = pilot.state in (State.TRACKING, State.HOVERING)
-    return recorded(loop.trace.flight, scenario, "" if flying else pilot.message)
+    flying = mission.state in (State.TRACKING, State.HOVERING)
+    found = recorded(loop.trace.flight, scenario, "" if flying else mission.message)
+    assert found is not None
+    return found

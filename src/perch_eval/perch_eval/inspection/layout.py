@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from perch_core.lines import Segment, scaled_clearance, segment_distance
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Vector3, load_vehicle
 from perch_eval.inspection.measures import collisions, reference_states, segments
 from perch_sim.scenario import Cable, Scenario, Start, Waypoint
 
@@ -82,7 +82,7 @@ def _draw(base: Scenario, rng: np.random.Generator) -> Scenario:
     return dataclasses.replace(base, inspection=inspection, world=world, start=start)
 
 
-def _way_up(scenario: Scenario, cables: list[Segment], radii: np.ndarray) -> bool:
+def _way_up(scenario: Scenario, cables: list[Segment], radii: Vector3) -> bool:
     """The take-off, straight up to the first waypoint, is free."""
     x, y, z = scenario.inspection.waypoints[0].position
     column = np.column_stack([np.full(30, x), np.full(30, y), np.linspace(0.0, z, 30)])

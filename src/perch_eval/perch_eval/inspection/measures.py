@@ -13,16 +13,19 @@ from perch_control.nmpc.reference_rows import reference_row
 from perch_control.reference import FlatReference
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.trajectory import FlatTrajectory
-from perch_core.vehicle import Vehicle, load_vehicle
+from perch_core.vehicle import Vector3, Vehicle, load_vehicle
+from perch_eval.flight import Flight
 from perch_planner.powerline.visibility import Visibility, visibility
+from perch_sim.contact_event import ContactState
 from perch_sim.scenario import Scenario
 
 SAMPLE = 0.01  # of the reference's states [s]
+EVERY = 5      # true states are judged at 100 Hz
 
 
 def segments(scenario: Scenario) -> list[Segment]:
     """The cables of a scenario, which are straight here, in W."""
-    return [Segment.between(c.start, c.end, c.radius, k) for k, c in enumerate(scenario.world.cables)]
+    return [Segment.between(np.array(c.start), np.array(c.end), c.radius, k) for k, c in enumerate(scenario.world.cables)]
 
 
 def watched(scenario: Scenario, lines: list[Segment]) -> Segment:
@@ -43,12 +46,12 @@ def reference_states(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return times, np.array([reference_row(source.setpoint(float(t)).packed, 0.5, vehicle)[:13] for t in times])
 
 
-def clearance(states: np.ndarray, lines: Sequence[Segment], radii: np.ndarray) -> np.ndarray:
+def clearance(states: np.ndarray, lines: Sequence[Segment], radii: Vector3) -> np.ndarray:
     """Scaled distance of the nearest line minus 1 at each state, negative: the line is in the body, shape (n,)."""
     return np.min([scaled_clearance(states[:, 0:3], states[:, 3:7], line, radii) for line in lines], axis=0)
 
 
-def collisions(states: np.ndarray, lines: Sequence[Segment], radii: np.ndarray) -> int:
+def collisions(states: np.ndarray, lines: Sequence[Segment], radii: Vector3) -> int:
     """How often a line enters the body."""
     inside = np.concatenate([[False], clearance(states, lines, radii) < 0.0])
     return int(np.count_nonzero(~inside[:-1] & inside[1:]))
@@ -122,3 +125,26 @@ def inspected(scenario: Scenario, times: np.ndarray, states: np.ndarray, crashes
     reference_times, reference = reference_states(scenario)
     return Inspected(times, states, judge(states, lines, line, vehicle), reference_times, reference,
                      judge(reference, lines, line, vehicle), lines, line, crashes, message)
+
+
+def recorded(flight: Flight, scenario: Scenario, message: str = "") -> Inspected | None:
+    """The last trajectory of a flight as an inspection; None where none was flown, or a cable sags (the measures are those of lines).
+
+    Args:
+        flight: what was flown.
+        scenario: where the lines truly are.
+        message: why it ended early, where that was no collision.
+    """
+    if scenario.mode != "inspection" or any(cable.sag > 0.0 for cable in scenario.world.cables):
+        return None
+    truth, orders = flight.states("ground_truth/odometry"), flight.values("trajectory")
+    if truth is None or not orders:
+        return None
+    way = orders[-1][1].trajectory
+    during = (truth.t >= way.start_time) & (truth.t <= way.start_time + way.duration)
+    states = np.column_stack([truth.p, truth.q])[during][::EVERY]
+    if len(states) < 2:
+        return None
+    crashes = [c for _, c in flight.values("contact") if c.state == ContactState.COLLISION]
+    return inspected(scenario, truth.t[during][::EVERY] - way.start_time, states, len(crashes),
+                     "; ".join(c.reason for c in crashes) or message)
