@@ -7,28 +7,26 @@ import os
 
 import numpy as np
 import pytest
+from perch_core.ros import topics
 from perch_core.values import CameraImage, ControllerStatus, MotorCommand, OdometryState, Serialized, TrajectoryOrder
 from perch_core.trajectory import rest_to_rest
 from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
-from perch_eval.recorder import CHANNELS, RecorderParameters
-from perch_eval.recorder_node import MessageRecorder
 from perch_eval import demo
 from perch_eval.report import build_report
-from perch_eval.ros.codec import MessageCodec
 from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.ros.recorder import CHANNELS, Recorder, RecorderParameters
 from perch_core.component import Diagnostics, Input, ports
 from perch_sim.scenario import load_scenario
 
 STEP = 2_000_000  # [ns]
-CODEC = MessageCodec()
 
 
 class Recording:
     """A recorder, and the test as its host."""
 
     def __init__(self, path, resolve=None, **parameters):
-        self.recorder = MessageRecorder(RecorderParameters(file=str(path), **parameters))
+        self.recorder = Recorder(RecorderParameters(file=str(path), **parameters))
         self.lines, self.path = [], path
         self.recorder.log.receivers.append(self.lines.append)
         if resolve is not None:
@@ -38,7 +36,7 @@ class Recording:
 
     def give(self, channel, value, topic=None):
         stamp = getattr(value, "stamp", 0)
-        self.handlers[channel](Serialized(topic or f"/{channel.lstrip('/')}", stamp, CODEC.encode(channel, value), CODEC.message(channel)))
+        self.handlers[channel](Serialized(topic or f"/{channel.lstrip('/')}", stamp, topics.encode(channel, value), topics.message_type(channel)))
 
     def fly(self, steps):
         for k in steps:
@@ -57,7 +55,7 @@ def image(stamp, encoding="mono8"):
 
 
 def test_every_channel_has_a_lazy_port_that_waits_for_nothing():
-    found = list(ports(MessageRecorder, Input))
+    found = list(ports(Recorder, Input))
     assert {p._channel for p in found} == {*CHANNELS, "camera_down/image_raw", "camera_front/image_raw"} and all(p.lazy for p in found)
 
 

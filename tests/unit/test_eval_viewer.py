@@ -20,8 +20,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval.ros.definitions import message_definition
 from perch_eval.view.gate import allowed
 from perch_eval.view.scene import Path, map_markers, vehicle_markers, world_markers
-from perch_eval.viewer import CAMERAS, FAST, LOCAL, MARKERS, PASSING, RARE, ViewerParameters
-from perch_eval.viewer_node import MessageViewer
+from perch_eval.ros.viewer import CAMERAS, FAST, LOCAL, MARKERS, PASSING, RARE, Viewer, ViewerParameters
 from perch_msgs.msg import Trajectory
 from perch_sim.scenario import load_scenario
 from rclpy.serialization import serialize_message
@@ -75,7 +74,7 @@ class Show:
 
     def __init__(self, scenario="surface_90", origin=None, **parameters):
         self.loop = asyncio.new_event_loop()
-        self.viewer = MessageViewer(ViewerParameters(port=0, scenario=scenario, **parameters))
+        self.viewer = Viewer(ViewerParameters(port=0, scenario=scenario, **parameters))
         self.handlers = {port.channel(self.viewer): port.handler(self.viewer) for port in ports(type(self.viewer), Input)}
         self.drawn = []
         self.viewer.markers.receivers.append(self.drawn.append)
@@ -218,7 +217,7 @@ def test_what_cannot_be_drawn_is_warned_of_and_passed_on(show):
 def test_a_port_in_use_is_refused_with_what_to_do(show):
     port = show.viewer.server.port
     with pytest.raises(ConfigError, match=f"viewer: port: 127.0.0.1:{port} cannot be served .*choose another"):
-        MessageViewer(ViewerParameters(port=port))
+        Viewer(ViewerParameters(port=port))
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "https://evil.example:8765", "null", "https://app.foxglove.dev.evil.example",

@@ -27,8 +27,8 @@ COMPONENTS = {
     "controller": "perch_control.controller:Controller",
     "mission": "perch_control.mission_component:Mission",
     "description": "perch_core.description:Description",
-    "recorder": "perch_eval.recorder:Recorder",
-    "viewer": "perch_eval.viewer:Viewer",
+    "recorder": "perch_eval.ros.recorder:Recorder",
+    "viewer": "perch_eval.ros.viewer:Viewer",
 }
 """Node -> its component."""
 
@@ -66,7 +66,7 @@ class NodeParameters:
         Raises:
             ConfigError: one of them is unknown, of the wrong type, or out of range.
         """
-        return config.from_mapping(cls, nested(self._launches[node].parameters), node)
+        return config.from_mapping(cls, nested(self._launches[node].parameters), node)  # type: ignore[type-var]
 
     def component(self, node: str) -> Component[Any]:
         """The component of a node with its parameters.

@@ -1,1 +1,1 @@
-"""What perch_eval needs of ROS: message types and definitions, the recorded flight, the action client."""
+"""What perch_eval needs of ROS: message definitions, recorder and viewer, the recorded flight, the action client."""

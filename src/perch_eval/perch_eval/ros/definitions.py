@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -18,6 +19,7 @@ def type_name(msg_type: type) -> str:
     return f"{package}/{kind}/{msg_type.__name__}"
 
 
+@lru_cache(maxsize=None)
 def schema_of(msg_type: type) -> Schema:
     """Name and definition of a message class."""
     name = type_name(msg_type)

@@ -11,14 +11,34 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import secrets
+import socket
 import threading
 from collections.abc import Iterable
 from urllib.parse import urlsplit
+
+from perch_core.errors import ConfigError
 
 HEADER_MAX = 16384  # of a handshake [bytes]
 HANDSHAKE_TIME = 5.0  # [s]
 CHUNK = 65536
 REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+def unservable(host: str, port: int, error: OSError) -> ConfigError:
+    """Why an address cannot be served: it is in use, may not be used, or is none of this machine's."""
+    return ConfigError("viewer", "port", f"{host}:{port} cannot be served ({error.strerror}); choose another, as in --view 8766")
+
+
+def check_free(host: str, port: int) -> None:
+    """Make sure that a port can be served, before anything is started.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    try:
+        socket.create_server((host, port)).close()
+    except OSError as error:
+        raise unservable(host, port, error) from None
 
 
 def hidden_host() -> str:

@@ -10,6 +10,7 @@ from perch_core.values import Marker, Shape
 
 Colour = tuple[float, float, float, float]
 Floats = tuple[float, ...]
+Vector = Sequence[float] | np.ndarray
 _ORIGIN, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
@@ -17,13 +18,13 @@ def _floats(values: Iterable[float]) -> Floats:
     return tuple(float(v) for v in values)
 
 
-def marker(shape: Shape, ns: str, id: int, colour: Colour, scale: Sequence[float], p: Sequence[float] = _ORIGIN,
-           q: Sequence[float] = _UPRIGHT) -> Marker:
+def marker(shape: Shape, ns: str, id: int, colour: Colour, scale: Vector, p: Vector = _ORIGIN,
+           q: Vector = _UPRIGHT) -> Marker:
     """A shape at a pose in `map`."""
     return Marker(shape, ns, id, colour, _floats(scale), _floats(p), _floats(q))
 
 
-def polyline(ns: str, id: int, colour: Colour, width: float, points: Iterable[Sequence[float]], pieces: bool = False) -> Marker:
+def polyline(ns: str, id: int, colour: Colour, width: float, points: Iterable[Vector], pieces: bool = False) -> Marker:
     """A line through points in `map` [m], or (pieces) a line between each two of them; fewer than two points remove it."""
     shape, corners = Shape.LINE_LIST if pieces else Shape.LINE_STRIP, tuple(_floats(p) for p in points)
     if len(corners) < 2:
@@ -36,12 +37,12 @@ def removed(shape: Shape, ns: str, id: int) -> Marker:
     return Marker(shape, ns, id, (0.0, 0.0, 0.0, 0.0), _ORIGIN, removed=True)
 
 
-def arrow(ns: str, id: int, colour: Colour, start: Sequence[float], end: Sequence[float]) -> Marker:
+def arrow(ns: str, id: int, colour: Colour, start: Vector, end: Vector) -> Marker:
     """An arrow between two points in `map`."""
     return Marker(Shape.ARROW, ns, id, colour, (0.02, 0.05, 0.08), points=(_floats(start), _floats(end)))
 
 
-def label(ns: str, id: int, colour: Colour, height: float, p: Sequence[float], text: str) -> Marker:
+def label(ns: str, id: int, colour: Colour, height: float, p: Vector, text: str) -> Marker:
     """A text that always faces the viewer; its letters are `height` high [m]."""
     return Marker(Shape.TEXT, ns, id, colour, (0.0, 0.0, height), _floats(p), text=text)
 

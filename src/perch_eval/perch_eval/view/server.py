@@ -8,10 +8,8 @@ from collections.abc import Iterable
 import foxglove
 import foxglove.websocket
 
-from perch_core.errors import ConfigError
 from perch_eval.mcap_log import Schema
-from perch_eval.view.address import ADVICE
-from perch_eval.view.gate import Gate, hidden_host
+from perch_eval.view.gate import Gate, hidden_host, unservable
 
 
 class LiveServer(foxglove.websocket.ServerListener):
@@ -37,7 +35,7 @@ class LiveServer(foxglove.websocket.ServerListener):
             self._gate = Gate(host, port, (hidden, self._server.port), origins)
         except OSError as error:
             self._server.stop()
-            raise ConfigError("viewer", "port", f"{host}:{port} cannot be served ({error.strerror}); {ADVICE}") from None
+            raise unservable(host, port, error) from None
 
     @property
     def port(self) -> int:

@@ -1,16 +1,14 @@
-"""Ports for components that take messages as they are on the wire, and what they need of ROS to make something of them."""
+"""Components that take messages as they are on the wire."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from perch_core.component import Component, Input
+from perch_core.ros import topics
 from perch_core.values import CameraImage, Serialized
-
-if TYPE_CHECKING:
-    from perch_eval.ros.codec import MessageCodec
 
 CAMERAS = ("down", "front")
 STAMPLESS = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
@@ -25,6 +23,7 @@ class Wire(Input[Serialized]):
 
     def handler(self, component: Component[Any]) -> Callable[[Serialized], None]:
         """Bound to the channel."""
+        assert isinstance(component, Listener)
         return partial(component.on_message, self.channel(component))
 
 
@@ -37,6 +36,7 @@ class Images(Input[CameraImage]):
 
     def handler(self, component: Component[Any]) -> Callable[[CameraImage], None]:
         """Bound to the camera."""
+        assert isinstance(component, Listener)
         return partial(component.on_image, self.camera)
 
 
@@ -44,23 +44,28 @@ class Listener(Component[C]):
     """A component that takes messages by `on_message(channel, message)` and images by `on_image(camera, image)`.
 
     Attributes:
-        codec: set by the node's file.
         resolve: channel to the fully resolved name of its topic; set by a host with a namespace.
         newest: newest stamp so far [ns].
     """
-
-    codec: MessageCodec
 
     def __init__(self, config: C) -> None:
         super().__init__(config)
         self.resolve: Callable[[str], str] = lambda channel: f"/{channel.lstrip('/')}"
         self.newest = 0
 
+    def on_message(self, channel: str, message: Serialized) -> None:
+        """A message of a channel."""
+        raise NotImplementedError
+
+    def on_image(self, camera: str, image: CameraImage) -> None:
+        """An image of a camera."""
+        raise NotImplementedError
+
     def serialized(self, channel: str, message: Any) -> Serialized:
         """A message as it is on the wire, whether the host has it so or as a value; its stamp is when it was sent."""
         if not isinstance(message, Serialized):
             stamp = getattr(message, "stamp", 0)
-            message = Serialized(self.resolve(channel), stamp, self.codec.encode(channel, message), self.codec.message(channel))
+            message = Serialized(self.resolve(channel), stamp, topics.encode(channel, message), topics.message_type(channel))
         if channel in STAMPLESS:
             return message._replace(stamp=self.newest)
         self.newest = max(self.newest, message.stamp)
@@ -71,7 +76,8 @@ def listening(channels: Iterable[str]) -> Callable[[T], T]:
     """Gives a `Listener` a lazy port for each channel and camera."""
 
     def declare(cls: T) -> T:
-        for port in (*(Wire(Serialized, channel, lazy=True) for channel in channels), *map(Images, CAMERAS)):
+        found: list[Wire | Images] = [*(Wire(Serialized, channel, lazy=True) for channel in channels), *map(Images, CAMERAS)]
+        for port in found:
             name = "in_" + port._channel.strip("/").replace("/", "_")
             port.__set_name__(cls, name)
             setattr(cls, name, port)

@@ -12,7 +12,8 @@ from perch_core.component import Diagnostics, LogLine, Wake
 from perch_core.config import quantity, text
 from perch_core.values import NANOSECONDS, CameraImage, CompressedPixels, Serialized
 from perch_eval.mcap_log import McapLog
-from perch_eval.messages_in import Listener, listening
+from perch_eval.ros.definitions import schema_of
+from perch_eval.ros.listener import Listener, listening
 
 CHANNELS = (
     "ground_truth/odometry", "ground_truth/target", "contact", "imu/data_raw", "rotor_state", "motor_command",
@@ -97,9 +98,11 @@ class Recorder(Listener[RecorderParameters]):
                 self._give_up(error)
 
     def _write(self, message: Serialized) -> None:
+        if self._log is None:
+            return
         try:
             if message.topic not in self._log:
-                self._log.add_topic(message.topic, self.codec.schema(message.message))
+                self._log.add_topic(message.topic, schema_of(message.message))
             self._log.write(message.topic, message.data, message.stamp)
             self._messages += 1
         except OSError as error:

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from perch_core.component import Output
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
+from perch_core.ros import topics
 from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, Serialized
 from perch_core.vehicle import load_vehicle
-from perch_eval.messages_in import CAMERAS, Listener, listening
 from perch_eval.extras import require
-from perch_eval.recorder import jpeg
+from perch_eval.ros.definitions import schema_of
+from perch_eval.ros.listener import CAMERAS, Listener, listening
+from perch_eval.ros.recorder import jpeg
 from perch_eval.view.scene import (
     Path, map_markers, path_markers, plan_markers, target_markers, truth_markers, vehicle_markers, world_markers)
 from perch_sim.scenario import load_scenario
@@ -119,7 +121,7 @@ class Viewer(Listener[ViewerParameters]):
             return
         channel = f"camera_{camera}/image_raw/compressed"
         topic = self.resolve(channel)
-        self._declare(topic, self.codec.message(channel))
+        self._declare(topic, topics.message_type(channel))
         if not pace(image.stamp) or not self.server.watched(topic):
             return
         packed = jpeg(image, self.config.image_quality)
@@ -132,7 +134,7 @@ class Viewer(Listener[ViewerParameters]):
 
     def _declare(self, topic: str, message: type) -> None:
         if topic not in self.server:
-            self.server.add_topic(topic, self.codec.schema(message))
+            self.server.add_topic(topic, schema_of(message))
 
     def _send(self, message: Serialized, keep: int = 0) -> None:
         self._declare(message.topic, message.message)
@@ -144,29 +146,29 @@ class Viewer(Listener[ViewerParameters]):
         self._truth = data
 
     def _see_trajectory(self, data: bytes, stamp: int) -> None:
-        order = self.codec.decode("trajectory", data)
+        order = topics.decode("trajectory", data)
         self._plan = plan_markers(order.trajectory, order.at_end == AtEnd.CONTACT)
 
     def _see_target(self, data: bytes, stamp: int) -> None:
-        pose = self.codec.decode("target/pose", data)
+        pose = topics.decode("target/pose", data)
         self._target = target_markers(pose.p_WS, pose.q_WS)
 
     def _see_lines(self, data: bytes, stamp: int) -> None:
-        lines = self.codec.decode("powerlines", data)
+        lines = topics.decode("powerlines", data)
         self._mapped |= {line.id for line in lines.lines}
         self._map = map_markers(lines, self._mapped)
 
     def _see_status(self, data: bytes, stamp: int) -> None:
-        self._words = self.codec.decode("controller/status", data).message
+        self._words = topics.decode("controller/status", data).message
 
     def _see_odometry(self, data: bytes, stamp: int) -> None:
         if not self._scene_pace(stamp):
             return
-        state = self.codec.decode("odometry", data)
+        state = topics.decode("odometry", data)
         self._flown.add(state.p_WB)
         found = vehicle_markers(self._vehicle, state, self._words)
         if self._truth:
-            truth = self.codec.decode("ground_truth/odometry", self._truth)
+            truth = topics.decode("ground_truth/odometry", self._truth)
             self._true_path.add(truth.p_WB)
             found += truth_markers(self._vehicle, truth)
         if self._scenes % SLOW_SCENE == 0:
