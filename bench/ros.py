@@ -24,11 +24,11 @@ from perch_core.values import TrajectoryOrder, nanoseconds, seconds
 from perch_eval.demo import fly
 from perch_eval.domain import reserved_domain
 from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
+from perch_eval.ros.graph_node import GraphNode
 from perch_eval.stack import Stack
 from perch_msgs.msg import ControllerCommand as CommandMessage
 from perch_msgs.msg import MotorCommand
 from perch_sim.scenario import Scenario, load_scenario
-from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import Imu
 
 CHAIN = ("vehicle", "vio_model", "estimator", "controller")  # the stand-in VIO: nothing here is about estimation
@@ -37,15 +37,11 @@ RATES = {"imu/data_raw": Imu, "odometry": Odometry, "motor_command": MotorComman
 WINDOW = 1.0  # s
 
 
-class Probe:
+class Probe(GraphNode):
     """Listens to a running stack."""
 
-    def __init__(self, domain: int) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self.node = rclpy.create_node("probe", context=self._context)
-        self._executor = EventsExecutor(context=self._context)
-        self._executor.add_node(self.node)
+    def __init__(self) -> None:
+        super().__init__("probe")
         self.counts = dict.fromkeys(RATES, 0)
         self.stamp = 0  # of the newest odometry [ns]
         self._orders = {channel: self.node.create_publisher(topic(channel).message, channel, topic(channel).qos.publish)
@@ -116,15 +112,13 @@ class Probe:
         """Take what comes for some wall-clock time; returns how long it really was [s]."""
         begin = time.perf_counter()
         while time.perf_counter() - begin < seconds:
-            self._executor.spin_once(timeout_sec=min(0.05, seconds))
+            self.spin(min(0.05, seconds))
         return time.perf_counter() - begin
 
     def close(self) -> None:
         """Leave the graph."""
-        self._executor.remove_node(self.node)
-        self.node.destroy_node()
         self._aside.destroy_node()
-        rclpy.shutdown(context=self._context)
+        super().close()
 
 
 @contextmanager
@@ -133,7 +127,7 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe
     with reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         with Stack(programs(scenario, folder=folder, **options), folder) as stack:
-            probe = Probe(domain)
+            probe = Probe()
             try:
                 stack.wait_until_ready(probe.visible)
                 for _ in range(600):

@@ -16,7 +16,7 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_eval.nodes import ALL_NODES, programs
 from perch_eval.program import RunningProgram
-from perch_eval.ros.pilot import FlightResult, Pilot
+from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_msgs.msg import ControllerStatus
 from perch_sim.scenario import Scenario, load_scenario
 from system.scripts import PATIENCE
@@ -57,9 +57,9 @@ class Rig:
                            hold_for_goal=lockstep, folder=folder)
         self._programs = {program.name: program for program in started}
         self._running: dict[str, RunningProgram] = {}
-        self.pilot = Pilot()
+        self.pilot = MissionClient()
         self.truth, self.controller, self._cues = None, -1, []
-        node = self.pilot._node
+        node = self.pilot.node
         node.create_subscription(Odometry, "ground_truth/odometry", self._see, topics.topic("odometry").qos.subscribe)
         node.create_subscription(ControllerStatus, "controller/status", self._hear, topics.topic("controller/status").qos.subscribe)
 
@@ -104,7 +104,7 @@ class Rig:
         end = time.monotonic() + PATIENCE
         while not done():
             assert time.monotonic() < end, f"{problem}\n" + "\n".join(self._lines[-30:])
-            self.pilot._spin(0.02)
+            self.pilot.spin(0.02)
 
     def listen(self, duration: float) -> None:
         """Run the pilot's callbacks for some wall-clock time [s]."""
@@ -144,7 +144,7 @@ class Rig:
             if isinstance(state["waits"], str):
                 state["waits"] = None
             go_on()
-            self.pilot._spin(0.02)
+            self.pilot.spin(0.02)
         return result
 
     def at_rest(self) -> bool:

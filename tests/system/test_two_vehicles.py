@@ -14,7 +14,7 @@ from perch_eval.domain import reserved_domain
 from perch_eval.in_process import fly
 from perch_eval.mcap_log import read
 from perch_eval.nodes import ALL_NODES, node_programs
-from perch_eval.ros.pilot import FlightResult, Pilot
+from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.stack import Stack
 from perch_sim.scenario import load_scenario
@@ -26,21 +26,21 @@ OF_THE_DOMAIN = {"/diagnostics", "/parameter_events", "/rosout"}
 
 
 @contextmanager
-def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, Pilot]]:
+def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, MissionClient]]:
     """The nodes of a flight without images and with a recorder, in lockstep, and who sends the goal."""
     folder.mkdir()
     overrides = {"mission": {"lockstep_hold": "perch"}, "recorder": {"file": str(folder / "flight.mcap")}}
     launches = modelled_sight_node.blind_launches(load_scenario(SCENARIO), SEEDS[namespace], SCENARIO, True, extra=("recorder",), overrides=overrides)
     programs = node_programs(launches, folder, namespace=namespace, composed=set(ALL_NODES) - set(modelled_sight_node.NODES))
     with Stack(modelled_sight_node.blind_programs(programs), folder) as stack:
-        pilot = Pilot(namespace)
+        pilot = MissionClient(namespace)
         try:
             yield stack, pilot
         finally:
             pilot.close()
 
 
-def flown(stack: Stack, pilot: Pilot) -> FlightResult:
+def flown(stack: Stack, pilot: MissionClient) -> FlightResult:
     """From the goal to its end."""
     result = pilot.fly(load_scenario(SCENARIO), check=stack.raise_if_ended, stall=PATIENCE)
     pilot.linger(LINGER, stack.raise_if_ended, PATIENCE)

@@ -13,7 +13,7 @@ from perch_core.values import CameraModel
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.preflight import checks, command
 from perch_eval.preflight.camera_turns import CameraTurns
-from perch_eval.preflight.ros import visitor
+from perch_eval.preflight.ros import listener
 from perch_sim.drawing import DrawnOnDemand
 from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import load_scenario
@@ -84,13 +84,13 @@ def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file:
     def read(samples: list) -> list:
         return [one._replace(f_B=tuple(axes @ one.f_B), w_B=tuple(axes @ one.w_B)) for one in samples]
 
-    class Bench(visitor.Visitor):
+    class Bench(listener.GraphListener):
         """In the place of the graph: everything is there at once."""
 
         def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
             values = {**seen.rest, "imu/data_raw": read(seen.rest["imu/data_raw"])}
             self.values = {channel: [(1e-9 * getattr(value, "stamp", 0), value) for value in values.get(channel, [])]
-                           for channel in visitor.CHANNELS}
+                           for channel in listener.CHANNELS}
             self.turns = CameraTurns(MOUNT.camera)
 
         def watch(self, camera, model) -> None:
@@ -106,7 +106,7 @@ def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file:
         def close(self) -> None:
             pass
 
-    monkeypatch.setattr(visitor, "Visitor", Bench)
+    monkeypatch.setattr(listener, "GraphListener", Bench)
     monkeypatch.setattr(command, "load_vehicle", lambda name: file)
     monkeypatch.setattr("sys.argv", ["preflight.py", "--vehicle", "rpg", "--shake", "front"])
     code, lines = command.main(), capsys.readouterr().out.splitlines()

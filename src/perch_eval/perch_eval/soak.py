@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from perch_eval.evaluation.document import machine
 from perch_eval.modelled_sight_node import blind_launches, blind_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
 from perch_eval.revision import banner, commit
-from perch_eval.ros.pilot import Pilot
+from perch_eval.ros.mission_client import MissionClient
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import load_scenario
 
@@ -90,7 +90,7 @@ def slope(values: Sequence[float], settled: int = SETTLED) -> float | None:
     return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
 
 
-def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: float, flights: int | None, folder: Path,
+def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
         keep: Callable[[Sequence[Flight]], object] = lambda _: None) -> list[Flight]:
     """Fly until there has been so much simulated time, or so many flights.
 
@@ -108,14 +108,15 @@ def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: flo
         PerchError: the stack does not come up, or breaks.
     """
     source = config.find("scenarios", name)
-    scenario, found = load_scenario(source), []
+    scenario = load_scenario(source)
+    found: list[Flight] = []
     if cameras:
         started = programs(scenario, seed, scenario_source=str(source), composed=composed, folder=folder)
     else:
         started = blind_programs(node_programs(blind_launches(scenario, seed, str(source), True), folder, composed=composed))
     with reserved_domain(range(43, 70)) as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        progress, pilot = Progress(flights or 0, what="flights"), Pilot()
+        progress, pilot = Progress(flights or 0, what="flights"), MissionClient()
         try:
             with Stack(started, folder) as stack:
                 stack.wait_until_ready(pilot.visible_nodes, READY)
@@ -137,7 +138,7 @@ def fly(name: str, seed: int, cameras: bool, composed: Sequence[str], hours: flo
     return found
 
 
-def _once(pilot: Pilot, scenario: Any, stack: Stack) -> Flight:
+def _once(pilot: MissionClient, scenario: Any, stack: Stack) -> Flight:
     outcome, words, departed = "failed", "", False
     try:
         result = pilot.fly(scenario, check=stack.raise_if_ended)

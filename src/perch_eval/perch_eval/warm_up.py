@@ -16,7 +16,7 @@ from perch_eval.domain import reserved_domain
 from perch_eval.goal import SUCCESSES
 from perch_eval.in_process import Sensing, fly
 from perch_eval.nodes import ALL_NODES, programs
-from perch_eval.ros.pilot import Pilot
+from perch_eval.ros.mission_client import MissionClient
 from perch_eval.stack import Stack
 from perch_sim.scenario import load_scenario
 
@@ -40,13 +40,13 @@ def warm_up() -> bool:
         overrides = {"vehicle": {"start_timeout": PATIENCE, "lockstep_timeout": PATIENCE}}
         started = programs(scenario, composed=ALL_NODES, record=folder / "flight.mcap", folder=folder, overrides=overrides)
         with Stack(started, folder) as stack:
-            pilot = Pilot()
+            client = MissionClient()
             try:
-                stack.wait_until_ready(pilot.visible_nodes, PATIENCE)
-                pilot.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
-                reached = pilot.time >= CLOCK_BEGINS + SIMULATED
+                stack.wait_until_ready(client.visible_nodes, PATIENCE)
+                client.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
+                reached = client.time >= CLOCK_BEGINS + SIMULATED
             finally:
-                pilot.close()
+                client.close()
     return reached and fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
 
 

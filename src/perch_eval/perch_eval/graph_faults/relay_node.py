@@ -35,7 +35,8 @@ class Disturbance:
 
     def __init__(self, seed: int = 1) -> None:
         self.fault = ""
-        self._rng, self._kept = random.Random(seed), []
+        self._rng = random.Random(seed)
+        self._kept: list[Any] = []
         self._late: deque[tuple[float, Any]] = deque()
 
     def passed(self, message: Any, now: float) -> list[Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -34,7 +36,7 @@ class CameraTurns:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._last: tuple[int, np.ndarray, np.ndarray | None] | None = None
+        self._last: tuple[int, np.ndarray, Any] | None = None
         self.spans: list[tuple[int, int, np.ndarray]] = []
 
     def add(self, stamp: int, image: np.ndarray) -> None:
@@ -42,7 +44,7 @@ class CameraTurns:
         grey = np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])
         if self._last is not None and self._last[2] is not None and stamp > self._last[0]:
             then, old, corners = self._last
-            moved, found, _ = cv2.calcOpticalFlowPyrLK(old, grey, corners, None, winSize=(21, 21), maxLevel=4)
+            moved, found, _ = cv2.calcOpticalFlowPyrLK(old, grey, corners, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
             before, after = (self._camera.unproject(points.reshape(-1, 2).astype(float)) for points in (corners, moved))
             good = (found.ravel() == 1) & np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
             if good.sum() >= LEAST:

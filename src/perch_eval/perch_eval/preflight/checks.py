@@ -64,7 +64,7 @@ def stream(channel: str, stamps: Sequence[int]) -> list[Check]:
     if len(stamps) < 3:
         return [Check(f"rate {channel}", Verdict.FAILED, f"{len(stamps)} messages",
                       "start what publishes it; see namespaces, ROS_DOMAIN_ID and QoS (topic.py info)")]
-    gaps = 1e-9 * np.diff(np.array(stamps, dtype=np.int64))
+    gaps: np.ndarray = 1e-9 * np.diff(np.array(stamps, dtype=np.int64))
     period = float(np.median(gaps))
     rate = 1.0 / period if period > 0.0 else np.inf
     return [judged(f"rate {channel}", 0.9 * low <= rate <= 1.1 * high, f"{rate:.4g} Hz",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 import numpy as np
 
 from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.arguments import command_parser, exit_code
 from perch_eval.preflight import checks
 from perch_eval.preflight.checks import Check, Verdict
 
@@ -26,8 +26,7 @@ DISARMED, ARMED, FAILED = 0, 1, 6     # perch_msgs/ControllerStatus
 
 def command_line() -> argparse.ArgumentParser:
     """The options."""
-    parser = argparse.ArgumentParser(prog="preflight.py", description="Check a running vehicle before it flies.", epilog=EXAMPLES,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
     parser.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
     parser.add_argument("--namespace", default="", help="namespace of its nodes")
     parser.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
@@ -38,79 +37,78 @@ def command_line() -> argparse.ArgumentParser:
     return parser
 
 
-def listened(visitor: Any, vehicle: Vehicle) -> list[Check]:
+def listened(listener: Any, vehicle: Vehicle) -> list[Check]:
     """What is judged of a vehicle at rest."""
-    values = {channel: [value for _, value in entries] for channel, entries in visitor.values.items()}
+    values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
     found = [check for channel in channels for check in checks.stream(channel, [value.stamp for value in values[channel]])]
-    seen = {name: visitor.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts}
-    found += checks.clocks(visitor.stamped("imu/data_raw"), seen)
-    found += checks.frames(visitor.newest("odometry"), visitor.newest("imu/data_raw"))
+    seen = {name: listener.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts}
+    found += checks.clocks(listener.stamped("imu/data_raw"), seen)
+    found += checks.frames(listener.newest("odometry"), listener.newest("imu/data_raw"))
     found += checks.rest(values["imu/data_raw"])
-    found += [checks.camera_model(name, visitor.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
+    found += [checks.camera_model(name, listener.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
     return found + checks.extrinsics(values["/tf_static"], vehicle)
 
 
-def shaken(visitor: Any, vehicle: Vehicle, camera: str) -> Check:
+def shaken(listener: Any, vehicle: Vehicle, camera: str) -> Check:
     """The rotation between camera and IMU, told while the vehicle is shaken."""
     if camera:
-        visitor.watch(camera, vehicle.mounts[camera].camera)
+        listener.watch(camera, vehicle.mounts[camera].camera)
         print("shake the vehicle about all axes for 10 s ...", flush=True)
-        visitor.listen(10.0)
-        imu = [value for _, value in visitor.values["imu/data_raw"]]
-        pairs = visitor.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
+        listener.listen(10.0)
+        imu = [value for _, value in listener.values["imu/data_raw"]]
+        turned_B, turned_C = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
                                      vehicle.mounts[camera].stamp_offset)
     else:
-        camera, pairs = next(iter(vehicle.mounts), ""), (np.zeros((0, 3)), np.zeros((0, 3)))
-    return checks.shaken(camera, *pairs, vehicle)
+        camera, turned_B, turned_C = next(iter(vehicle.mounts), ""), np.zeros((0, 3)), np.zeros((0, 3))
+    return checks.shaken(camera, turned_B, turned_C, vehicle)
 
 
-def exercised(visitor: Any, allowed: bool, watchdog: bool, bound: float = checks.STOPPED) -> list[Check]:
+def exercised(listener: Any, allowed: bool, watchdog: bool, bound: float = checks.STOPPED) -> list[Check]:
     """Arming, disarming, killing, and the watchdog, where the propellers are off."""
     takeover = Check("pilot's takeover", Verdict.OPEN, "this program has no switch",
                      "props off, armed: flip the pilot's switch, and see the autopilot's `mode` in /diagnostics")
     if not allowed:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "watchdog")] + [takeover]
-    found = [checks.obeyed("armed state", visitor.order(ARM, ARMED), ARMED, True),
-             checks.obeyed("disarming", visitor.order(DISARM, DISARMED), DISARMED, False)]
+    found = [checks.obeyed("armed state", listener.order(ARM, ARMED), ARMED, True),
+             checks.obeyed("disarming", listener.order(DISARM, DISARMED), DISARMED, False)]
     if found[0].verdict is Verdict.PASSED:
-        visitor.order(ARM, ARMED)
-        found.append(checks.obeyed("kill", visitor.order(KILL, FAILED), FAILED, False))
-        visitor.order(DISARM, DISARMED)
+        listener.order(ARM, ARMED)
+        found.append(checks.obeyed("kill", listener.order(KILL, FAILED), FAILED, False))
+        listener.order(DISARM, DISARMED)
     last = None, None
-    if watchdog and visitor.order(ARM, ARMED).armed:
+    if watchdog and listener.order(ARM, ARMED).armed:
         print("armed: stop the controller's process now (within 60 s) ...", flush=True)
-        last = visitor.await_end_of_commands(60.0)
-        visitor.order(KILL, FAILED)
+        last = listener.await_end_of_commands(60.0)
+        listener.order(KILL, FAILED)
     return [*found, checks.stopped(*last, bound), takeover]
 
 
 def main() -> int:
     """Listen, judge, tell."""
     arguments = command_line().parse_args()
-    if not 1.0 <= arguments.listen <= 300.0:
-        print(f"error: --listen: {arguments.listen:g} is outside [1, 300] s", file=sys.stderr)
-        return 2
-    try:
-        vehicle = load_vehicle(arguments.vehicle)
-        if arguments.shake and arguments.shake not in vehicle.mounts:
-            raise PerchError(f"--shake: {vehicle.name} has no camera {arguments.shake!r}")
-        from perch_eval.preflight.ros.visitor import Visitor
+    return exit_code(lambda: _check(arguments))
 
-        visitor = Visitor(vehicle, arguments.namespace)
-    except PerchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+
+def _check(arguments: argparse.Namespace) -> int:
+    if not 1.0 <= arguments.listen <= 300.0:
+        raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
+    vehicle = load_vehicle(arguments.vehicle)
+    if arguments.shake and arguments.shake not in vehicle.mounts:
+        raise PerchError(f"--shake: {vehicle.name} has no camera {arguments.shake!r}")
+    from perch_eval.preflight.ros.listener import GraphListener
+
+    listener = GraphListener(vehicle, arguments.namespace)
     try:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
-        visitor.await_first("imu/data_raw", arguments.listen)
-        visitor.listen(arguments.listen)
-        found = [*listened(visitor, vehicle), shaken(visitor, vehicle, arguments.shake or ""),
-                 *exercised(visitor, arguments.props_off, arguments.watchdog,
+        listener.await_first("imu/data_raw", arguments.listen)
+        listener.listen(arguments.listen)
+        found = [*listened(listener, vehicle), shaken(listener, vehicle, arguments.shake or ""),
+                 *exercised(listener, arguments.props_off, arguments.watchdog,
                             checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
     finally:
-        visitor.close()
+        listener.close()
     print("\n".join(map(str, found)))
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}
     print(", ".join(f"{count} {verdict.value}" for verdict, count in counts.items()))

@@ -12,7 +12,7 @@ from perch_core import so3
 from perch_core.ros import topics
 from perch_core.values import seconds
 from perch_eval.graph_faults.cases import Situation
-from perch_eval.ros.pilot import Pilot
+from perch_eval.ros.mission_client import MissionClient
 from perch_sim.contact_event import ContactState
 
 HOVERING = 3  # perch_msgs/ControllerStatus
@@ -26,7 +26,7 @@ class Watcher:
         contacts: all of them, in order.
     """
 
-    def __init__(self, pilot: Pilot) -> None:
+    def __init__(self, pilot: MissionClient) -> None:
         self._newest: dict[str, bytes] = {}
         self.contacts: list[Any] = []
         self._start: tuple[float, ...] | None = None
@@ -57,7 +57,7 @@ class Watcher:
     def height(self) -> float:
         """Above where the vehicle stood before the flight [m]."""
         p = self.position
-        return 0.0 if p is None else p[2] - self._start[2]
+        return 0.0 if p is None or self._start is None else p[2] - self._start[2]
 
     @property
     def time(self) -> float:

@@ -13,8 +13,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from perch_core.errors import PerchError
 from perch_eval.goal import goal_of
-from perch_eval.ros import pilot as pilot_module
-from perch_eval.ros.pilot import Pilot
+from perch_eval.ros import mission_client as client_module
+from perch_eval.ros.mission_client import MissionClient
 from perch_core.ros import topics
 from perch_core.ros.messages.mission import goal_value
 from perch_msgs.action import Perch
@@ -105,7 +105,7 @@ def mission(ros_domain):
 
 @pytest.fixture
 def pilot(mission):
-    found = Pilot()
+    found = MissionClient()
     yield found
     found.close()
 
@@ -151,11 +151,11 @@ def hear_who_owes(pilot):
     end = time.monotonic() + 60.0
     while not pilot.waiting_for:
         assert time.monotonic() < end
-        pilot._spin(0.02)
+        pilot.spin(0.02)
 
 
 def test_who_is_waited_for_is_told_when_time_stands_still(mission, pilot, monkeypatch):
-    monkeypatch.setattr(pilot_module, "NAMED", 0.5)
+    monkeypatch.setattr(client_module, "NAMED", 0.5)
     told, on_phase = finish_when(mission, "waiting")
     mission.passes.set()
     hear_who_owes(pilot)
@@ -169,13 +169,13 @@ def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(miss
     mission.passes.set()
     hear_who_owes(pilot)
     threading.Thread(target=lambda: (mission.begins.wait(120.0), mission.passes.clear()), daemon=True).start()
-    look = pilot_module._Progress.look
+    look = client_module._Progress.look
 
     def hurried(progress, time_now):
         progress._moved -= 0.0 if mission.passes.is_set() else 100.0  # every look is later than the one before
         return look(progress, time_now)
 
-    monkeypatch.setattr(pilot_module._Progress, "look", hurried)
+    monkeypatch.setattr(client_module._Progress, "look", hurried)
     with pytest.raises(PerchError, match=r"stood still at .* waiting for estimator: odometry of 1.200 s"):
         pilot.fly(SCENARIO, stall=1000.0)
 

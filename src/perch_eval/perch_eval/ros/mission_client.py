@@ -1,4 +1,4 @@
-"""The user's side of a flight: sends the Perch goal, follows its feedback, waits for its result."""
+"""The action client of a flight: sends the Perch goal, follows its feedback, waits for its result."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from perch_msgs.action import Perch
 from rclpy.action import ActionClient
-from rclpy.context import Context
-from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -23,7 +20,7 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.messages.mission import goal_message
 from perch_eval.goal import goal_of, outcome_of
-from perch_eval.nodes import in_namespace
+from perch_eval.ros.graph_node import GraphNode
 from perch_sim.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
@@ -78,30 +75,28 @@ class _Progress:
         return True
 
 
-class Pilot:
-    """An action client in a ROS context of its own. Time is that of `/clock`, in a namespace that of its `clock`."""
+class MissionClient(GraphNode):
+    """The mission's client. Time is that of `/clock`, in a namespace that of its `clock`."""
 
     def __init__(self, namespace: str = "") -> None:
         """
         Args:
             namespace: of the vehicle's nodes, as in `/quad1`.
         """
-        self._context = Context()
-        rclpy.init(context=self._context)
-        self._node = Node("pilot", context=self._context, cli_args=["--ros-args", *in_namespace(namespace)], start_parameter_services=False)
-        self._executor = EventsExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._client = ActionClient(self._node, Perch, "perch")
-        self._vehicle = self._node.get_namespace().rstrip("/") + "/vehicle"
+        super().__init__("mission_client", namespace)
+        self._client = ActionClient(self.node, Perch, "perch")
+        self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
         self._time, self._waiting_for, self._looked = 0.0, "", 0.0
         self._heard: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self._process: dict[str, str] = {}  # node -> where it runs, as its diagnostics say
-        self._silent, self._news = set(), []
-        self._interrupted, self._handler = False, None
+        self._silent: set[str] = set()
+        self._news: list[str] = []
+        self._interrupted = False
+        self._handler: Any = None
         if threading.current_thread() is threading.main_thread():
             self._handler = signal.signal(signal.SIGINT, self._interrupt)
-        self._node.create_subscription(Clock, "/clock", self._receive_clock, topics.topic("/clock").qos.subscribe)
-        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
+        self.node.create_subscription(Clock, "/clock", self._receive_clock, topics.topic("/clock").qos.subscribe)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
                                        topics.topic("/diagnostics").qos.subscribe)
 
     def _interrupt(self, *_: Any) -> None:
@@ -112,9 +107,9 @@ class Pilot:
             self._interrupted = False
             raise KeyboardInterrupt
 
-    def _spin(self, timeout: float) -> None:
-        """Run callbacks; an interrupt counts afterwards, as rclpy's C++ cannot pass on an exception out of a callback."""
-        self._executor.spin_once(timeout_sec=timeout)
+    def spin(self, timeout: float) -> None:
+        """Run what has come, or comes in time [s]; an interrupt counts afterwards: rclpy's C++ cannot pass on an exception of a callback."""
+        super().spin(timeout)
         self._check_interrupt()
 
     @property
@@ -126,15 +121,6 @@ class Pilot:
     def waiting_for(self) -> str:
         """Who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody."""
         return self._waiting_for
-
-    @property
-    def node(self) -> Node:
-        """Its node, for further subscriptions."""
-        return self._node
-
-    def listen(self, timeout: float) -> None:
-        """Run what has come, or comes in time [s]."""
-        self._spin(timeout)
 
     def news(self) -> list[str]:
         """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended."""
@@ -151,8 +137,8 @@ class Pilot:
 
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
-        self._spin(0.02)
-        return {f"{ns.rstrip('/')}/{name}" for name, ns in self._node.get_node_names_and_namespaces()}
+        self.spin(0.02)
+        return {f"{ns.rstrip('/')}/{name}" for name, ns in self.node.get_node_names_and_namespaces()}
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
             check: Callable[[], None] = lambda: None, stall: float = 60.0) -> FlightResult:
@@ -180,8 +166,8 @@ class Pilot:
         self._spin_until(self._client.server_is_ready, check, START_PATIENCE, "the mission's action server does not appear")
         for node, service in SERVICES.items():
             if node in scenario.nodes:
-                name = self._node.resolve_service_name(service)
-                self._spin_until(lambda name=name: self._node.count_services(name) > 0, check, START_PATIENCE, f"{node} does not offer {service}")
+                offered = partial(self.node.count_services, self.node.resolve_service_name(service))
+                self._spin_until(offered, check, START_PATIENCE, f"{node} does not offer {service}")
         progress = _Progress(self._time)
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
         self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
@@ -191,7 +177,7 @@ class Pilot:
         result = handle.get_result_async()
         cancelled, servers = False, self._servers()
         while not result.done():
-            self._spin(0.05)
+            self.spin(0.05)
             check()
             for words in self.news():
                 on_phase(self._time, seen[0], words)
@@ -224,36 +210,34 @@ class Pilot:
         Raises:
             PerchError: the mission does not answer.
         """
-        client = self._node.create_client(Trigger, "depart")
+        client = self.node.create_client(Trigger, "depart")
         try:
             self._spin_until(client.service_is_ready, check, stall, "the mission does not offer depart")
             answer = client.call_async(Trigger.Request())
             self._spin_until(answer.done, check, stall, "the mission does not answer to depart")
             return answer.result().success, answer.result().message
         finally:
-            self._node.destroy_client(client)
+            self.node.destroy_client(client)
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 30.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
         end, last = self._time + duration, time.monotonic() + patience
         while self._time < end and time.monotonic() < last:
-            self._spin(0.05)
+            self.spin(0.05)
             check()
 
     def close(self) -> None:
         """Leave the graph."""
         if self._handler is not None:
             signal.signal(signal.SIGINT, self._handler)
-        self._executor.shutdown()  # it holds the context, and so the middleware's threads, sockets and shared memory
         self._client.destroy()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        super().close()
         self._check_interrupt()
 
     def _servers(self) -> set[bytes]:
         """Who carries out goals."""
-        topic = f"{self._node.resolve_service_name('perch')}/_action/status"
-        return {bytes(info.endpoint_gid) for info in self._node.get_publishers_info_by_topic(topic)}
+        topic = f"{self.node.resolve_service_name('perch')}/_action/status"
+        return {bytes(info.endpoint_gid) for info in self.node.get_publishers_info_by_topic(topic)}
 
     def _check_server(self, servers: set[bytes]) -> None:
         """A result comes from the process that took the goal, or never."""
@@ -267,10 +251,10 @@ class Pilot:
     def _whom(self) -> str:
         return f"waiting for {self._waiting_for}" if self._waiting_for else f"{self._vehicle} does not say why"
 
-    def _spin_until(self, done: Callable[[], bool], check: Callable[[], None], timeout: float, problem: str) -> None:
+    def _spin_until(self, done: Callable[[], object], check: Callable[[], None], timeout: float, problem: str) -> None:
         last = time.monotonic() + timeout
         while not done():
-            self._spin(0.05)
+            self.spin(0.05)
             check()
             if time.monotonic() > last:
                 waiting = f" (the vehicle is waiting for {self._waiting_for})" if self._waiting_for else ""

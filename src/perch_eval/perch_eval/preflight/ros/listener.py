@@ -1,4 +1,4 @@
-"""A node that listens to a vehicle's graph for preflight, and gives the controller orders where it is allowed to."""
+"""Listens to a vehicle's graph for preflight, and gives the controller orders where it is allowed to."""
 
 from __future__ import annotations
 
@@ -7,31 +7,25 @@ from copy import copy
 from functools import partial
 from typing import Any
 
-import rclpy
-from rclpy.context import Context
-from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
-
 from perch_core.camera import Camera
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.values import ControllerCommand, RotorState
 from perch_core.vehicle import Vehicle
-from perch_eval.nodes import in_namespace
 from perch_eval.preflight.camera_turns import CameraTurns
 from perch_eval.preflight.checks import ANSWER, Order
+from perch_eval.ros.graph_node import GraphNode
 
 COMMANDS = ("motor_command", "rates_thrust_command", "attitude_thrust_command")
 CHANNELS = ("imu/data_raw", "odometry", "camera_down/camera_info", "camera_front/camera_info", "controller/status", "rotor_state",
-            "/tf_static",
-            "/diagnostics", *COMMANDS)
+            "/tf_static", "/diagnostics", *COMMANDS)
 KEPT = 20_000       # values of a channel
 DEEP = 2000         # messages that wait while this program does not run
 TURNING = 0.02      # of its highest speed: a rotor that is faster turns
 SETTLING = 0.3      # after an effect, until the commands are looked at [s]
 
 
-class Visitor:
+class GraphListener(GraphNode):
     """Subscribes to everything that is judged.
 
     Attributes:
@@ -40,11 +34,7 @@ class Visitor:
     """
 
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
-        self._context = Context()
-        rclpy.init(context=self._context)
-        self._node = Node("preflight", context=self._context, cli_args=["--ros-args", *in_namespace(namespace)], start_parameter_services=False)
-        self._executor = EventsExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        super().__init__("preflight", namespace)
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
         self.turns: CameraTurns | None = None
         self._fastest = vehicle.speed_max
@@ -52,9 +42,9 @@ class Visitor:
             row = topics.topic(channel)
             profile = copy(row.qos.subscribe)
             profile.depth = max(profile.depth, DEEP)
-            self._node.create_subscription(row.message, channel, partial(self._take, channel, row), profile, raw=True)
+            self.node.create_subscription(row.message, channel, partial(self._take, channel, row), profile, raw=True)
         order = topics.topic("controller/command")
-        self._orders = self._node.create_publisher(order.message, "controller/command", order.qos.publish)
+        self._orders = self.node.create_publisher(order.message, "controller/command", order.qos.publish)
 
     def _take(self, channel: str, row: topics.Topic, data: bytes) -> None:
         try:
@@ -67,6 +57,7 @@ class Visitor:
 
     def _look(self, row: topics.Topic, data: bytes) -> None:
         image = row.read(data)
+        assert self.turns is not None
         self.turns.add(image.stamp, image.pixels())
 
     def await_first(self, channel: str, patience: float) -> None:
@@ -78,13 +69,13 @@ class Visitor:
     def watch(self, camera: str, model: Camera) -> None:
         """Look through a camera from now on."""
         self.turns, row = CameraTurns(model), topics.topic(f"camera_{camera}/image_raw")
-        self._node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._look, row), row.qos.subscribe, raw=True)
+        self.node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._look, row), row.qos.subscribe, raw=True)
 
     def listen(self, duration: float) -> None:
         """For so long [s]."""
         end = time.monotonic() + duration
         while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.05)
+            self.spin(0.05)
 
     def stamped(self, channel: str) -> list[tuple[float, int]]:
         """Arrival [s] and stamp [ns] of everything on a channel."""
@@ -125,9 +116,3 @@ class Visitor:
         told += [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
                  if arrival > since and "armed" in said.values]
         return max((arrival for arrival, turns in told if turns), default=since) if told else None
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
