@@ -10,7 +10,7 @@ import numpy as np
 from harness import Figure, figure, measure
 from perch_eval import estimation_flight
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.workers import spread
+from perch_eval.campaign.workers import in_processes
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import Estimator, ImuSample, Inertial, VioPose
@@ -28,8 +28,11 @@ def figures(quick: bool) -> list[Figure]:
     ukf = _ukf(quick)  # by the wall clock: before the flights, which use every core
     tasks = [(scenario, seed) for scenario in (*dict(SCENARIOS), IDEAL) for seed in range(1 if quick else 20)]
     flown: dict[str, list[_Flown]] = {scenario: [] for scenario, _ in tasks}
-    for one, (scenario, _) in zip(spread(_fly, None, Progress(len(tasks), what="perches"), *zip(*tasks)), tasks):
+    progress = Progress(len(tasks), what="perches")
+    for (scenario, _), one in in_processes(_fly, tasks):
         flown[scenario].append(one)
+        progress.add(True)
+    progress.close()
     costs = [cost for one in sum(flown.values(), []) for cost in one.costs]
     out = [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="), *ukf]
     for scenario, name in SCENARIOS:
@@ -51,10 +54,10 @@ class _Flown:
     delay_costs: float   # RMSE with LATENCY over that without
 
 
-def _fly(scenario: str, seed: int) -> _Flown:
+def _fly(task: tuple[str, int]) -> _Flown:
     """One rendered perch through VIO and UKF."""
     cv2.setNumThreads(1)
-    flight = estimation_flight.fly(load_scenario(scenario), seed)
+    flight = estimation_flight.fly(load_scenario(task[0]), task[1])
     steps = estimation_flight.run_vio(flight)
     late = estimation_flight.run_estimator(flight, steps, latency=LATENCY)
     prompt = estimation_flight.run_estimator(flight, steps, latency=0.0)

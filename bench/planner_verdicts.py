@@ -14,7 +14,7 @@ import exact_sturm
 
 from perch_core import bernstein
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.workers import spread
+from perch_eval.campaign.workers import in_processes
 from perch_planner import bounds
 
 _CHUNK = 100  # polynomials
@@ -38,5 +38,9 @@ def _wrong(first: int) -> int:
 def wrong_verdicts(count: int) -> float:
     """Verdicts on `count` polynomials, a multiple of 100, that the exact chain contradicts; on all processors but one."""
     starts = range(0, count, _CHUNK)
-    progress = Progress(len(starts), what=f"times {_CHUNK} verdicts")
-    return float(sum(spread(_wrong, max(1, (os.cpu_count() or 1) - 1), progress, starts, good=lambda wrong: not wrong)))
+    progress, total = Progress(len(starts), what=f"times {_CHUNK} verdicts"), 0
+    for _, wrong in in_processes(_wrong, starts, max(1, (os.cpu_count() or 1) - 1)):
+        total += wrong
+        progress.add(not wrong)
+    progress.close()
+    return float(total)

@@ -1,6 +1,5 @@
 """Campaign files, draws, causes of failure, results and their ranking."""
 
-import io
 import math
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.stats import binomtest, kstest
+from scipy.stats import kstest
 
 from perch_core.errors import ConfigError
 from perch_eval import demo
@@ -21,9 +20,7 @@ from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.distributions import parse
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.figures import Axis
-from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.ranking import worst
-from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results
+from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results, worst
 from perch_eval.campaign.specification import Run, load_campaign, scenario_of
 from perch_eval.evaluation import command as evaluation
 from perch_eval.statistics import Rate, Spread
@@ -217,9 +214,10 @@ def test_every_value_has_its_cell():
 
 
 @pytest.mark.parametrize("k, n", [(0, 10), (4, 5), (95, 100), (100, 100), (3, 7)])
-def test_wilson_interval_is_that_of_scipy(k, n):
-    reference = binomtest(k, n).proportion_ci(method="wilson")
-    assert Rate(k, n).interval == pytest.approx((reference.low, reference.high), abs=1e-9)
+def test_the_interval_is_that_of_the_score_test(k, n):
+    """At its ends the share that was seen is 1.96 standard deviations from the rate (Wilson 1927)."""
+    for p, outermost in zip(Rate(k, n).interval, (0.0, 1.0)):
+        assert abs(k / n - p) == pytest.approx(1.959964 * np.sqrt(p * (1.0 - p) / n), abs=1e-6) if p != outermost else k == n * outermost
 
 
 def test_spread_leaves_out_what_is_no_number():
@@ -247,11 +245,11 @@ def test_a_run_that_a_broken_pool_refuses_goes_on_waiting(monkeypatch, broken_at
         def __init__(self, jobs, mp_context, initializer):
             super().__init__(jobs)
 
-        def submit(self, function, task):
+        def submit(self, function, work, task):
             submitted.append(task)
             if len(submitted) == broken_at:
                 raise BrokenProcessPool
-            return super().submit(function, task)
+            return super().submit(function, work, task)
 
     monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
     monkeypatch.setattr(workers, "carry_out", lambda task: RunResult(task.run.number, task.run.seed, "perched", "perched", ""))
@@ -259,7 +257,7 @@ def test_a_run_that_a_broken_pool_refuses_goes_on_waiting(monkeypatch, broken_at
     assert {r.number for r in workers.in_pool(tasks, 2)} == set(range(12))
 
 
-def test_work_in_processes_keeps_its_order_and_ends_with_whoever_waits_for_it(monkeypatch):
+def test_work_in_processes_ends_with_whoever_waits_for_it(monkeypatch):
     ended = []
 
     class Pool(ThreadPoolExecutor):
@@ -267,14 +265,12 @@ def test_work_in_processes_keeps_its_order_and_ends_with_whoever_waits_for_it(mo
             super().__init__(jobs)
 
         def shutdown(self, wait=True, *, cancel_futures=False):
-            ended.append((wait, cancel_futures))
+            ended.append(wait)
             super().shutdown(wait, cancel_futures=cancel_futures)
 
     monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
-    progress = Progress(2, out=io.StringIO())
-    done = workers.spread(divmod, 1, progress, [7, 9], [2, 4], good=lambda result: result[0] > 2)
-    assert list(done) == [(3, 1), (2, 1)] and "2/2 runs, 1 good" in progress.line(0.0)
-    interrupted = workers.spread(divmod, 1, Progress(2, out=io.StringIO()), [7, 9], [2, 4])
+    assert dict(workers.in_processes(abs, [-7, 9], 1)) == {-7: 7, 9: 9}
+    interrupted = workers.in_processes(abs, [-7, 9], 1)
     next(interrupted)
     interrupted.close()  # as an exception of the caller does
-    assert ended == [(True, False), (False, True)]
+    assert ended == [True, False]

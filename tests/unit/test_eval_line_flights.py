@@ -1,6 +1,7 @@
 """Errors at the perching point of a flown powerline perch, against a flight whose errors are known."""
 
 import dataclasses
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -102,12 +103,12 @@ def effort(tmp_path, seeds: int) -> Effort:
 def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):
     handed = []
 
-    def pool(tasks, jobs):
+    def pool(work, tasks, jobs):
         for task in tasks:
             handed.append(task)
-            yield RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values)
+            yield task, asdict(RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values))
 
-    monkeypatch.setattr(kept, "in_pool", pool)
+    monkeypatch.setattr(kept, "in_processes", pool)
     monkeypatch.setattr(kept, "digest", lambda: "0123456789ab")
     found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
     assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
@@ -123,12 +124,13 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
 @pytest.mark.parametrize("outcome, message, verdict", [("missed", "no adhesion; recovered to a hover", HOLDS),
                                                        ("failed", "crashed: a cable in the rotors", FAILS)])
 def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outcome, message, verdict):
-    def pool(tasks, jobs):
+    def pool(work, tasks, jobs):
         for task in tasks:
             end = ("perched", "perched", "") if task.run.values["grips"] else ("missed_pad", outcome, message)
-            yield RunResult(task.run.number, task.run.seed, *end, task.run.values, {"perching_position_m": 0.01, "perching_tilt_deg": 1.0})
+            errors = {"perching_position_m": 0.01, "perching_tilt_deg": 1.0}
+            yield task, asdict(RunResult(task.run.number, task.run.seed, *end, task.run.values, errors))
 
-    monkeypatch.setattr(kept, "in_pool", pool)
+    monkeypatch.setattr(kept, "in_processes", pool)
     [section] = flown_sections(effort(tmp_path, 1))
     rows = {row.name: row for row in section.rows}
     assert rows["180 deg, grip switched off: recoveries to a hover"].verdict == verdict

@@ -19,7 +19,7 @@ from perch_eval import consistency
 from perch_eval import estimation_flight as flights
 from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.workers import spread
+from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
 from perch_eval.target_sightings import Sightings, see_target
@@ -55,7 +55,13 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     """
     motion = flights.motion_of(load_scenario(scenario_name), first_seed)  # its phases are those of every run
     seeds = range(first_seed, first_seed + runs)
-    flown = list(spread(_fly, None, Progress(runs, what="perches"), [scenario_name] * runs, seeds))
+    progress = Progress(runs, what="perches")
+    found: dict[int, _Run] = {}
+    for (_, seed), one in in_processes(_fly, [(scenario_name, seed) for seed in seeds]):
+        found[seed] = one
+        progress.add(True)
+    progress.close()
+    flown = [found[seed] for seed in seeds]
     n = min(len(one.track.times) for one in flown)
     times = flown[0].track.times[:n]
     errors = np.array([one.track.errors[:n] for one in flown])
@@ -75,17 +81,17 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     return results, summary
 
 
-def _fly(scenario_name: str, seed: int) -> _Run:
+def _fly(job: tuple[str, int]) -> _Run:
     """One flight of `run`."""
     cv2.setNumThreads(1)
-    scenario = load_scenario(scenario_name)
+    scenario, seed = load_scenario(job[0]), job[1]
     flight = flights.fly(scenario, seed)
     steps = flights.run_vio(flight)
     track = flights.run_estimator(flight, steps, begin=flight.motion.settings.ground + AIRBORNE_AFTER)
     posed = [s for s in steps if s.error is not None]
     seen = [s for s in posed if s.result.nis_dimension]
-    return _Run(track, np.array([s.time for s in posed]),
-                np.array([consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed]),
+    nees = [consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed if s.error is not None and s.result.estimate is not None]
+    return _Run(track, np.array([s.time for s in posed]), np.array(nees),
                 sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen),
                 see_target(scenario, flight, track, seed, flight.motion.perch_time + LOOK[0], flight.motion.perch_time + LOOK[1]))
 

@@ -10,12 +10,11 @@ from collections import Counter
 from pathlib import Path
 
 from perch_core.errors import PerchError
-from perch_eval.arguments import count, output_folder
+from perch_eval.arguments import command_parser, count, output_folder
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.ranking import worst
-from perch_eval.campaign.results import Results, RunResult
+from perch_eval.campaign.results import Results, RunResult, worst
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
 from perch_eval.statistics import Rate
@@ -32,8 +31,7 @@ exit code: 0 every run was flown (whatever came of it), 1 some could not be carr
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="campaign.py", description=__doc__, epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("campaign.py", __doc__, EXAMPLES)
     out.add_argument("campaign", metavar="CAMPAIGN", help="name in config/campaigns, or a YAML file")
     out.add_argument("--engine", metavar="NAME", help=f"{' or '.join(ENGINES)}, or your own as module:function (default: the file's)")
     out.add_argument("--runs", type=count, metavar="N", help="flights, with grids per grid point (default: the file's)")

@@ -6,19 +6,20 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from perch_core.errors import PerchError
 from perch_core.processes import end_with_parent, without_interrupts
 from perch_eval.campaign.engines import Task, carry_out
-from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import RunResult
 from perch_eval.extras import require
 
 T = TypeVar("T")
+R = TypeVar("R")
 END_LIMIT = 5  # of a worker that is told to end [s]
 ATTEMPTS = 3  # a run whose worker died so often is given up
 
@@ -40,91 +41,72 @@ def prepare_worker() -> None:
         os._exit(1)
 
 
-def _carry_out(task: Task) -> RunResult:
-    """As `carry_out`; told to stop in mid-run, the pool would take that for the run's own end, and wait for ever for another."""
+def _call(work: Callable[[T], R], item: T) -> R:
+    """Told to stop in the middle of its work, the pool would take that for the work's own end, and wait for ever for another."""
     try:
-        return carry_out(task)
+        return work(item)
     except SystemExit:
         os._exit(1)
 
 
-def spread(work: Callable[..., T], jobs: int | None, progress: Progress, *columns: Iterable[Any], good: Callable[[T], bool] = lambda _: True
-           ) -> Iterator[T]:
-    """`map` in processes, which are not forked: BLAS threads of the parent do not survive a fork.
+def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = None, dead: Callable[[T], R] | None = None
+                 ) -> Iterator[tuple[T, R]]:
+    """Results of work in processes, as they are finished.
+
+    A worker that dies takes the pool with it: it is made anew, and what was under way is done again. Processes are not forked: BLAS threads
+    of the parent do not survive a fork. They end with whoever waits for them.
 
     Args:
         work: to be done, a function of a module.
+        items: its arguments.
         jobs: processes; None: one on each core.
-        progress: told of each result, and closed at the end.
-        columns: arguments of `work`.
-        good: what is counted as good on the way.
+        dead: result of an item whose worker died `ATTEMPTS` times.
+
+    Raises:
+        PerchError: a worker died so often, and there is no `dead`.
     """
-    pool = _pool(jobs)
-    try:
-        with without_interrupts():  # a worker that has just been started would print where it was
-            results = pool.map(work, *columns)
-        for result in results:
-            progress.add(good(result))
-            yield result
-    except BaseException:
-        _abandon(pool)
-        raise
-    finally:
-        progress.close()
-    pool.shutdown()
+    jobs = jobs or os.cpu_count() or 1
+    waiting, attempts = deque(enumerate(items)), Counter[int]()
+    while waiting:
+        pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
+        under_way: dict[Future[R], tuple[int, T]] = {}
+        try:
+            while waiting or under_way:
+                while waiting and len(under_way) < 2 * jobs:
+                    with without_interrupts():  # a worker that has just been started would print where it was
+                        under_way[pool.submit(_call, work, waiting[0][1])] = waiting[0]  # raises where the pool has broken: it goes on waiting
+                    waiting.popleft()
+                for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    result = future.result()
+                    yield under_way.pop(future)[1], result
+        except BrokenProcessPool:
+            for future, (number, item) in under_way.items():
+                attempts[number] += 1
+                if future.done() and future.exception() is None:
+                    yield item, future.result()
+                elif attempts[number] < ATTEMPTS:
+                    waiting.append((number, item))
+                elif dead is None:
+                    raise PerchError(f"a process has died {ATTEMPTS} times at {item}") from None
+                else:
+                    yield item, dead(item)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():  # in the middle of what they do
+                process.terminate()
+            raise
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _pool(jobs: int | None) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
-
-
-def _abandon(pool: ProcessPoolExecutor) -> None:
-    """End its processes in the middle of what they do."""
-    pool.shutdown(wait=False, cancel_futures=True)
-    for process in multiprocessing.active_children():
-        process.terminate()
-
-
-def dead(task: Task, why: str) -> RunResult:
+def dead(task: Task, why: str = f"its worker died {ATTEMPTS} times") -> RunResult:
     """The result of a run whose workers died."""
     return RunResult(task.run.number, task.run.seed, "error", "failed", why, task.run.values)
 
 
 def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
-    """Carry out tasks in `jobs` processes; results come as they are finished.
-
-    A worker that dies takes the pool with it: it is made anew, and what was under way is carried out again.
-    """
-    waiting, attempts = list(reversed(tasks)), {}
-    while waiting:
-        pool = _pool(jobs)
-        under_way: dict[Future, Task] = {}
-        try:
-            while waiting or under_way:
-                while waiting and len(under_way) < 2 * jobs:
-                    task = waiting[-1]
-                    with without_interrupts():
-                        under_way[pool.submit(_carry_out, task)] = task  # raises where the pool has broken: the task goes on waiting
-                    waiting.pop()
-                done, _ = wait(under_way, return_when=FIRST_COMPLETED)
-                for future in done:
-                    result = future.result()
-                    del under_way[future]
-                    yield result
-        except BrokenProcessPool:
-            for future, task in under_way.items():
-                if future.done() and future.exception() is None:
-                    yield future.result()
-                    continue
-                attempts[task.run.number] = attempts.get(task.run.number, 0) + 1
-                if attempts[task.run.number] >= ATTEMPTS:
-                    yield dead(task, f"its worker died {ATTEMPTS} times")
-                else:
-                    waiting.append(task)
-        except BaseException:
-            _abandon(pool)
-            raise
-        pool.shutdown(wait=True, cancel_futures=True)
+    """Carry out runs of a campaign in `jobs` processes; results come as they are finished."""
+    for _, result in in_processes(carry_out, tasks, jobs, dead):
+        yield result
 
 
 def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
