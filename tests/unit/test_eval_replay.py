@@ -21,12 +21,12 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, report
 from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight, timed
+from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins
 from perch_eval.mcap_log import read
 from perch_eval.metrics import flight_metrics, perch_window, rates
 from perch_eval.page import Html, section, table
 from perch_eval.replay.command import main
-from perch_eval.replay.scene import View
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.report import build_report
 from perch_eval.ros.recorded_flight import RecordedFlight, write
@@ -165,8 +165,8 @@ def test_an_animation_has_a_frame_for_each_moment(recorded, tmp_path):
 
 def test_a_stroboscopic_picture_shows_each_instant_of_the_perch(recorded, tmp_path):
     path, _ = recorded
-    view, vehicle = View.of(RecordedFlight(path)), load_vehicle("snapdragon")
-    figure = stroboscope(view, vehicle, 1.5, 3.4, 7)
+    view = FlightView.of(RecordedFlight(path), load_vehicle("snapdragon"))
+    figure = stroboscope(view, 1.5, 3.4, 7)
     discs = [c for c in figure.axes[0].collections if c.get_zorder() > 3.0]
     assert len(discs) == 7 * 4
     assert any(text.get_text() == "+0.00 s, 11°" for text in figure.axes[0].texts)

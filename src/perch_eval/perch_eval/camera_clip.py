@@ -50,6 +50,7 @@ def _frame(images: dict[str, CameraImage], time: float) -> np.ndarray:
     panels = []
     for name, image in images.items():
         pixels = image.pixels()
+        assert pixels is not None, "recorded images are files, which have pixels"
         panel = cv2.resize(pixels, (round(pixels.shape[1] * HEIGHT / pixels.shape[0]), HEIGHT), interpolation=cv2.INTER_AREA)
         panel = cv2.cvtColor(panel, cv2.COLOR_GRAY2RGB if panel.ndim == 2 else cv2.COLOR_BGR2RGB)
         for shift, colour in ((1, (0, 0, 0)), (0, (255, 255, 255))):  # a shadow: legible on any background

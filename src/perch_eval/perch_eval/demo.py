@@ -14,13 +14,13 @@ from perch_autopilot import firmware
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_core.vehicle import load_vehicle
-from perch_eval.arguments import open_network, output_folder
+from perch_eval.arguments import command_parser, exit_code, open_network, output_folder
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
-from perch_eval.report import build_report, inspection_words
-from perch_eval.ros.pilot import FlightResult, Pilot
+from perch_eval.report import build_report, summary
+from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import Scenario, load_scenario
 
@@ -35,8 +35,7 @@ EXAMPLES = """examples:
 
 def parser() -> argparse.ArgumentParser:
     """The command line of the demo."""
-    out = argparse.ArgumentParser(prog="demo.py", description=__doc__, epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("demo.py", __doc__, EXAMPLES)
     out.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a YAML file (default: %(default)s)")
     out.add_argument("--vehicle", default="", help="name in config/vehicles, or a YAML file (default: the scenario's)")
     out.add_argument("--seed", type=int, default=1, help="seed of noise, calibration and textures (default: %(default)s)")
@@ -89,43 +88,41 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         stack = Stack(started, out / "logs", on_line=say)
         print(f"{scenario.name}, seed {seed}: starting {len(started)} processes", flush=True)
         with stack:
-            result = _pilot(scenario, stack)
+            result = _flown(scenario, stack)
     return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
                         result.start_time)
 
 
-def _pilot(scenario: Scenario, stack: Stack) -> FlightResult:
+def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
     """Send the goal to a started stack; a flight that breaks off is a result too, its recording is kept."""
-    pilot = Pilot()
+    client = MissionClient()
     try:
-        stack.wait_until_ready(pilot.visible_nodes, timeout=READY_TIMEOUT)
-        result = pilot.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
+        stack.wait_until_ready(client.visible_nodes, timeout=READY_TIMEOUT)
+        result = client.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
                            stack.raise_if_ended)
-        pilot.linger(0.5)
+        client.linger(0.5)
         return result
     except StackError as error:
         if error.callers_mistake:
             raise
-        return FlightResult("failed", str(error), pilot.time, math.nan)
+        return FlightResult("failed", str(error), client.time, math.nan)
     except PerchError as error:
-        return FlightResult("failed", str(error), pilot.time, math.nan)
+        return FlightResult("failed", str(error), client.time, math.nan)
     finally:
-        pilot.close()
+        client.close()
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; 0 perched or inspected, 1 the flight failed, 2 the caller's mistake."""
     args = parser().parse_args(arguments)
-    try:
-        open_network(args.network)
-        report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose, args.vehicle)
-    except PerchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; all nodes are stopped", file=sys.stderr)
-        return 130
-    print(summary(report))
+    return exit_code(lambda: _demonstrate(args), interrupted="interrupted; all nodes are stopped")
+
+
+def _demonstrate(args: argparse.Namespace) -> int:
+    open_network(args.network)
+    report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose, args.vehicle)
+    print(f"outcome: {report['outcome']}")
+    print("".join(f"  {name}: {words}\n" for name, words in summary(report)), end="")
     if "unwritten" in report:
         print(f"error: {report['unwritten']}", file=sys.stderr)
         return 2
@@ -136,26 +133,6 @@ def main(arguments: list[str] | None = None) -> int:
 def _composed(args: argparse.Namespace) -> Collection[str]:
     """Real time has deadlines at 500 Hz that the work of more neighbours in the same process would miss."""
     return sharing(args.composed, otherwise=() if args.separate else CHAIN_NODES if args.realtime else FAST_NODES)
-
-
-def summary(report: dict) -> str:
-    """A few lines for the terminal."""
-    def centimetres(key: str) -> str:
-        return ", ".join(f"{100 * v:.1f}" for v in report[key]) + " cm" if report.get(key) else "not measured"
-
-    lines = [f"outcome: {report['outcome']} ({report['message']})",
-             f"  tracking RMSE {centimetres('tracking_rmse_m')}; estimation RMSE {centimetres('estimation_rmse_m')} (x, y, z)"]
-    if report["recording_damage"]:
-        lines.append(f"  the recording is cut off or damaged ({report['recording_damage']}): figures are of what can be read")
-    if report.get("contact"):
-        c = report["contact"]
-        lines.append(f"  contact: {c['normal_speed_m_s']:.2f} m/s normal, {c['tangential_speed_m_s']:.2f} m/s tangential, "
-                     f"tilt error {c['tilt_error_deg']:.1f} deg, {100 * c['offset_m']:.1f} cm off centre")
-    if report.get("inspection"):
-        lines.append(f"  {inspection_words(report['inspection'])}")
-    if report.get("max_body_rate_deg_s"):
-        lines.append(f"  largest body rate {report['max_body_rate_deg_s']:.0f} deg/s; real-time factor {report['real_time_factor']:.2f}")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

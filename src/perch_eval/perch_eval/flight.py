@@ -81,6 +81,17 @@ class Flight:
         return States(seconds(np.array([s.stamp for s in found], dtype=np.int64)), np.array([s.p_WB for s in found]),
                       np.array([s.q_WB for s in found]), np.array([s.v_WB for s in found]), np.array([s.w_B for s in found]))
 
+    def known_states(self, channel: str) -> States:
+        """As `states`, where the flight must have them.
+
+        Raises:
+            LookupError: it has not.
+        """
+        found = self.states(channel)
+        if found is None:
+            raise LookupError(f"the flight has no {channel}")
+        return found
+
     def vectors(self, channel: str, pick: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray]:
         """Times (n,) and `pick(value)` (n, ...) of a channel."""
         rows = self.values(channel)

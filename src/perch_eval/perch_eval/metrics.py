@@ -14,6 +14,16 @@ from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight, States
 
 CONTACT_STATES = {0: "none", 1: "attached", 2: "bounced", 3: "collision", 4: "ground"}
+FIGURES: dict[str, tuple[str, str, float]] = {
+    **{f"{kind}_rmse_m_{axis}": (f"{kind} RMSE {axis}", "cm", 100.0) for kind in ("tracking", "estimation") for axis in "xyz"},
+    "max_body_rate_deg_s": ("largest body rate", "deg/s", 1.0), "max_acceleration_m_s2": ("largest acceleration", "m/s^2", 1.0),
+    "perch_time_s": ("duration of the perch", "s", 1.0),
+    "contact_normal_speed_m_s": ("normal speed at contact", "m/s", 1.0),
+    "contact_tangential_speed_m_s": ("tangential speed at contact", "m/s", 1.0),
+    "contact_tilt_error_deg": ("tilt error at contact", "deg", 1.0), "contact_offset_m": ("offset at contact", "cm", 100.0),
+    "target_error_position_m": ("target error, position", "cm", 100.0), "target_error_attitude_deg": ("target error, attitude", "deg", 1.0),
+}
+"""Figure of a flight, as `figures` names it -> what it is, unit in which it is shown, factor to that unit."""
 _DURATION = re.compile(r"_(ms|us)(?=_|$)")
 
 
@@ -23,7 +33,8 @@ def _rmse(difference: np.ndarray) -> list[float]:
 
 def perch_window(flight: Flight) -> tuple[float, float] | None:
     """Start and end [s] of the perch: the first planned perch trajectory up to the contact, or to its planned end."""
-    start = end = None
+    start: float | None = None
+    end = math.nan
     for _, order in flight.values("trajectory"):
         if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER):
             begin, length = order.trajectory.start_time, order.trajectory.duration
@@ -106,6 +117,23 @@ def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, 
         out["velocity_rmse_m_s"] = _rmse(cut.v - estimated.v)
     out["target_error"] = target_error(flight)
     return out
+
+
+def figures(report: dict[str, Any], end_time: float) -> dict[str, float | None]:
+    """The figures of a flight's report that are compared, by name; None where one could not be had."""
+    out: dict[str, float | None] = {"simulated_time_s": end_time}
+    for name in ("max_body_rate_deg_s", "max_acceleration_m_s2", "attitude_error_at_end_deg"):
+        out[name] = report.get(name)
+    for name in ("tracking_rmse_m", "estimation_rmse_m"):
+        for axis, value in zip("xyz", report.get(name) or ()):
+            out[f"{name}_{axis}"] = value
+    for part, names in (("contact", ("normal_speed_m_s", "tangential_speed_m_s", "tilt_error_deg", "offset_m", "time")),
+                        ("target_error", ("position_m", "attitude_deg"))):
+        for name in names:
+            out[f"{part}_{name}"] = (report.get(part) or {}).get(name)
+    if report.get("window_s") and report.get("perch_planned"):
+        out["perch_time_s"] = report["window_s"][1] - report["window_s"][0]
+    return {name: float(v) if v is not None and math.isfinite(v) else None for name, v in out.items()}
 
 
 def target_error(flight: Flight) -> dict[str, float] | None:

@@ -1,10 +1,11 @@
-"""The figures of a flight's report."""
+"""The figures of a flight, or of several flights side by side, over the perch: PNG in base64, for a page."""
 
 from __future__ import annotations
 
 import base64
 import io
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -13,12 +14,28 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend must be chosen first)
 
 from perch_core import so3  # noqa: E402
-from perch_core.vehicle import Vehicle  # noqa: E402
-from perch_eval.flight import Flight  # noqa: E402
-from perch_eval.metrics import perch_window, thrust_history, tilt_degrees, touch_of  # noqa: E402
+from perch_eval.flight import States  # noqa: E402
+from perch_eval.flight_view import ESTIMATE, LIMIT, PAD, TRUTH, WANTED, FlightView  # noqa: E402
+from perch_eval.metrics import thrust_history, tilt_degrees, touch_of  # noqa: E402
 
-TRUTH, ESTIMATE, WANTED, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
 RUNNING = 1  # state in perch_msgs/EstimatorStatus
+BEFORE, AFTER = 0.3, 0.7  # shown around the perch [s]
+
+
+class Line(NamedTuple):
+    """A curve in a panel: times [s] and values, (n,) each."""
+
+    t: np.ndarray
+    y: np.ndarray
+    colour: str
+    label: str = ""
+    style: str = "-"
+    width: float = 1.3
+
+
+Views = Sequence[FlightView]
+Panel = tuple[str, list[Line]]
+"""Label of the y axis with its unit, and curves."""
 
 
 def encode(figure: Any) -> str:
@@ -31,143 +48,158 @@ def encode(figure: Any) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def _span(flight: Flight) -> tuple[float, float]:
-    window = perch_window(flight)
-    if window is not None:
-        return window[0] - 0.3, window[1] + 0.7
-    truth = flight.states("ground_truth/odometry")
-    return float(truth.t[0]), float(truth.t[-1])
+def panels(views: Views, content: Sequence[Panel], columns: int, height: float = 2.4, bounds: Sequence[float] = (),
+           span: tuple[float, float] | None = None) -> str:
+    """Panels over time. Times of one flight are its own, those of several count from the start of each perch.
 
-
-def _mark(axis: Any, flight: Flight) -> None:
-    """Plan start and contact as vertical lines."""
-    window, touch = perch_window(flight), touch_of(flight)
-    if window is not None:
-        axis.axvline(window[0], color="0.7", lw=0.8)
-    if touch is not None:
-        axis.axvline(touch[0], color=LIMIT, lw=0.8, ls="--")
-
-
-def tracking_figure(flight: Flight) -> str:
-    """Position over time: reference, truth, estimate (the paper's Fig. 5)."""
-    t0, t1 = _span(flight)
-    truth, estimate, reference = flight.states("ground_truth/odometry"), flight.states("odometry"), flight.reference()
-    figure, axes = plt.subplots(3, 2, figsize=(12, 6.5), sharex=True)
-    for i, name in enumerate("xyz"):
-        for states, colour, label, style in ((reference, WANTED, "reference", "-"), (truth, TRUTH, "truth", "-"),
-                                             (estimate, ESTIMATE, "estimate", "--")):
-            if states is None:
-                continue
-            keep = (states.t >= t0) & (states.t <= t1)
-            axes[i, 0].plot(states.t[keep], states.p[keep, i], style, color=colour, label=label, lw=1.4)
-            axes[i, 1].plot(states.t[keep], states.v[keep, i], style, color=colour, lw=1.4)
-        axes[i, 0].set_ylabel(f"{name} [m]")
-        axes[i, 1].set_ylabel(f"v{name} [m/s]")
-        for axis in axes[i]:
-            axis.grid(alpha=0.3)
-            _mark(axis, flight)
-    axes[0, 0].legend(loc="best", fontsize=8)
-    for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
+    Args:
+        views: whose start of the perch and contact are marked.
+        content: row by row.
+        columns: panels side by side.
+        height: of a panel [in].
+        bounds: drawn in each panel.
+        span: times that are shown [s]; None: around the perch.
+    """
+    alone, rows = len(views) == 1, -(-len(content) // columns)
+    low, high = span or (min(view.start - _zero(views, view) for view in views) - BEFORE,
+                         max(view.end - _zero(views, view) for view in views) + AFTER)
+    figure, grid = plt.subplots(rows, columns, figsize=(12, height * rows), sharex=True, squeeze=False)
+    for axis, (label, lines) in zip(grid.flat, content):
+        for line in lines:
+            keep = (line.t >= low) & (line.t <= high)
+            axis.plot(line.t[keep], line.y[keep], line.style, color=line.colour, lw=line.width, label=line.label or None)
+        for bound in bounds:
+            axis.axhline(bound, color=LIMIT, lw=0.8, ls="--")
+        for time, colour, style in _marks(views):
+            if low <= time <= high:
+                axis.axvline(time, color=colour, lw=0.8, ls=style)
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    if grid[0, 0].get_legend_handles_labels()[1]:
+        grid[0, 0].legend(fontsize=8)
+    for axis in grid[-1]:
+        axis.set_xlabel("time [s]" if alone else "time since the perch began [s]; dotted: its end")
     return encode(figure)
 
 
-def path_figure(flight: Flight) -> str:
+def _zero(views: Views, view: FlightView) -> float:
+    """Time of a flight that is called 0 s [s]."""
+    return 0.0 if len(views) == 1 else view.start
+
+
+def _marks(views: Views) -> list[tuple[float, str, str]]:
+    """Time [s], colour and style of vertical lines: the perch begins, and the contact; of several flights the end of each."""
+    if len(views) > 1:
+        return [(view.end - view.start, view.colour, ":") for view in views]
+    touch = touch_of(views[0].flight)
+    return [(views[0].start, "0.7", "-"), *([(touch[0], LIMIT, "--")] if touch is not None else [])]
+
+
+def _states(views: Views, pick: Callable[[States], np.ndarray], estimate: bool = True) -> list[Line]:
+    """Reference, truth and estimate of one flight; of several flights the truth of each."""
+    if len(views) > 1:
+        return [Line(view.truth.t - view.start, pick(view.truth), view.colour, view.name) for view in views]
+    view = views[0]
+    kinds = [(view.reference, WANTED, "reference", "-"), (view.truth, TRUTH, "truth", "-"), (view.estimate, ESTIMATE, "estimate", "--")]
+    return [Line(states.t, pick(states), colour, label, style) for states, colour, label, style in kinds[:3 if estimate else 2]
+            if states is not None]
+
+
+def tracking_figure(*views: FlightView) -> str:
+    """Position and velocity over time (the paper's Fig. 5)."""
+    def content(axis: int) -> list[Panel]:
+        return [(f"{'xyz'[axis]} [m]", _states(views, lambda states: states.p[:, axis])),
+                (f"v{'xyz'[axis]} [m/s]", _states(views, lambda states: states.v[:, axis]))]
+
+    return panels(views, [panel for axis in range(3) for panel in content(axis)], 2)
+
+
+def rates_figure(*views: FlightView) -> str:
+    """Body rates (the paper's Fig. 6) and tilt."""
+    def content(axis: int) -> Panel:
+        return f"rate {'xyz'[axis]} [deg/s]", _states(views, lambda states: np.degrees(states.w[:, axis]), estimate=False)
+
+    tilts = [Line(view.truth.t - _zero(views, view), tilt_degrees(view.truth.q), view.colour) for view in views]
+    return panels(views, [*map(content, range(3)), ("tilt of b3 [deg]", tilts)], 2)
+
+
+def thrust_figure(*views: FlightView) -> str:
+    """Collective thrust against its bounds [M:eq16]."""
+    reached: list[Line] = []
+    commanded: list[Line] = []
+    for view in views:
+        t, *thrusts = thrust_history(view.flight, view.vehicle)
+        for lines, thrust in zip((reached, commanded), thrusts):
+            lines.append(Line(t - _zero(views, view), thrust, view.colour, view.name))
+    bounds = sorted({4 * bound for view in views for bound in (view.vehicle.thrust_min, view.vehicle.thrust_max)})
+    if len(views) > 1:
+        return panels(views, [("reached [N]", reached), ("commanded [N]", commanded)], 2, bounds=bounds)
+    t, wanted = views[0].flight.vectors("controller/reference", lambda r: r.thrust)
+    lines = [Line(t, wanted, WANTED, "reference"),
+             commanded[0]._replace(colour=ESTIMATE, label="commanded to the rotors (leads the lag)", width=0.9),
+             reached[0]._replace(label="reached")]
+    return panels(views, [("thrust [N]", lines)], 1, 2.8, bounds)
+
+
+def error_figure(view: FlightView) -> str:
+    """Estimation error with its own 3-sigma bounds over the whole flight; empty where there is no estimate."""
+    estimate = view.estimate
+    if estimate is None:
+        return ""
+    running = [t for t, health in view.flight.values("estimator/status") if health.state == RUNNING]
+    began = running[0] if running else estimate.t[0]  # before, the filter knows nothing: kilometres of sigma
+    shown = [(t, state) for t, state in view.flight.values("odometry") if t >= began][::10]
+    sigma = np.array([np.sqrt(np.maximum(0.0, state.pose_covariance.diagonal()[:3])) for _, state in shown])
+    t, error = np.array([t for t, _ in shown]), estimate.p - view.truth.at(estimate.t).p
+    return panels([view], [(f"error {name}, 3 sigma [cm]", [
+        Line(estimate.t, 100 * error[:, i], TRUTH, "estimate - truth", width=1.0),
+        *(Line(t, sign * 300 * sigma[:, i], LIMIT, style="--", width=0.7) for sign in (-1, 1))]) for i, name in enumerate("xyz")], 3, 2.8,
+        span=(float(began), float(estimate.t[-1])))
+
+
+def distance_figure(*views: FlightView) -> str:
+    """Distances of reference and estimate from the truth through the perch."""
+    def lines(kind: str) -> list[Line]:
+        found = []
+        for view in views:
+            states: States | None = getattr(view, kind)
+            if states is not None:
+                t = states.t[inside := (states.t >= view.start) & (states.t <= view.end)]
+                found.append(Line(t - _zero(views, view), 100.0 * np.linalg.norm(states.p[inside] - view.truth.at(t).p, axis=1), view.colour, view.name))
+        return found
+
+    return panels(views, [(f"{kind} - truth [cm]", lines(kind)) for kind in ("reference", "estimate")], 2)
+
+
+def path_figure(*views: FlightView) -> str:
     """Side view of the perch with the thrust direction as arrows (the paper's Fig. 5, right)."""
-    t0, t1 = _span(flight)
-    truth, reference = flight.states("ground_truth/odometry"), flight.reference()
-    keep = (truth.t >= t0) & (truth.t <= t1 - 0.4)
-    p, q = truth.p[keep], truth.q[keep]
     figure, axis = plt.subplots(figsize=(12, 5))
-    target = flight.values("ground_truth/target")
-    direction = np.array([1.0, 0.0])
-    if target:
-        pad = target[-1][1]
-        c, R = np.array(pad.p), so3.quat_to_matrix(np.array(pad.q))
-        horizontal = np.cross(R[:, 1], [0.0, 0.0, 1.0])[:2]
-        if np.linalg.norm(horizontal) > 1e-6:
-            direction = horizontal / np.linalg.norm(horizontal)
-        ends = np.array([c - 0.3 * R[:, 0], c + 0.3 * R[:, 0]])
-        axis.plot(ends[:, :2] @ direction, ends[:, 2], color="k", lw=5, solid_capstyle="butt", label="pad")
-    if reference is not None:
-        inside = (reference.t >= t0) & (reference.t <= t1 - 0.4)
-        axis.plot(reference.p[inside][:, :2] @ direction, reference.p[inside][:, 2], color=WANTED, lw=1.2, label="reference")
-    axis.plot(p[:, :2] @ direction, p[:, 2], color=TRUTH, lw=1.5, label="truth")
-    b3 = so3.quat_rotate(q, np.array([0.0, 0.0, 1.0]))
-    every = slice(None, None, max(1, len(p) // 28))
-    axis.quiver(p[every][:, :2] @ direction, p[every][:, 2], b3[every][:, :2] @ direction, b3[every][:, 2],
-                color=ESTIMATE, width=0.004, scale=14, label="b3")
+    along = _horizontal(views[0])
+    if views[0].pad is not None:
+        c, R = views[0].pad
+        ends = np.array([c - PAD * R[:, 0], c + PAD * R[:, 0]])
+        axis.plot(ends[:, :2] @ along, ends[:, 2], color="k", lw=5, solid_capstyle="butt", label="pad")
+    for view in views:
+        wanted, name = (WANTED, "") if len(views) == 1 else (view.colour, f"{view.name}, ")
+        for states, colour, width, label in ((view.reference, wanted, 1.0, f"{name}reference"), (view.truth, view.colour, 1.6, f"{name}truth")):
+            if states is not None:
+                keep = (states.t >= view.start - BEFORE) & (states.t <= view.end + 0.3)
+                axis.plot(states.p[keep, :2] @ along, states.p[keep, 2], color=colour, lw=width, label=label)
+        p, b3 = view.truth.p[keep], so3.quat_rotate(view.truth.q[keep], np.array([0.0, 0.0, 1.0]))
+        every = slice(None, None, max(1, len(p) // 28))
+        axis.quiver(p[every, :2] @ along, p[every, 2], b3[every, :2] @ along, b3[every, 2], width=0.004, scale=14,
+                    color=ESTIMATE if len(views) == 1 else view.colour, label=f"{name}b3")
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("towards the pad [m]")
-    axis.set_ylabel("z [m]")
+    axis.set(xlabel="along the perch [m]", ylabel="z [m]")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
     return encode(figure)
 
 
-def rates_figure(flight: Flight) -> str:
-    """Body rates (the paper's Fig. 6) and tilt."""
-    t0, t1 = _span(flight)
-    truth, reference = flight.states("ground_truth/odometry"), flight.reference()
-    figure, axes = plt.subplots(2, 2, figsize=(12, 5), sharex=True)
-    for i, (axis, name) in enumerate(zip(axes.flat, "xyz")):
-        for states, colour, label in ((reference, WANTED, "commanded"), (truth, TRUTH, "truth")):
-            if states is not None:
-                keep = (states.t >= t0) & (states.t <= t1)
-                axis.plot(states.t[keep], np.degrees(states.w[keep, i]), color=colour, lw=1.3, label=label)
-        axis.set_ylabel(f"rate {name} [deg/s]")
-    keep = (truth.t >= t0) & (truth.t <= t1)
-    axes[1, 1].plot(truth.t[keep], tilt_degrees(truth.q[keep]), color=TRUTH, lw=1.3)
-    axes[1, 1].set_ylabel("tilt of b3 [deg]")
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-        _mark(axis, flight)
-    axes[0, 0].legend(fontsize=8)
-    for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
-    return encode(figure)
-
-
-def thrust_figure(flight: Flight, vehicle: Vehicle) -> str:
-    """Collective thrust against its bounds [M:eq16]."""
-    t0, t1 = _span(flight)
-    t, reached, commanded = thrust_history(flight, vehicle)
-    keep = (t >= t0) & (t <= t1)
-    figure, axis = plt.subplots(figsize=(12, 2.8))
-    tr, wanted = flight.vectors("controller/reference", lambda r: r.thrust)
-    inside = (tr >= t0) & (tr <= t1)
-    axis.plot(tr[inside], wanted[inside] if len(tr) else [], color=WANTED, lw=1.2, label="reference")
-    axis.plot(t[keep], commanded[keep], color=ESTIMATE, lw=0.9, label="commanded to the rotors (leads the lag)")
-    axis.plot(t[keep], reached[keep], color=TRUTH, lw=1.4, label="reached")
-    for bound in (4 * vehicle.thrust_min, 4 * vehicle.thrust_max):
-        axis.axhline(bound, color=LIMIT, lw=0.8, ls="--")
-    axis.set_ylabel("thrust [N]")
-    axis.set_xlabel("time [s]")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8, ncol=3)
-    _mark(axis, flight)
-    return encode(figure)
-
-
-def error_figure(flight: Flight) -> str:
-    """Estimation error with its own 3-sigma bounds over the whole flight."""
-    truth, estimate = flight.states("ground_truth/odometry"), flight.states("odometry")
-    if estimate is None:
-        return ""
-    running = [t for t, health in flight.values("estimator/status") if health.state == RUNNING]
-    began = running[0] if running else estimate.t[0]  # before, the filter knows nothing: kilometres of sigma
-    shown = [(t, state) for t, state in flight.values("odometry") if t >= began][::10]
-    keep = estimate.t >= began
-    sigma = np.array([np.sqrt(np.maximum(0.0, state.pose_covariance.diagonal()[:3])) for _, state in shown])
-    ts = np.array([t for t, _ in shown])
-    error = estimate.p - truth.at(estimate.t).p
-    figure, axes = plt.subplots(1, 3, figsize=(12, 2.8), sharex=True)
-    for i, (axis, name) in enumerate(zip(axes, "xyz")):
-        axis.plot(estimate.t[keep], 100 * error[keep, i], color=TRUTH, lw=1.0)
-        for sign in (-3, 3):
-            axis.plot(ts, sign * 100 * sigma[:, i], color=LIMIT, lw=0.7, ls="--")
-        axis.set_ylabel(f"estimate - truth, {name}, with 3 sigma [cm]", fontsize=8)
-        axis.set_xlabel("time [s]")
-        axis.grid(alpha=0.3)
-        _mark(axis, flight)
-    return encode(figure)
+def _horizontal(view: FlightView) -> np.ndarray:
+    """Unit vector towards the pad, or along the perch, shape (2,)."""
+    begin, end = view.truth.at(np.array([view.start, view.end])).p
+    for direction in (*([np.cross(view.pad[1][:, 1], [0.0, 0.0, 1.0])[:2]] if view.pad is not None else []), (end - begin)[:2]):
+        if np.linalg.norm(direction) > 1e-6:
+            return direction / np.linalg.norm(direction)
+    return np.array([1.0, 0.0])

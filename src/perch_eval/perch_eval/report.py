@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,16 @@ from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight
+from perch_eval.flight_view import FlightView
+from perch_eval.identification.page import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
-from perch_eval.inspection.measures import Inspected
-from perch_eval.inspection.recorded import recorded
-from perch_eval.loop_plots import inner_loop_figure
+from perch_eval.inspection.measures import Inspected, recorded
 from perch_eval.margins import limits, margins
-from perch_eval.metrics import contact_report, diagnostics, flight_metrics, missed_deadlines, node_durations, perch_window, rates
+from perch_eval.metrics import diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
 from perch_eval.page import Html, finite, image, page, section, table, text
-from perch_eval.replay.scene import View
 from perch_eval.ros.recorded_flight import RecordedFlight
-from perch_eval.turnable import AFTER, BEFORE, Shown, turnable
+from perch_eval.scene_3d import scene_3d
 from perch_sim.scenario import Scenario
 
 def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, message: str, wall_time: float,
@@ -106,37 +106,26 @@ def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
     return ", ".join("-" if v is None or not math.isfinite(v) else f"{scale * v:.1f}" for v in values) + f" {unit}"
 
 
-def inspection_words(figures: dict[str, Any]) -> str:
+def _inspection(figures: dict[str, Any]) -> str:
     """What came of an inspection, in a line."""
     return (f"{figures['collisions']} collisions ({figures['reference_collisions']} of the reference); mean reprojection error "
             f"{figures['reprojection_px']:.0f} px ({figures['reference_reprojection_px']:.0f} px of the reference); "
             f"least scaled clearance {figures['least_clearance']:.2f}")
 
 
-def _turnable(flight: Flight, vehicle: Vehicle, name: str) -> str:
-    """The flight in 3-D, around the perch if there is one."""
-    try:
-        view = View.of(flight)
-    except LookupError:
-        return "not recorded"
-    first, last = float(view.truth.t[0]), float(view.truth.t[-1])
-    window = perch_window(flight)
-    start, end = (max(first, window[0] - BEFORE), min(last, window[1] + AFTER)) if window else (first, last)
-    return turnable([Shown(name, plots.TRUTH, view, vehicle, start, end, 0.0)])
-
-
-def _summary(flight: Flight, scenario: Scenario, report: dict[str, Any]) -> list[tuple[str, Any]]:
-    rows = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"]), ("message", report["message"])]
+def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """What came of a flight, by name, for the page and for the terminal."""
+    rows = [("message", report["message"])]
     if "inspection" in report:
-        rows.append(("inspection", inspection_words(report["inspection"])))
+        rows.append(("inspection", _inspection(report["inspection"])))
     if error := report.get("target_error"):
         rows.append(("target error", f"{100 * error['position_m']:.1f} cm, {error['attitude_deg']:.2f} deg"))
-    if contact := contact_report(flight):
+    if contact := report.get("contact"):
         rows.append(("contact", f"{contact['state']} at {contact['time']:.3f} s: {contact['normal_speed_m_s']:.2f} m/s normal, "
                                 f"{contact['tangential_speed_m_s']:.2f} m/s tangential, tilt error {contact['tilt_error_deg']:.1f} deg, "
-                                f"{100 * contact['offset_m']:.1f} cm from the centre {contact['reason']}"))
-    if flight.damage:
-        rows.append(("recording", f"cut off or damaged ({flight.damage}): the figures are of what can be read"))
+                                f"{100 * contact['offset_m']:.1f} cm from the centre {contact['reason']}".rstrip()))
+    if report["recording_damage"]:
+        rows.append(("recording", f"cut off or damaged ({report['recording_damage']}): the figures are of what can be read"))
     return [*rows, ("tracking RMSE x, y, z", _vector(report.get("tracking_rmse_m"), 100, "cm")),
             ("estimation RMSE x, y, z", _vector(report.get("estimation_rmse_m"), 100, "cm")),
             ("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
@@ -146,35 +135,38 @@ def _summary(flight: Flight, scenario: Scenario, report: dict[str, Any]) -> list
             ("ended at", f"{report['simulated_time_s']:.2f} s of simulated time"), ("flight hash", report["flight_hash"][:16])]
 
 
-def _figures(flight: Flight, vehicle: Vehicle, inspection: Inspected | None) -> list[tuple[str, str]]:
+def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tuple[str, str]]:
     """Titles and PNG in base64."""
     figures = []
     if inspection is not None:
         figures += [("Reference and flown path", plots.encode(paths_figure(inspection))),
                     ("Clearance, reprojection error and visibility of the watched line", plots.encode(metrics_figure(inspection)))]
-    if flight.states("ground_truth/odometry"):
-        figures += [("Tracking and estimation through the perch", plots.tracking_figure(flight)),
-                    ("Path, seen from the side", plots.path_figure(flight)),
-                    ("Body rates and tilt", plots.rates_figure(flight)),
-                    ("Thrust against its bounds", plots.thrust_figure(flight, vehicle)),
-                    ("The inner loop: commanded, measured, and by the vehicle file's model", inner_loop_figure(flight, vehicle)),
-                    ("Estimation error over the flight", plots.error_figure(flight))]
+    if view is not None:
+        figures += [("Tracking and estimation through the perch", plots.tracking_figure(view)),
+                    ("Path, seen from the side", plots.path_figure(view)), ("Body rates and tilt", plots.rates_figure(view)),
+                    ("Thrust against its bounds", plots.thrust_figure(view)),
+                    ("The inner loop: commanded, measured, and by the vehicle file's model", inner_loop_figure(view.flight, view.vehicle)),
+                    ("Estimation error over the flight", plots.error_figure(view))]
     return figures
 
 
 def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Vehicle, inspection: Inspected | None) -> str:
     title = f"{scenario.name}, seed {report['seed']}"
+    view = None
+    with suppress(LookupError):
+        view = FlightView.of(flight, vehicle, scenario.name)
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
     nodes = [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items())) for node, reports in diagnostics(flight).items()]
     kept = [(m["name"], f"{m['value']:.2f} {m['unit']} ({limits(m)}): {m['left']:+.2f} left") for m in report["margins"]]
+    flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"])]
     return page(
-        title, table(_summary(flight, scenario, report)), section("Margins", table(kept), "No perch was planned."),
+        title, table([*flown, *summary(report)]), section("Margins", table(kept), "No perch was planned."),
         section("Timeline", table((f"{t:.3f} s", words) for t, words in _timeline(flight))),
-        section("Flight in 3-D", _turnable(flight, vehicle, scenario.name)),
+        section("Flight in 3-D", scene_3d([view]) if view is not None else "", "not recorded"),
         section("What the cameras saw", clip(flight), "No images were recorded."),
-        *(section(name, image(png, name)) for name, png in _figures(flight, vehicle, inspection)),
+        *(section(name, image(png, name)) for name, png in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
         section("Durations that the nodes measured", table(timings)), section("Last diagnostics", table(nodes)),
         heading=Html(f'{text(title)}: <span class="{good}">{text(report["outcome"])}</span>'))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
-import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,10 +17,13 @@ import yaml
 
 from perch_core.errors import PerchError
 from perch_core.processes import one_thread_for_sums
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run, scenario_of
+from perch_eval.flight import Flight
+from perch_eval.metrics import figures, flight_metrics
+from perch_sim.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,23 @@ def carry_out(task: Task) -> RunResult:
     return dataclasses.replace(result, values=task.run.values, wall_time=time.perf_counter() - began)
 
 
-def fly_in_process(task: Task) -> RunResult:
-    """One run in this process."""
+Measure = Callable[[Flight, Scenario, Vehicle], dict[str, float | None]]
+
+
+def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float = 0.0) -> RunResult:
+    """One run in this process.
+
+    Args:
+        task: what is flown.
+        measure: further figures of the flight.
+        linger: flown on after its end [s].
+    """
     from perch_eval.in_process import Sensing, fly
-    from perch_eval.metrics import flight_metrics
 
     scenario = scenario_of(task.scenario, f"run {task.run.number}")
-    trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5 if task.keep else 0.0)
-    metrics = flight_metrics(trace.flight, load_vehicle(scenario.vehicle), trace.end_time)
+    trace = fly(scenario, task.run.seed, Sensing(**task.sensing), 0.5 if task.keep else linger)
+    vehicle = load_vehicle(scenario.vehicle)
+    metrics = figures(flight_metrics(trace.flight, vehicle, trace.end_time), trace.end_time)
     if task.keep:
         from perch_eval.report import build_report  # and with it matplotlib and ROS: most workers keep no flight
         from perch_eval.ros.recorded_flight import write
@@ -90,7 +101,7 @@ def fly_in_process(task: Task) -> RunResult:
         (folder / "scenario.yaml").write_text(yaml.safe_dump(task.scenario))
         build_report(folder, scenario, task.run.seed, trace.outcome, trace.message, trace.wall_time, trace.end_time)
     return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion),
-                     trace.outcome, trace.message, metrics=flatten(metrics, trace.end_time))
+                     trace.outcome, trace.message, metrics=metrics | measure(trace.flight, scenario, vehicle))
 
 
 def fly_on_the_stack(task: Task) -> RunResult:
@@ -110,26 +121,7 @@ def fly_on_the_stack(task: Task) -> RunResult:
         contacts = [contact for _, contact in RecordedFlight(folder / "flight.mcap").values("contact")]
         adhesion = scenario_of(task.scenario, str(file)).adhesion
     return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, adhesion), report["outcome"],
-                     report["message"], metrics=flatten(report, report["simulated_time_s"]))
-
-
-def flatten(metrics: dict[str, Any], end_time: float) -> dict[str, float | None]:
-    """The figures of a flight's report that campaigns compare, by name; None where one could not be had."""
-    out: dict[str, float | None] = {"simulated_time_s": end_time}
-    for name in ("max_body_rate_deg_s", "max_acceleration_m_s2", "attitude_error_at_end_deg"):
-        out[name] = metrics.get(name)
-    for name in ("tracking_rmse_m", "estimation_rmse_m"):
-        for axis, value in zip("xyz", metrics.get(name) or ()):
-            out[f"{name}_{axis}"] = value
-    if metrics.get("tracking_error_at_end_m"):
-        out["tracking_error_at_end_m"] = math.hypot(*metrics["tracking_error_at_end_m"])
-    for part, names in (("contact", ("normal_speed_m_s", "tangential_speed_m_s", "tilt_error_deg", "offset_m", "time")),
-                        ("target_error", ("position_m", "attitude_deg"))):
-        for name in names:
-            out[f"{part}_{name}"] = (metrics.get(part) or {}).get(name)
-    if metrics.get("window_s") and metrics.get("perch_planned"):
-        out["perch_time_s"] = metrics["window_s"][1] - metrics["window_s"][0]
-    return {name: float(v) if v is not None and math.isfinite(v) else None for name, v in out.items()}
+                     report["message"], metrics=figures(report, report["simulated_time_s"]))
 
 
 ENGINES: dict[str, Callable[[Task], RunResult]] = {"in_process": fly_in_process, "stack": fly_on_the_stack}

@@ -24,7 +24,7 @@ class Axis:
         distinct = sorted(set(map(_key, values)), key=lambda v: (isinstance(v, str), v))
         self._edges: np.ndarray | None = None
         if len(distinct) > 10 and not any(isinstance(v, str) for v in distinct):
-            self._edges = np.linspace(distinct[0], distinct[-1], BINS + 1)
+            self._edges = np.linspace(float(distinct[0]), float(distinct[-1]), BINS + 1)
             self.labels = [f"{a:.3g} - {b:.3g}" for a, b in zip(self._edges, self._edges[1:])]
         else:
             self._values = distinct
@@ -97,7 +97,7 @@ def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(11.0, 2.4 * rows), layout="constrained")
     for axes, (name, (title, factor)) in zip(figure.subplots(rows, columns, squeeze=False).flat, names.items()):
-        groups = [[factor * r.metrics[name] for r in found if (r.cause == SUCCESS) is good and r.metrics.get(name) is not None]
+        groups = [[factor * value for r in found if (r.cause == SUCCESS) is good and (value := r.metrics.get(name)) is not None]
                   for good in (True, False)]
         everything = groups[0] + groups[1]
         axes.set_title(title, fontsize=9)

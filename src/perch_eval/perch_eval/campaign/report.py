@@ -8,23 +8,15 @@ from pathlib import Path
 
 from perch_eval.campaign import figures
 from perch_eval.campaign.causes import MEANING, SUCCESS
-from perch_eval.campaign.ranking import worst
-from perch_eval.campaign.results import RunResult
+from perch_eval.campaign.results import RunResult, worst
 from perch_eval.campaign.specification import Campaign
+from perch_eval.metrics import FIGURES
 from perch_eval.page import Html, image, page, section, table, text
 from perch_eval.statistics import Rate, Spread
 
-METRICS = {
-    "contact_normal_speed_m_s": ("normal speed at contact [m/s]", 1.0),
-    "contact_tangential_speed_m_s": ("tangential speed at contact [m/s]", 1.0),
-    "contact_tilt_error_deg": ("tilt error at contact [deg]", 1.0),
-    "contact_offset_m": ("offset from the pad's centre [cm]", 100.0),
-    "target_error_position_m": ("error of the localised target [cm]", 100.0),
-    "target_error_attitude_deg": ("attitude error of the localised target [deg]", 1.0),
-    "tracking_rmse_m_z": ("tracking RMSE, z [cm]", 100.0),
-    "estimation_rmse_m_z": ("estimation RMSE, z [cm]", 100.0),
-    "max_body_rate_deg_s": ("largest body rate [deg/s]", 1.0),
-}
+METRICS = {name: (f"{FIGURES[name][0]} [{FIGURES[name][1]}]", FIGURES[name][2]) for name in (
+    "contact_normal_speed_m_s", "contact_tangential_speed_m_s", "contact_tilt_error_deg", "contact_offset_m", "target_error_position_m",
+    "target_error_attitude_deg", "tracking_rmse_m_z", "estimation_rmse_m_z", "max_body_rate_deg_s")}
 """Metric -> title with unit, factor."""
 
 

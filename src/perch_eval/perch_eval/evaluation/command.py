@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from pathlib import Path
 
-from perch_core.errors import ConfigError, PerchError
+from perch_core.errors import PerchError
 from perch_core.registry import resolved
-from perch_eval.arguments import count, output_folder
+from perch_eval.arguments import command_parser, count, exit_code, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 
@@ -44,8 +43,7 @@ BEYOND_PAPERS = ("c_faults", "c_comparison")
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="evaluate.py", description=__doc__, epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("evaluate.py", __doc__, EXAMPLES)
     size = out.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="both papers, with few flights (default)")
     size.add_argument("--full", action="store_true", help="every part, with many flights; resumable")
@@ -61,22 +59,19 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
+    return exit_code(lambda: _regenerate(args), interrupted="interrupted; finished flights are kept, the same command goes on")
+
+
+def _regenerate(args: argparse.Namespace) -> int:
     mode = "full" if args.full else "quick"
     counts = {name: getattr(args, name.replace("-", "_")) or default for name, default in (FULL if args.full else QUICK).items()}
     made_by = ["python3 scripts/evaluate.py", *["--full"] * args.full, *(f"--{name} {n}" for name, n in counts.items()),
                *(f"--only {name}" for name in args.only or ()), f"--out {args.out}"]
     effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by), args.fresh, *counts.values())
     began = time.monotonic()
-    try:
-        output_folder(args.out)
-        sections = evaluate(effort, args.only or [name for name in PARTS if args.full or name not in BEYOND_PAPERS])
-        document.write(sections, effort, time.monotonic() - began)
-    except KeyboardInterrupt:
-        print("\ninterrupted; finished flights are kept, the same command goes on", file=sys.stderr)
-        return 130
-    except (ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    output_folder(args.out)
+    sections = evaluate(effort, args.only or [name for name in PARTS if args.full or name not in BEYOND_PAPERS])
+    document.write(sections, effort, time.monotonic() - began)
     found = document.counts(sections)
     print(f"results: {args.out / 'README.md'}: " + ", ".join(f"{n} {verdict}" for verdict, n in found.items()))
     return 1 if found.get(FAILS) else 3 if found.get(MISSING) else 0
@@ -101,7 +96,3 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
         print(f"  {time.monotonic() - began:.0f} s", flush=True)
         sections += part
     return sections
-
-
-if __name__ == "__main__":
-    sys.exit(main())

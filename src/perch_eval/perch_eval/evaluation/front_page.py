@@ -40,8 +40,8 @@ def table() -> str:
     if commit is None:
         raise LookupError(f"{page}: no commit")
     lines = [f"| of [{commit[1]}]({page}) | paper | ours | verdict |", "| --- | --- | --- | --- |"]
-    for title, *row in ROWS:
-        found = rows.get(tuple(row), {"paper": "", "ours": "not evaluated", "verdict": MISSING})
+    for title, key, name in ROWS:
+        found = rows.get((key, name), {"paper": "", "ours": "not evaluated", "verdict": MISSING})
         lines.append(f"| {title} | {found['paper'] or '-'} | {found['ours']} | {found['verdict'].lower()} |")
     return "\n".join(lines) + "\n"
 

@@ -20,6 +20,7 @@ from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.evaluation.kept import flown
 from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.flight_view import FlightView
 from perch_eval.statistics import Rate, Spread
 from perch_sim.scenario import load_scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -106,12 +107,12 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
     scenario = load_scenario("surface_90")
     trace = fly(scenario, 1, Sensing(**SENSING), linger=0.5)
-    flight, vehicle = trace.flight, load_vehicle(scenario.vehicle)
+    view = FlightView.of(trace.flight, load_vehicle(scenario.vehicle))
     for section, name, data, caption in (
-            (five, "m_fig_5_tracking.png", plots.tracking_figure(flight), "Position and velocity over time"),
-            (five, "m_fig_5_path.png", plots.path_figure(flight), "Path from the side with b3 as arrows"),
-            (five, "m_fig_5_thrust.png", plots.thrust_figure(flight, vehicle), "Thrust against its bounds"),
-            (six, "m_fig_6.png", plots.rates_figure(flight), "Body rates and tilt")):
+            (five, "m_fig_5_tracking.png", plots.tracking_figure(view), "Position and velocity over time"),
+            (five, "m_fig_5_path.png", plots.path_figure(view), "Path from the side with b3 as arrows"),
+            (five, "m_fig_5_thrust.png", plots.thrust_figure(view), "Thrust against its bounds"),
+            (six, "m_fig_6.png", plots.rates_figure(view), "Body rates and tilt")):
         (effort.out / name).write_bytes(base64.b64decode(data))
         section.figures.append((name, caption))
     five.show("outcome of seed 1", f"{trace.outcome}: {trace.message}")
@@ -154,7 +155,7 @@ def _engines() -> Section:
             return out
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:  # loads the same sources as the nodes
             trace = pool.submit(fly, load_scenario(file), 1, Sensing(**SENSING)).result()
-    rows = trace.flight.states("ground_truth/odometry")
+    rows = trace.flight.known_states("ground_truth/odometry")
     if states is None or len(states.t) < len(rows.t):
         out.claim("greatest difference of position", f"{0 if states is None else len(states.t)} of {len(rows.t)} steps on the stack "
                   f"({report['outcome']})", "", False, "the same flight")

@@ -99,7 +99,7 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
         if tried.coefficients is None:
             continue
         peaks.append(vehicle.mass * plan_checks.thrust_extrema(tried.coefficients, tried.program.durations, 0.0, bound / vehicle.mass)[2])
-        t, thrust = _thrust(tried, vehicle.mass)
+        t, thrust = _thrust(tried.coefficients, tried.program.durations, vehicle.mass)
         axes.plot(t, thrust, lw=1.4, label=f"{k + 1}: {t[-1]:.2f} s, peak {peaks[-1]:.2f} N")
     axes.axhline(bound, color="k", lw=0.8, ls="--", label=f"bound {bound:g} N")
     axes.set_xlabel("time [s]")
@@ -114,14 +114,15 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
               "each iteration has a lower peak")
     out.claim("peak of the last iteration", f"{peaks[-1]:.3f} N", f"<= {bound:g} N", found.solved and peaks[-1] <= bound,
               "the bound is kept: proved by subdivision, not sampled")
+    assert found.trajectory is not None
     out.show("final duration", f"{found.trajectory.duration:.2f} s", "1.4 s", "the paper does not say where its start and target are")
     return out
 
 
-def _thrust(tried: paper_m.Iteration, mass: float) -> tuple[np.ndarray, np.ndarray]:
+def _thrust(coefficients: np.ndarray, durations: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
     """Thrust over time of the QP's solution for its durations."""
     times, values, begin, s = [], [], 0.0, np.linspace(0.0, 1.0, 200)
-    for segment, length in zip(tried.coefficients, tried.program.durations):
+    for segment, length in zip(coefficients, durations):
         a = bernstein.evaluate(bernstein.derivative(segment, 2), s).T / length**2
         times.append(begin + s * length)
         values.append(mass * np.linalg.norm(a + np.array([0.0, 0.0, GRAVITY]), axis=1))

@@ -48,7 +48,7 @@ def _table(effort: Effort) -> Section:
             except PlanningRefusal as refusal:
                 refused.append(f"seed {seed}: {refusal}")
                 continue
-            if plan.recovery is None:
+            if plan.perch is None or plan.recovery is None:
                 refused.append(f"seed {seed}: {plan.without_recovery}")
                 continue
             perch.append(plan.perch.solve_time)
@@ -86,7 +86,7 @@ def flown_sections(effort: Effort) -> list[Section]:
         out.show(f"{name}: gripped the cable", str(rate), "", words)
         for title, key, paper, factor, unit in (("position RMSE", "perching_position_m", paper_p, 100.0, "cm"),
                                                 ("pitch-roll RMSE", "perching_tilt_deg", paper_q, 1.0, "deg")):
-            values = [r.metrics[key] for r in runs if r.metrics.get(key) is not None]
+            values = [value for r in runs if (value := r.metrics.get(key)) is not None]
             if values:
                 rmse = factor * float(np.sqrt(np.mean(np.square(values))))
                 out.claim(f"{name}: {title}", f"{rmse:.1f} {unit} ({len(values)} of {len(runs)} flights)", f"{paper} {unit}",
@@ -95,7 +95,7 @@ def flown_sections(effort: Effort) -> list[Section]:
                 out.missing(f"{name}: {title}", f"{paper} {unit}", words or "no flight came to the perching point")
         for title, key in (("position in map", "perching_in_map_m"), ("mapping in map", "mapping_in_map_m")):
             out.show(f"{name}: {title}", Spread.of(r.metrics.get(key) for r in runs).words(100.0, 1, "cm"))
-        mapped = [r.metrics["mapping_m"] for r in runs if r.metrics.get("mapping_m") is not None]
+        mapped = [value for r in runs if (value := r.metrics.get("mapping_m")) is not None]
         error = 100.0 * float(np.mean(mapped)) if mapped else float("nan")
         out.claim(f"{name}: mapping", f"{error:.1f} cm ({len(mapped)} maps)", "", error <= 3.0 if mapped else None, "at most 3 cm in the mean")
         missed = [r for r in runs if r.cause != SUCCESS]
@@ -124,6 +124,7 @@ def _published() -> Section:
         except PerchError as error:
             out.claim(f"duration of {name}", f"refused: {error}", f"{paper:.3f} s", False, "the same to 2 ms")
             continue
+        assert planned.plan.perch is not None
         ours = planned.plan.perch.duration
         out.claim(f"duration of {name}", f"{ours:.4f} s", f"{paper:.3f} s", abs(ours - paper) < 2e-3, "the same to 2 ms")
         out.data[name] = {"duration_s": ours, "wall_s": perf_counter() - began}
@@ -141,6 +142,7 @@ def _pictures(effort: Effort) -> list[Section]:
     means = {}
     for case, section in (("line_80", seven), ("line_80_pa", seven), ("line_180", eight)):
         planned = problem.plan(problem.load(f"powerline_{case}"))
+        assert planned.plan.perch is not None
         draw_manoeuvre(planned, effort.out / f"p_{case}.png")
         section.figures.append((f"p_{case}.png", f"{WORDS[case]}: the manoeuvre"))
         if section is seven:

@@ -10,15 +10,15 @@ import numpy as np
 from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder, seconds
-from perch_core.vehicle import load_vehicle
-from perch_eval.campaign.causes import SUCCESS, cause_of
-from perch_eval.campaign.engines import Task, flatten
+from perch_core.vehicle import Vehicle
+from perch_eval.campaign.causes import SUCCESS
+from perch_eval.campaign.engines import Task, fly_in_process
 from perch_eval.campaign.results import RunResult
-from perch_eval.campaign.specification import Run, scenario_of
+from perch_eval.campaign.specification import Run
 from perch_eval.evaluation.kept import flown
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
-from perch_eval.metrics import flight_metrics, touch_of
+from perch_eval.metrics import touch_of
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -32,16 +32,12 @@ AROUND = 1.5  # the map is judged within this of the target point [m]
 
 def fly_line(task: Task) -> RunResult:
     """One perch on a line, the same as by the real nodes, with the errors at the perching point among its metrics."""
-    from perch_eval.in_process import Sensing, fly
+    return fly_in_process(task, _errors, linger=0.5)
 
-    scenario = scenario_of(task.scenario, f"run {task.run.number}")
-    trace = fly(scenario, task.run.seed, Sensing(**task.sensing), linger=0.5)
-    flight, vehicle = trace.flight, load_vehicle(scenario.vehicle)
-    metrics = flatten(flight_metrics(flight, vehicle, trace.end_time), trace.end_time)
-    metrics |= perching_errors(flight, scenario, vehicle.wire_offset) | mapping_errors(flight, scenario)
-    metrics["other_lines_touched"] = float(_others_touched(flight, scenario))
-    return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion), trace.outcome,
-                     trace.message, metrics=metrics)
+
+def _errors(flight: Flight, scenario: Scenario, vehicle: Vehicle) -> dict[str, float | None]:
+    return {**perching_errors(flight, scenario, vehicle.wire_offset), **mapping_errors(flight, scenario),
+            "other_lines_touched": float(_others_touched(flight, scenario))}
 
 
 def _target(scenario: Scenario) -> int:
@@ -81,6 +77,7 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
         return none
     order = plans[-1][1]
     plan = order.trajectory
+    assert isinstance(plan, SampledTrajectory)
     perch_time = order.recovery_start if order.recovery_start > 0 else plan.duration
     end = plan.start_time + perch_time
     touch = touch_of(flight)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 from perch_core import config
 from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.arguments import command_parser, exit_code
 from perch_eval.flight import Flight
 from perch_eval.identification import flight, page
 from perch_eval.identification.fit import battery, identify
@@ -35,8 +35,7 @@ nothing, or a battery that no curve fits"""
 
 def command_line() -> argparse.ArgumentParser:
     """The options."""
-    parser = argparse.ArgumentParser(prog="identify.py", description="Identify lags, gains, thrust and drag of a vehicle from a flight.",
-                                     epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_parser("identify.py", "Identify lags, gains, thrust and drag of a vehicle from a flight.", EXAMPLES)
     parser.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
     parser.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
     parser.add_argument("--voltage", type=float, nargs="+", default=[], metavar="V",
@@ -84,29 +83,26 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | Re
 def main() -> int:
     """Fly or read, fit, write, tell."""
     arguments = command_line().parse_args()
-    try:
-        vehicle = load_vehicle(arguments.vehicle)
-        flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
-        flown = flights(arguments, vehicle)
-        found, answers = identify(record_of(flown[0]), vehicle)
-        if arguments.voltage:
-            gains = [next(one for one in identify(record_of(one), vehicle)[0] if one.key == "actuation.thrust_gain") for one in flown]
-            curve = vehicle.actuation.battery
-            found.append(battery(arguments.voltage, gains, curve.exponent if curve.reference else 0.0))
-            if found[-1].refused:
-                raise PerchError(f"--voltage: no curve of the battery fits: {found[-1].refused}")
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        is_file = arguments.vehicle.endswith((".yaml", ".yml"))
-        base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
-        name = arguments.name or f"{vehicle.name}_identified"
-        (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base), name, flown_as, arguments.voltage))
-        page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
-    except PerchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"error: {error.filename or arguments.out}: {error.strerror}", file=sys.stderr)
-        return 2
+    return exit_code(lambda: _identify(arguments))
+
+
+def _identify(arguments: argparse.Namespace) -> int:
+    vehicle = load_vehicle(arguments.vehicle)
+    flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
+    flown = flights(arguments, vehicle)
+    found, answers = identify(record_of(flown[0]), vehicle)
+    if arguments.voltage:
+        gains = [next(one for one in identify(record_of(one), vehicle)[0] if one.key == "actuation.thrust_gain") for one in flown]
+        curve = vehicle.actuation.battery
+        found.append(battery(arguments.voltage, gains, curve.exponent if curve.reference else 0.0))
+        if found[-1].refused:
+            raise PerchError(f"--voltage: no curve of the battery fits: {found[-1].refused}")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    is_file = arguments.vehicle.endswith((".yaml", ".yml"))
+    base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
+    name = arguments.name or f"{vehicle.name}_identified"
+    (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base), name, flown_as, arguments.voltage))
+    page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
     print("\n".join(map(str, found)))
     if not arguments.voltage:
         print(f"{'actuation.battery':32s} not identified: flights at two voltages and more tell it (--voltage)")

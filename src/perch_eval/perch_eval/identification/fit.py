@@ -82,7 +82,7 @@ def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
 def _fitted(model: Callable[[np.ndarray, slice], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
             high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of `model(parameters, samples)`, and their standard deviations: the scatter of fits to parts / sqrt(their number)."""
-    def fit(samples: slice, x0: Sequence[float]) -> np.ndarray:
+    def fit(samples: slice, x0: Sequence[float] | np.ndarray) -> np.ndarray:
         return least_squares(lambda x: model(x, samples) - measured[samples], x0, bounds=(low, high),
                              x_scale=np.maximum(np.abs(start), 1e-2), diff_step=1e-4).x
 
@@ -110,15 +110,17 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
         delay, spread: with its standard deviation [s]. Of commands that are slow against the lag an answer tells the sum of both, so
             that the delay's uncertainty is the lag's, too.
     """
-    h, w, free = record.period, record.gyro[:, axis], delay is None
+    h, w, free, known = record.period, record.gyro[:, axis], delay is None, delay or 0.0
+    assert record.rates is not None
+    commanded = record.rates[:, axis]
 
     def model(x: np.ndarray, samples: slice) -> np.ndarray:
-        late = x[3] if free else delay
-        return lagged(x[1] * record.at(record.command_t, record.rates[:, axis], late + h)[samples], x[0], h) + x[2]
+        late = x[3] if free else known
+        return lagged(x[1] * record.at(record.command_t, commanded, late + h)[samples], x[0], h) + x[2]
 
     n = 4 if free else 3
     x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
-    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, record.rates[:, axis], 0.0), w,
+    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, commanded, 0.0), w,
                     model(x, slice(None)))
     size, why = float(np.std(answer.command)), ""
     if size < LEAST_RATE:
@@ -133,9 +135,11 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
 def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) -> tuple[list[Found], Answer]:
     """Lag and gain of the thrust, and the drag along z; of the rotors where their speeds are commanded. For `spread` see `rates`."""
     h, f, rotors = record.period, record.accel[:, 2], record.rotor_speeds is not None
+    sent = record.rotor_speeds if record.rotor_speeds is not None else record.thrust
+    assert sent is not None
     keys = ("motor_time_constant", "thrust_coefficient") if rotors else ("actuation.thrust_lag", "actuation.thrust_gain")
     unit = vehicle.thrust_coefficient / vehicle.mass if rotors else 1.0
-    u = (record.at(record.command_t, record.rotor_speeds, h) if rotors else record.at(record.command_t, record.thrust, delay + h))
+    u = record.at(record.command_t, sent, h if rotors else delay + h)
 
     def model(x: np.ndarray, samples: slice) -> np.ndarray:
         lag, gain, drag = x
@@ -171,10 +175,10 @@ def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.
     noise = np.array([gain.sigma / gain.value for gain in gains])
     covariance = np.diag(noise[1:] ** 2) + noise[0] ** 2  # the first gain is in every ratio
     W, x1 = np.linalg.inv(covariance), x[1:]
-    information = x1 @ W @ x1
+    information = float(x1 @ W @ x1)
     more = float(x1 @ W @ y / max(information, 1e-12))
     k, left, free = flown + more, y - more * x1, len(y) - 1
-    scatter = sqrt(max(float(left @ W @ left) / free, 1.0)) if free else 1.0
+    scatter = float(np.sqrt(max(float(left @ W @ left) / free, 1.0))) if free else 1.0
     sigma, spread, why = scatter / sqrt(max(information, 1e-12)), float(np.ptp(x)), next((one.refused for one in gains if one.refused), "")
     if not why and spread < LEAST_VOLTAGES:
         why = f"voltages are {100 * spread:.0f} % apart; {100 * LEAST_VOLTAGES:.0f} are needed"

@@ -64,9 +64,10 @@ def record_of(flight: Flight) -> Record:
                 for channel in ("rates_thrust_command", "attitude_thrust_command", "motor_command")}
     channel = max(commands, key=lambda name: len(commands[name]))
     imu, states, sent = flight.values("imu/data_raw"), flight.states("odometry"), commands[channel]
-    for name, values in (("imu/data_raw", imu), ("odometry", states and states.t), ("commands to the vehicle while armed", sent)):
-        if values is None or len(values) < 100:
+    for name, n in {"imu/data_raw": len(imu), "odometry": 0 if states is None else len(states.t), "commands to the vehicle while armed": len(sent)}.items():
+        if n < 100:
             raise PerchError(f"the flight has no {name}")
+    assert states is not None
     t = np.array([time for time, _ in imu])
     f = np.array([sample.f_B for _, sample in imu])
     w = np.array([sample.w_B for _, sample in imu])

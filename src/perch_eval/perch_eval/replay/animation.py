@@ -68,7 +68,7 @@ def _write_mp4(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
 
 def _encoder(path: Path, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:
     for codec in CODECS:
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), fps, size)
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, size)
         if writer.isOpened():
             return writer
     raise PerchError(f"{path}: OpenCV has no encoder for MP4 ({', '.join(CODECS)}) here; choose a .gif")

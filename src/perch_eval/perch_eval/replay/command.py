@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import base64
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,10 @@ import numpy as np
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import count, exit_code
-from perch_eval.flight import Flight
-from perch_eval.metrics import perch_window
+from perch_eval.arguments import command_parser, count, exit_code
+from perch_eval.flight_view import FlightView
 from perch_eval.replay.animation import write_animation
-from perch_eval.replay.scene import Scene, View
+from perch_eval.replay.scene import Scene
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
 
@@ -33,8 +33,7 @@ exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="replay.py", description=__doc__, epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("replay.py", __doc__, EXAMPLES)
     out.add_argument("flight", type=Path, metavar="FLIGHT.mcap", help="recording (demo.py, recorder, a campaign's kept flight)")
     out.add_argument("--out", type=Path, metavar="FILE", help="animation, .gif or .mp4, or a stroboscopic picture, .png (default: FLIGHT.gif)")
     out.add_argument("--plots", type=Path, metavar="DIR", help="also write the plots here, as PNG")
@@ -64,20 +63,20 @@ def _show(args: argparse.Namespace) -> int:
     if flight.damage:
         print(f"warning: {args.flight} is cut off or damaged, and shown as far as it goes ({flight.damage})", file=sys.stderr)
     try:
-        view = View.of(flight)
+        view = FlightView.of(flight, vehicle)
     except LookupError as error:
         raise PerchError(f"{args.flight}: {error}") from None
     path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
-        start, end = span(flight, view, args.start, args.end, 0.0, 0.0)
-        stroboscope(view, vehicle, start, end, args.instants).savefig(path, dpi=110)
+        start, end = span(view, args.start, args.end, 0.0, 0.0)
+        stroboscope(view, start, end, args.instants).savefig(path, dpi=110)
         print(f"picture: {path}")
     else:
-        start, end = span(flight, view, args.start, args.end)
-        _animate(args, Scene(view, vehicle, start, end), start, end, path)
+        start, end = span(view, args.start, args.end)
+        _animate(args, Scene(view, start, end), start, end, path)
     if args.plots:
-        write_plots(flight, vehicle, args.plots)
+        write_plots(view, args.plots)
         print(f"plots: {args.plots}")
     return 0
 
@@ -90,36 +89,30 @@ def _animate(args: argparse.Namespace, scene: Scene, start: float, end: float, p
     print(f"animation: {path}")
 
 
-def span(flight: Flight, view: View, start: float | None, end: float | None, before: float = BEFORE, after: float = AFTER
-         ) -> tuple[float, float]:
+def span(view: FlightView, start: float | None, end: float | None, before: float = BEFORE, after: float = AFTER) -> tuple[float, float]:
     """Time span to show [s]: what was asked for, or the perch with some time before and after it, or all.
 
     Raises:
         PerchError: nothing of the flight lies in it.
     """
-    window = perch_window(flight)
-    first, last = float(view.truth.t[0]), float(view.truth.t[-1])
-    begin = start if start is not None else max(first, window[0] - before) if window else first
-    finish = end if end is not None else min(last, window[1] + after) if window else last
+    perch, (first, last) = view.around(before, after), (float(view.truth.t[0]), float(view.truth.t[-1]))
+    begin, finish = perch[0] if start is None else start, perch[1] if end is None else end
     if not (begin < finish and begin < last and finish > first):
         raise PerchError(f"--from {begin:g} --to {finish:g}: the flight lasts from {first:.2f} to {last:.2f} s")
     return max(begin, first), min(finish, last)
 
 
-def write_plots(flight: Flight, vehicle, folder: Path) -> None:
+def write_plots(view: FlightView, folder: Path) -> None:
     """The figures of the flight's report as PNG files."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, data in (("tracking", plots.tracking_figure(flight)), ("path", plots.path_figure(flight)),
-                       ("rates", plots.rates_figure(flight)), ("thrust", plots.thrust_figure(flight, vehicle)),
-                       ("estimation_error", plots.error_figure(flight))):
-        if data:
+    figures: dict[str, Callable[[FlightView], str]] = {
+        "tracking": plots.tracking_figure, "path": plots.path_figure, "rates": plots.rates_figure, "thrust": plots.thrust_figure,
+        "estimation_error": plots.error_figure}
+    for name, draw in figures.items():
+        if data := draw(view):
             (folder / f"{name}.png").write_bytes(base64.b64decode(data))
 
 
 def _progress(done: int, total: int) -> None:
     if sys.stderr.isatty():
         print(f"\r  {done}/{total}", end="" if done < total else "\n", file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

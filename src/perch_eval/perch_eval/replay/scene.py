@@ -2,72 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
 from perch_core import so3
-from perch_core.values import CameraImage
-from perch_core.vehicle import Vehicle
-from perch_eval.flight import Flight, States
+from perch_eval.flight_view import ESTIMATE, LIMIT, TRUTH, WANTED, FlightView
 from perch_eval.metrics import tilt_degrees
 
-TRUTH, ESTIMATE, WANTED, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
 ARM = 1.6   # rotors are drawn so much larger than they are, to be seen
-
-
-@dataclass(frozen=True)
-class View:
-    """What is shown of a flight.
-
-    Attributes:
-        truth: true states.
-        estimate, reference: estimated and wanted states, where recorded.
-        pad: true pose of the pad p (3,), R (3, 3), where there is one.
-        cables: end points of mapped wires, (n, 2, 3).
-        camera: (time [s], image) of the front camera's images.
-    """
-
-    truth: States
-    estimate: States | None
-    reference: States | None
-    pad: tuple[np.ndarray, np.ndarray] | None
-    cables: np.ndarray
-    camera: list[tuple[float, CameraImage]]
-
-    @classmethod
-    def of(cls, flight: Flight) -> View:
-        """What a recording holds.
-
-        Raises:
-            LookupError: no true states.
-        """
-        truth = flight.states("ground_truth/odometry")
-        if truth is None:
-            raise LookupError("the recording holds no ground_truth/odometry")
-        pad = None
-        if targets := flight.values("ground_truth/target"):
-            pad = np.array(targets[-1][1].p), so3.quat_to_matrix(np.array(targets[-1][1].q))
-        lines = flight.values("powerlines")
-        cables = np.array([[line.start, line.end] for line in lines[-1][1].lines]) if lines else np.zeros((0, 2, 3))
-        return cls(truth, flight.states("odometry"), flight.reference(), pad, cables.reshape(-1, 2, 3),
-                   flight.values("camera_front/image_raw/compressed"))
 
 
 class Scene:
     """Draws the frames of one animation on one figure."""
 
-    def __init__(self, view: View, vehicle: Vehicle, start: float, end: float) -> None:
+    def __init__(self, view: FlightView, start: float, end: float) -> None:
         """
         Args:
             view: what is shown.
-            vehicle: its rotors.
             start, end: time span of the animation [s].
         """
         self._view, self._start, self._end = view, start, end
-        self._rotors = np.column_stack([ARM * np.array(vehicle.rotor_xy), np.zeros(4)])
+        self._rotors = np.column_stack([ARM * np.array(view.vehicle.rotor_xy), np.zeros(4)])
         self._inside = (view.truth.t >= start) & (view.truth.t <= end)
         self.figure = Figure(figsize=(10.0, 5.4), layout="constrained")
         grid = self.figure.add_gridspec(3, 3)
@@ -81,10 +37,8 @@ class Scene:
         view, axes = self._view, self._space
         p = view.truth.p[self._inside]
         low, high = p.min(axis=0), p.max(axis=0)
-        if view.pad is not None:
-            corner = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) * 0.3
-            ring = view.pad[0] + corner @ view.pad[1][:, :2].T
-            axes.plot(*ring.T, color="k", lw=2.0)
+        if (ring := view.pad_corners) is not None:
+            axes.plot(*np.vstack([ring, ring[:1]]).T, color="k", lw=2.0)
             low, high = np.minimum(low, ring.min(axis=0)), np.maximum(high, ring.max(axis=0))
         for cable in view.cables:
             axes.plot(*cable.T, color=LIMIT, lw=1.5)
@@ -148,4 +102,5 @@ class Scene:
         seen = [image for t, image in self._view.camera if t <= time]
         if seen:
             pixels = seen[-1].pixels()
-            self._shown.set_data(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
+            if pixels is not None:
+                self._shown.set_data(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))

@@ -12,22 +12,20 @@ from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_core.vehicle import Vehicle
+from perch_eval.flight_view import PAD, SQUARE, FlightView
 from perch_eval.metrics import tilt_degrees
-from perch_eval.replay.scene import View
 
 AZIMUTH, ELEVATION = math.radians(-68.0), math.radians(12.0)  # of the observer, from the direction of flight
-PAD = 0.3              # half of the pad's side [m]
 LABEL = 0.12           # between instants that both have one [m]
 DISC = np.linspace(0.0, 2.0 * math.pi, 25)
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def stroboscope(view: View, vehicle: Vehicle, start: float, end: float, instants: int = 10) -> Figure:
+def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) -> Figure:
     """The figure.
 
     Args:
         view: what was recorded.
-        vehicle: its rotors.
         start, end: time span [s].
         instants: how often the vehicle is drawn.
     """
@@ -46,7 +44,7 @@ def stroboscope(view: View, vehicle: Vehicle, start: float, end: float, instants
     tilts = tilt_degrees(states.q)
     for k, (p, q) in enumerate(zip(states.p, states.q)):
         R = so3.quat_to_matrix(q)
-        _draw_vehicle(axes, vehicle, p, R, project, towards, colors[k], 3 + k)
+        _draw_vehicle(axes, view.vehicle, p, R, project, towards, colors[k], 3 + k)
         if k == instants - 1 or np.linalg.norm(states.p[k + 1] - p) > LABEL:
             axes.annotate(f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°", project(p + 0.5 * PAD * DOWN), ha="center", va="top",
                           fontsize=7, color="0.25", zorder=50,
@@ -68,14 +66,13 @@ def _observer(flight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return right, np.cross(towards, right), towards
 
 
-def _draw_place(axes: Any, view: View, project: Any) -> None:
+def _draw_place(axes: Any, view: FlightView, project: Any) -> None:
     if view.pad is not None:
         p, R = view.pad
-        square = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
-        surface = lambda centre, half: project(p + (np.asarray(centre) + half * square) @ R[:, :2].T)
+        surface = lambda centre, half: project(p + (np.asarray(centre) + half * SQUARE) @ R[:, :2].T)
         axes.add_collection(PolyCollection([surface((0.0, 0.0), 2.2 * PAD)], facecolor="0.93", edgecolor="0.8", zorder=0))
         axes.add_collection(PolyCollection([surface((0.0, 0.0), PAD)], facecolor="white", edgecolor="0.3", zorder=0.5))
-        tags = [surface(0.55 * PAD * corner, 0.3 * PAD) for corner in square]
+        tags = [surface(0.55 * PAD * corner, 0.3 * PAD) for corner in SQUARE]
         axes.add_collection(PolyCollection(tags, facecolor="0.15", zorder=0.6))
     for a, b in view.cables:
         axes.plot(*project(np.array([a, b])).T, color="0.2", lw=2.5, solid_capstyle="round", zorder=1)

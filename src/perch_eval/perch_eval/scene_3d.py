@@ -8,78 +8,40 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from perch_core.vehicle import Vehicle
-from perch_eval.flight import States
-from perch_eval.replay.scene import View
+from perch_eval.flight_view import FlightView
 
 PERIOD = 0.02     # between instants that are shown [s]
-PAD = 0.3         # half of the pad's side [m]
 BEFORE, AFTER = 1.5, 1.0  # shown around a perch [s]
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A flight in the picture.
-
-    Attributes:
-        name: in the legend.
-        colour: of its path and vehicle.
-        view: what was recorded.
-        vehicle: its rotors.
-        start, end: time span [s].
-        zero: time that is called 0 s [s].
-    """
-
-    name: str
-    colour: str
-    view: View
-    vehicle: Vehicle
-    start: float
-    end: float
-    zero: float
-
-
-def turnable(flights: Sequence[Shown]) -> str:
+def scene_3d(views: Sequence[FlightView]) -> str:
     """The picture as a part of a page.
 
     Args:
-        flights: what is shown; time runs for all of them from their zero.
+        views: what is shown; of one flight the times are its own, those of several count from the start of each perch.
     """
-    legend = "".join(f'<span style="color:{one.colour}">&#9632;</span> {html.escape(one.name)} &nbsp; ' for one in flights)
-    data = json.dumps({"flights": [_flight(one) for one in flights]}, separators=(",", ":")).replace("</", "<\\/")
-    return ('<div class="turnable"><canvas width="1100" height="620" '
-            'style="width:100%;touch-action:none;cursor:grab;background:#fafafa"></canvas>'
+    legend = "".join(f'<span style="color:{view.colour}">&#9632;</span> {html.escape(view.name)} &nbsp; ' for view in views)
+    flights = [_flight(view, 0.0 if len(views) == 1 else view.start) for view in views]
+    data = json.dumps({"flights": flights}, separators=(",", ":")).replace("</", "<\\/")
+    return ('<div><canvas width="1100" height="620" style="width:100%;touch-action:none;cursor:grab;background:#fafafa"></canvas>'
             '<div><button type="button">play</button> <input type="range" min="0" max="1000" value="1000" style="width:70%" '
             'aria-label="time"> <output></output></div>'
             f'<p>{legend}thin: reference. Drag to turn, drag with Shift to move, turn the wheel to zoom.</p>'
             f'<script type="application/json">{data}</script><script>{_SCRIPT}</script></div>')
 
 
-def _flight(one: Shown) -> dict[str, Any]:
-    times = np.arange(one.start, one.end + 0.5 * PERIOD, PERIOD)
-    states = one.view.truth.at(times)
-    return {"colour": one.colour, "t": _rounded(times - one.zero), "p": _rounded(states.p), "q": _rounded(states.q, 4),
-            "rotors": _rounded(one.vehicle.rotor_xy), "reference": _path(one.view.reference, one.start, one.end),
-            "pad": _pad(one.view), "cables": _rounded(one.view.cables)}
-
-
-def _path(states: States | None, start: float, end: float) -> list[Any]:
-    if states is None:
-        return []
-    inside = np.flatnonzero((states.t >= start) & (states.t <= end))
-    return _rounded(states.p[inside[::2]])
-
-
-def _pad(view: View) -> list[Any]:
-    if view.pad is None:
-        return []
-    corners = PAD * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
-    return _rounded(view.pad[0] + corners @ view.pad[1][:, :2].T)
+def _flight(view: FlightView, zero: float) -> dict[str, Any]:
+    start, end = view.around(BEFORE, AFTER)
+    times = np.arange(start, end + 0.5 * PERIOD, PERIOD)
+    states, reference = view.truth.at(times), view.reference
+    wanted = np.empty((0, 3)) if reference is None else reference.p[(reference.t >= start) & (reference.t <= end)][::2]
+    return {"colour": view.colour, "t": _rounded(times - zero), "p": _rounded(states.p), "q": _rounded(states.q, 4),
+            "rotors": _rounded(view.vehicle.rotor_xy), "reference": _rounded(wanted), "cables": _rounded(view.cables),
+            "pad": [] if view.pad_corners is None else _rounded(view.pad_corners)}
 
 
 def _rounded(values: Any, digits: int = 3) -> list[Any]:

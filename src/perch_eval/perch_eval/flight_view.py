@@ -1,0 +1,74 @@
+"""A flight as it is shown, alone or beside others: states, place, camera images, and the time of the perch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core import so3
+from perch_core.values import CameraImage
+from perch_core.vehicle import Vehicle
+from perch_eval.flight import Flight, States
+from perch_eval.metrics import perch_window
+
+TRUTH, ESTIMATE, WANTED, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
+PAD = 0.3  # half of the pad's side [m]
+SQUARE = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+
+
+@dataclass(frozen=True)
+class FlightView:
+    """What is shown of a flight.
+
+    Attributes:
+        name, colour: on a page with several flights.
+        flight, vehicle: what was recorded, and what flew.
+        truth: true states.
+        estimate, reference: estimated and wanted states, where recorded.
+        pad: true pose of the pad p (3,), R (3, 3), where there is one.
+        cables: end points of mapped wires, (n, 2, 3).
+        camera: (time [s], image) of the front camera's images.
+        start, end: of the perch, or of the recording where there is none [s].
+    """
+
+    name: str
+    colour: str
+    flight: Flight
+    vehicle: Vehicle
+    truth: States
+    estimate: States | None
+    reference: States | None
+    pad: tuple[np.ndarray, np.ndarray] | None
+    cables: np.ndarray
+    camera: list[tuple[float, CameraImage]]
+    start: float
+    end: float
+
+    @classmethod
+    def of(cls, flight: Flight, vehicle: Vehicle, name: str = "", colour: str = TRUTH) -> FlightView:
+        """What a recording holds.
+
+        Raises:
+            LookupError: no true states.
+        """
+        truth = flight.states("ground_truth/odometry")
+        if truth is None:
+            raise LookupError("the recording holds no ground_truth/odometry")
+        pad = None
+        if targets := flight.values("ground_truth/target"):
+            pad = np.array(targets[-1][1].p), so3.quat_to_matrix(np.array(targets[-1][1].q))
+        lines = flight.values("powerlines")
+        cables = np.array([[line.start, line.end] for line in lines[-1][1].lines]) if lines else np.zeros((0, 2, 3))
+        window = perch_window(flight) or (float(truth.t[0]), float(truth.t[-1]))
+        return cls(name, colour, flight, vehicle, truth, flight.states("odometry"), flight.reference(), pad, cables.reshape(-1, 2, 3),
+                   flight.values("camera_front/image_raw/compressed"), *window)
+
+    def around(self, before: float, after: float) -> tuple[float, float]:
+        """The perch with some time before and after it, as far as it is recorded [s]."""
+        return max(float(self.truth.t[0]), self.start - before), min(float(self.truth.t[-1]), self.end + after)
+
+    @property
+    def pad_corners(self) -> np.ndarray | None:
+        """Of the pad in W [m], shape (4, 3)."""
+        return None if self.pad is None else self.pad[0] + PAD * SQUARE @ self.pad[1][:, :2].T
