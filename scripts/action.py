@@ -12,7 +12,7 @@ EXAMPLES = """examples:
   python3 scripts/action.py list -t
   python3 scripts/action.py send_goal /perch perch_msgs/action/Perch '{takeoff_height: 1.2}' --feedback
 """
-HANDLERS = {"list": "actions:list_actions", "send_goal": "actions:send_goal"}
+HANDLERS = {"list": "calls:list_actions", "send_goal": "calls:send_goal"}
 
 
 def command_line() -> argparse.ArgumentParser:

@@ -12,7 +12,7 @@ EXAMPLES = """examples:
   python3 scripts/service.py list -t
   python3 scripts/service.py call /plan_perch perch_msgs/srv/PlanPerch '{}'
 """
-HANDLERS = {"list": "services:list_services", "call": "services:call_service"}
+HANDLERS = {"list": "calls:list_services", "call": "calls:call_service"}
 
 
 def command_line() -> argparse.ArgumentParser:

@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs, sharing
     from perch_eval.stack import Stack
-    from perch_eval.view.address import check_free
+    from perch_eval.view.gate import check_free
     from ros_graph.connection import visit
 
     open_network(arguments.network)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -131,3 +132,13 @@ def visit() -> Iterator[Visit]:
 def hidden(name: str) -> bool:
     """Whether a part of a name begins with an underscore, which ROS keeps out of lists."""
     return any(part.startswith("_") for part in name.split("/"))
+
+
+def show_names(arguments: argparse.Namespace, observe: Callable[[Node], list[tuple[str, list[str]]]]) -> int:
+    """Print the names of the graph that are not hidden, with their types where that is asked for (`list -t`)."""
+    with visit() as graph:
+        found = graph.settle(lambda: observe(graph.node), arguments.spin_time)
+    for name, types in sorted(found):
+        if not hidden(name):
+            print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
+    return 0

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import argparse
 
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, hidden, visit
+from ros_graph.connection import Visit, show_names, visit
 from ros_graph.interfaces import interface
 
 
 def list_topics(arguments: argparse.Namespace) -> int:
     """`topic.py list`"""
-    with visit() as graph:
-        topics = graph.settle(graph.node.get_topic_names_and_types, arguments.spin_time)
-    for name, types in sorted(topics):
-        if not hidden(name):
-            print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
-    return 0
+    return show_names(arguments, Node.get_topic_names_and_types)
 
 
 def show_info(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Lists actions and sends goals."""
+"""Lists services and actions, sends requests and goals."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import sys
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient, get_action_names_and_types
 from rclpy.action.client import ClientGoalHandle
+from rclpy.node import Node
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, visit
+from ros_graph.connection import Visit, show_names, visit
 from ros_graph.interfaces import interface
 from ros_graph.message_text import to_yaml
 from ros_graph.message_values import fill, parse
@@ -22,13 +23,28 @@ _STATUS = {
 }
 
 
+def list_services(arguments: argparse.Namespace) -> int:
+    """`service.py list`"""
+    return show_names(arguments, Node.get_service_names_and_types)
+
+
 def list_actions(arguments: argparse.Namespace) -> int:
     """`action.py list`"""
+    return show_names(arguments, get_action_names_and_types)
+
+
+def call_service(arguments: argparse.Namespace) -> int:
+    """`service.py call`: prints the response; 1 where it says `success: false`."""
+    cls = interface(arguments.type, "srv")
+    request = fill(cls.Request(), parse(arguments.values, "request"))
     with visit() as graph:
-        actions = graph.settle(lambda: get_action_names_and_types(graph.node), arguments.spin_time)
-    for name, types in sorted(actions):
-        print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)
-    return 0
+        service = graph.absolute(arguments.service)
+        client = graph.node.create_client(cls, service)
+        if not graph.spin_until(client.service_is_ready, arguments.spin_time):
+            raise GraphError(f"service {service} does not exist with type {arguments.type}; 'service.py list -t' shows all")
+        response = graph.answer(client.call_async(request), service, timeout=30.0)
+    sys.stdout.write(to_yaml(response))
+    return 0 if getattr(response, "success", True) else 1
 
 
 def send_goal(arguments: argparse.Namespace) -> int:
