@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_eval import consistency
 from perch_eval.estimation_flight import EstimatorTrack, Flight, motion_of
@@ -50,9 +49,8 @@ def test_errors_of_the_body_move_vehicle_and_target_alike(hover):
 
 
 def test_an_image_from_before_the_truth_was_heard_first_shows_nothing():
-    config, mount = TargetLocalizerConfig(), load_vehicle("snapdragon").mounts["front"]
     truth = StateHistory(10)
     truth.append(TrueState(1_490_000_000, np.r_[np.zeros(3), 0.0, 0.0, 0.0, 1.0, np.zeros(6)]))
-    sight = ModelledSight(load_board(config.board), mount, mount, config.localizer, np.random.default_rng(1), truth, lambda: None)
+    sight = ModelledSight(TargetLocalizerConfig(), load_scenario("surface_90_ideal"), 1, truth, lambda: None)
     found = sight.process(None, 1.148, None)
     assert found.board is None and "outside" in found.message

@@ -10,7 +10,7 @@ from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_eval import nodes as nodes_module
 from perch_eval.node_launch import (
-    NODES, NodeLaunch, choose_nodes, node_launches, parse_override, parse_overrides, read_parameters)
+    NODES, NodeLaunch, choose_nodes, node_launches, parse_overrides, read_parameters)
 from perch_eval.nodes import ALL_NODES, node_programs, programs
 from perch_sim.scenario import Scenario, load_scenario
 
@@ -99,11 +99,11 @@ def test_impossible_choices_are_refused(arguments, words):
 
 
 def test_overrides_are_yaml_and_name_their_node():
-    assert parse_override("controller.gains.a:=2") == ("controller", "gains.a", 2)
+    assert parse_overrides(["controller.gains.a:=2"]) == {"controller": {"gains.a": 2}}
     assert parse_overrides(["a.x:=1", "b.y:=[1.0, 2.0]", "a.x:=false"]) == {"a": {"x": False}, "b": {"y": [1.0, 2.0]}}
     for text in ("controller.a=1", "a:=1", ".a:=1", "controller.a:=[1"):
         with pytest.raises(PerchError, match="-p "):
-            parse_override(text)
+            parse_overrides([text])
     with pytest.raises(PerchError, match="'vio', which is not started"):
         node_launches(scenario(), ["vehicle"], overrides={"vio": {"a": 1}})
 

@@ -21,21 +21,31 @@ def count(text: str) -> int:
     return value
 
 
-def exit_code(work: Callable[[], int], *mistakes: type[Exception]) -> int:
+def command_parser(name: str, description: str | None, examples: str) -> argparse.ArgumentParser:
+    """A command line with examples below its help, which stay as they are written."""
+    return argparse.ArgumentParser(prog=name, description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def exit_code(work: Callable[[], int], *mistakes: type[Exception], interrupted: str = "interrupted") -> int:
     """What a command ends with: what its work returns, 2 with one line where it is refused, 130 where it is interrupted.
 
     Args:
         work: of the command.
         mistakes: what else the caller is to blame for, beside `PerchError` and `OSError`.
+        interrupted: said after Ctrl-C.
     """
     try:
         return work()
-    except (PerchError, OSError, *mistakes) as error:
+    except OSError as error:
+        print(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error}", file=sys.stderr)
+    except Exception as error:
+        if not isinstance(error, (PerchError, *mistakes)):
+            raise
         print(f"error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
+        print(f"\n{interrupted}", file=sys.stderr)
         return 130
+    return 2
 
 
 def output_folder(path: Path, option: str = "--out") -> Path:

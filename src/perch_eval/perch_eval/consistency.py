@@ -81,8 +81,8 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int, pro
     if samples.ndim != 2 or samples.shape[1] != len(times):
         raise ValueError(f"samples of shape {samples.shape} do not fit {len(times)} times")
     runs, tail = len(samples), 0.5 * (1 - probability)
-    bounds = tuple(float(b) for b in chi2.ppf([tail, 1 - tail], runs * dimension) / runs)
-    return Consistency(name, dimension, np.asarray(times), samples.mean(axis=0), bounds, runs)
+    low, high = chi2.ppf([tail, 1 - tail], runs * dimension) / runs
+    return Consistency(name, dimension, np.asarray(times), samples.mean(axis=0), (float(low), float(high)), runs)
 
 
 def plot(results: list[Consistency], path: Path | str, marks: dict[str, float] | None = None) -> None:

@@ -76,12 +76,11 @@ class _Module:
         self.package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         self.defined: dict[str, ast.stmt] = {}
         self.imported: dict[str, _Key] = {}
-        for node in self.tree.body:
-            for target in getattr(node, "targets", [getattr(node, "target", node)]):
-                for leaf in ast.walk(target) if isinstance(node, ast.Assign) else [target]:
-                    name = getattr(leaf, "name", getattr(leaf, "id", None))
-                    if name:
-                        self.defined[name] = node
+        for statement in self.tree.body:
+            for target in getattr(statement, "targets", [getattr(statement, "target", statement)]):
+                for leaf in ast.walk(target) if isinstance(statement, ast.Assign) else [target]:
+                    if own := getattr(leaf, "name", getattr(leaf, "id", None)):
+                        self.defined[own] = statement
         for node in ast.walk(self.tree):
             if isinstance(node, ast.ImportFrom):
                 self.imported |= {alias.asname or alias.name: (node.module or "", alias.name) for alias in node.names}
@@ -125,7 +124,8 @@ def _reached(modules: dict[str, _Module]) -> set[_Key]:
 @lru_cache
 def definitions(root: Path) -> dict[_Key, list[Place]]:
     """Where each equation is defined."""
-    modules, found = _modules(root), {}
+    modules = _modules(root)
+    found: dict[_Key, list[Place]] = {}
     reached = _reached(modules)
     modules.pop(__name__, None)  # it shows what a tag looks like
     for name, module in modules.items():

@@ -132,6 +132,7 @@ class _Frame(CameraImage):
     """An image that knows the middle of its exposure [s]."""
 
     __slots__ = ("middle",)
+    middle: float
 
 
 class _Vehicle(Component[NoParameters]):
@@ -140,7 +141,7 @@ class _Vehicle(Component[NoParameters]):
     config_type = NoParameters
 
     imu = Output(ImuSample, "imu/data_raw")
-    info = Output(CameraModel, "camera_down/camera_info")
+    camera_info = Output(CameraModel, "camera_down/camera_info")
     image = Output(CameraImage, "camera_down/image_raw")
 
     def __init__(self, flight: Flight, begin: float = 0.0, transport: float = TRANSPORT, tamper: Tamper | None = None,
@@ -162,10 +163,9 @@ class _Vehicle(Component[NoParameters]):
         at = float(self._flight.truth.times[self._k])
         sample = self._flight.sample(self._k)
         self._k, self.time = self._k + 1, sample.stamp
-        if self._tamper_imu is not None:
-            sample = self._tamper_imu(at, sample)
-        if sample is not None:
-            self.imu(sample)
+        arriving = sample if self._tamper_imu is None else self._tamper_imu(at, sample)
+        if arriving is not None:
+            self.imu(arriving)
         arrivals = []
         while self._coming is not None and self._coming[0] + self._transport <= at:
             arrivals += self._show(*self._coming)
@@ -177,7 +177,7 @@ class _Vehicle(Component[NoParameters]):
         for arriving, shown in self._tamper(middle, stamp, pixels) if self._tamper is not None else [(stamp, pixels)]:
             image = _Frame(arriving, frame, shown.shape[1], shown.shape[0], "mono8", shown)
             image.middle = middle
-            self.info(CameraModel(arriving, frame, camera))
+            self.camera_info(CameraModel(arriving, frame, camera))
             self.image(image)
             arrivals.append(Arrival("down", arriving, round(middle * 1e9), image))
         return arrivals
@@ -190,10 +190,12 @@ class _Vio(VioComponent):
         super().__init__(config)
         self.frames: list[tuple[float, VioResult, float]] = []  # middle of the exposure [s], result, CPU time [s]
 
-    def use(self, image: _Frame) -> None:
+    def use(self, image: CameraImage) -> None:
         """As it does, and note it."""
+        assert isinstance(image, _Frame)
         clock = time.process_time()
         super().use(image)
+        assert self.result is not None
         self.frames.append((image.middle, self.result, time.process_time() - clock))
 
 
@@ -202,14 +204,14 @@ class _Repeated(Component[NoParameters]):
 
     config_type = NoParameters
 
-    info = Input(CameraModel, "camera_down/camera_info")
+    frame = Input(CameraModel, "camera_down/camera_info")
     state = Output(InertialState, "vio/state")
 
     def __init__(self, states: dict[int, InertialState]) -> None:
         super().__init__(NoParameters())
         self._states = states
 
-    def on_info(self, model: CameraModel) -> None:
+    def on_frame(self, model: CameraModel) -> None:
         """Of the frame with this stamp."""
         if model.stamp in self._states:
             self.state(self._states[model.stamp])
@@ -219,7 +221,7 @@ class _Estimator(StateEstimator):
     """Keeps its whole state at every `stride`-th sample from `begin` [s] on, and the NIS of each state that it has used."""
 
     def __init__(self, config: UkfConfig, begin: float, stride: int) -> None:
-        super().__init__(config)
+        super().__init__(config)  # type: ignore[arg-type]  # the name of the estimator is nothing to itself
         self._from, self._stride, self._samples = round(begin * 1e9), stride, 0
         self.states: list[tuple[int, Estimate]] = []  # number of the sample
         self.nis: list[float] = []
@@ -231,6 +233,7 @@ class _Estimator(StateEstimator):
         if self._estimator.status.accepted > accepted:
             self.nis.append(self._estimator.status.nis)
         if sample.stamp >= self._from and self._samples % self._stride == 0:
+            assert self._estimator.estimate is not None
             self.states.append((self._samples, self._estimator.estimate))
         self._samples += 1
 

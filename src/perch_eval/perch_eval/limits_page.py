@@ -63,9 +63,8 @@ def _requests() -> Iterator[str]:
     yield (f"## Requests and goals\n\nAt most {WAITING} requests of a service wait, and {WAITING_MAX} plans; more plans are refused. Every request is "
            "answered.\n\n| service, action | value | node |\n| --- | --- | --- |")
     for node, cls in _components():
-        for port in (*ports(cls, Service), *ports(cls, Action)):
-            value = port.goal if isinstance(port, Action) else port.request
-            yield f"| `{port._channel}` | {value.__name__} | {node} |"
+        taken = [(port._channel, port.request) for port in ports(cls, Service)] + [(port._channel, port.goal) for port in ports(cls, Action)]
+        yield from (f"| `{channel}` | {value.__name__} | {node} |" for channel, value in taken)
     yield ""
 
 

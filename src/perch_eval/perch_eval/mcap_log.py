@@ -98,6 +98,6 @@ def read(path: Path, topics: set[str] | None = None,
         try:
             for schema, channel, message in NonSeekingReader(file, validate_crcs=True).iter_messages(
                     topics=list(topics) if topics else None, log_time_order=False):
-                yield channel.topic, schema.name, message.log_time, message.data
+                yield channel.topic, schema.name if schema else "", message.log_time, message.data
         except (McapError, EOFError, struct.error, ZstdError, CRCValidationError, UnicodeDecodeError) as error:
             on_damage(str(error) or type(error).__name__)

@@ -16,16 +16,12 @@ import numpy as np
 from perch_core.component import Input
 from perch_core.config import quantity, text
 from perch_core.ros.node import node
-from perch_core.tag_board import load_board
 from perch_core.values import CameraImage, CameraModel, OdometryState
-from perch_core.vehicle import load_vehicle
 from perch_eval.in_process.modelled_sight import ModelledSight
 from perch_eval.in_process.stand_ins import MappedWorld
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
-from perch_sim import seeding
-from perch_sim.calibration import true_mounts
 from perch_sim.lockstep import START
 from perch_sim.obstacles import pad_surface
 from perch_sim.scenario import Scenario, load_scenario
@@ -56,7 +52,7 @@ class ModelledLocalizer(TargetLocalizer):
 
     config_type = SightParameters
 
-    image = None
+    image = None  # type: ignore[assignment]
     truth = Input(OdometryState, "ground_truth/odometry")
 
     def __init__(self, config: SightParameters) -> None:
@@ -65,13 +61,8 @@ class ModelledLocalizer(TargetLocalizer):
             ConfigError: no such scenario, vehicle, camera or board.
         """
         scenario = load_scenario(config.scenario)
-        mount = load_vehicle(scenario.vehicle).mounts[config.camera]
-        true = true_mounts(scenario, {config.camera: mount}, config.seed)[config.camera]
         self._truth, self._newest = StateHistory(MEMORY), 0
-        self._sight = ModelledSight(
-            load_board(config.board), mount, true, config.localizer, seeding.stream(config.seed, "tag_corners"), self._truth,
-            lambda: pad_surface(scenario, (self._newest - START) * 1e-9), averaging=config.mode == "average",
-            calibration=config.calibration)
+        self._sight = ModelledSight(config, scenario, config.seed, self._truth, lambda: pad_surface(scenario, (self._newest - START) * 1e-9))
         super().__init__(config, self._sight)
 
     def _channel(self, port: str) -> str:
@@ -97,7 +88,7 @@ class ModelledLocalizer(TargetLocalizer):
 class ModelledMapper(MappedWorld):
     """The map of a scenario's cables with the mapper's error."""
 
-    config_type = MapParameters
+    config_type = MapParameters  # type: ignore[assignment]
 
     def __init__(self, config: MapParameters) -> None:
         """
@@ -106,7 +97,7 @@ class ModelledMapper(MappedWorld):
             PerchError: a cable sags.
         """
         super().__init__(replace(MappedWorld.of(load_scenario(config.scenario), config.seed).config, camera=config.camera))
-        self.config = config
+        self.config = config  # type: ignore[assignment]
 
 
 TARGET_LOCALIZER = node("target_localizer", ModelledLocalizer)

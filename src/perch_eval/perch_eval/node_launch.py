@@ -162,28 +162,19 @@ def parameters_in(file: Path, changed: int) -> dict[str, Any]:
     return found
 
 
-def parse_override(text: str) -> tuple[str, str, Any]:
-    """`node.parameter:=value`, with a value in YAML, as (node, parameter, value).
-
-    Raises:
-        PerchError: text of another form.
-    """
-    target, assigned, value = text.partition(":=")
-    node, dot, parameter = target.partition(".")
-    if not (assigned and dot and node and parameter):
-        raise PerchError(f"-p {text}: expected NODE.PARAMETER:=VALUE, as in controller.position_gain:=6.0")
-    return node, parameter, config.parse_yaml(value, f"-p {text}")
-
-
 def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Several `node.parameter:=value` as node -> parameter -> value; of two for the same, the later counts.
+    """Several `node.parameter:=value`, with values in YAML, as node -> parameter -> value; of two for the same, the later counts.
 
     Raises:
         PerchError: a text of another form.
     """
     overrides: dict[str, dict[str, Any]] = {}
-    for node, parameter, value in map(parse_override, texts):
-        overrides.setdefault(node, {})[parameter] = value
+    for text in texts:
+        target, assigned, value = text.partition(":=")
+        node, dot, parameter = target.partition(".")
+        if not (assigned and dot and node and parameter):
+            raise PerchError(f"-p {text}: expected NODE.PARAMETER:=VALUE, as in controller.position_gain:=6.0")
+        overrides.setdefault(node, {})[parameter] = config.parse_yaml(value, f"-p {text}")
     return overrides
 
 
@@ -198,9 +189,9 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
     """What the scenario as a whole means for single nodes."""
     participants = [node for node in nodes if NODES[node].participant]
     vehicle = {"vehicle": scenario.vehicle}
-    mission = {"mission.planner_latency": scenario.latency.perching_planner,
+    mission: dict[str, Any] = {"mission.planner_latency": scenario.latency.perching_planner,
                "mission.powerline_latency": scenario.latency.powerline_planner}
-    controller = dict(vehicle)
+    controller: dict[str, Any] = dict(vehicle)
     planner = vehicle | ({"time_limit": PATIENT} if lockstep else {})  # simulation time waits: what is flown depends on no processor
     if scenario.mode == "inspection":
         mission |= {"mission.waypoints": [v for w in scenario.inspection.waypoints for v in (*w.position, w.yaw_deg)],

@@ -13,7 +13,7 @@ import numpy as np
 from perch_core import config, so3
 from perch_core.flatness import flat_to_state
 from perch_core.vehicle import GRAVITY, ImuConfig
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import BSpline, make_interp_spline
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class PerchMotion:
     settings: PerchMotionConfig = PerchMotionConfig()
     seed: int = 0
     duration: float = field(init=False)
-    _path: object = field(init=False, repr=False)
+    _path: BSpline = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -129,7 +129,7 @@ class PerchMotion:
     def sample(self, times: np.ndarray) -> Motion:
         """The state at times [s], shape (n,)."""
         derivatives = [self._path.derivative(k)(times) if k else self._path(times) for k in range(5)]
-        states = [flat_to_state(*row, 0.0, 0.0, 0.0, 1.0) for row in zip(*derivatives)]
+        states = [flat_to_state(p, v, a, j, s, 0.0, 0.0, 0.0, 1.0) for p, v, a, j, s in zip(*derivatives)]
         R = np.array([s.R_WB for s in states])
         a = derivatives[2]
         f = np.einsum("nji,nj->ni", R, a + np.array([0, 0, GRAVITY]))

@@ -123,6 +123,7 @@ class RunningProgram:
 
     def _read(self) -> None:
         """Take everything that it writes, whatever becomes of the log: a program whose pipe is full waits, one whose pipe is closed dies."""
+        assert self._process.stdout is not None
         with self._process.stdout as stream, ExitStack() as stack:
             file = None
             with suppress(OSError):

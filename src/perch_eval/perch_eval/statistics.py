@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
+from scipy.stats import binomtest
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,10 @@ class Rate:
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson score interval: sensible at 0 and at 1, too; (0, 1) without trials."""
-        n = self.trials
-        if n == 0:
+        if not self.trials:
             return 0.0, 1.0
-        z, p = NormalDist().inv_cdf(0.5 + self.confidence / 2), self.successes / n
-        centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-        return max(0.0, centre - half), min(1.0, centre + half)
+        found = binomtest(self.successes, self.trials).proportion_ci(self.confidence, method="wilson")
+        return float(found.low), float(found.high)
 
     def __str__(self) -> str:
         low, high = self.interval

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from perch_core.component import Component, LogLine
@@ -30,7 +30,8 @@ class SentGoal:
         self.value, self.feedback = value, told
         self.cancel_requested = False
         self.rejected = ""
-        self.ending, self.result = "", None
+        self.ending = ""
+        self.result: PerchResult | None = None
 
     def finish(self, ending: str, result: PerchResult) -> None:
         """It has ended."""
@@ -44,7 +45,7 @@ class _Reached(LocalParticipant):
         super().__init__(component, **options)
         self._filters = filters
 
-    def begin(self, now: int, batch: list[Packet]) -> None:
+    def begin(self, now: int, batch: Sequence[Packet]) -> None:
         """Work on what arrives of a batch."""
         if self._filters:
             mine = {channel: change for (name, channel), change in self._filters.items() if name == self.name}
@@ -76,7 +77,8 @@ class Loop:
             PerchError: a component has no task.
         """
         one_thread_for_sums()
-        self.vehicle, self.components = vehicle, {**components, **servers}
+        self.vehicle: Any = vehicle
+        self.components: dict[str, Any] = {**components, **servers}
         self.filters: dict[tuple[str, str], Filter] = {}
         self.trace = FlightTrace()
         asked = {name: LocalParticipant(server, name=name) for name, server in servers.items()}

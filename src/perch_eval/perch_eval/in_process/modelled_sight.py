@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount
 from perch_core.surface import PerchSurface
-from perch_core.tag_board import TagBoard, load_board
+from perch_core.tag_board import load_board
 from perch_core.values import NANOSECONDS
+from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
-from perch_perception.tags import (
-    CalibrationSigma, Localization, LocalizationRefusal, LocalizerConfig, average_board, solve_board)
+from perch_perception.tags import Localization, LocalizationRefusal, average_board, solve_board
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
+from perch_sim.scenario import Scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
 from perch_sim.state_history import StateHistory, TrueState
 
@@ -41,43 +41,37 @@ def corner_sigma(side: np.ndarray) -> np.ndarray:
 
 def modelled_localizer(config: TargetLocalizerConfig, vehicle: SimulatedVehicle, seed: int) -> TargetLocalizer:
     """The target localiser with its sightings made from the truth."""
-    simulation, board, truth = vehicle.simulation, load_board(config.board), StateHistory(MEMORY)
-    mount = simulation.vehicle.mounts[config.camera]
-    true = true_mounts(simulation.scenario, {config.camera: mount}, seed)[config.camera]
+    simulation, truth = vehicle.simulation, StateHistory(MEMORY)
     truth.append(simulation.state)  # an exposure may have its middle before the first step ends
     vehicle.truth.receivers.append(lambda _: truth.append(simulation.state))
-    return TargetLocalizer(config, ModelledSight(
-        board, mount, true, config.localizer, seeding.stream(seed, "tag_corners"), truth, lambda: simulation.pad,
-        averaging=config.mode == "average", calibration=config.calibration))
+    return TargetLocalizer(config, ModelledSight(config, simulation.scenario, seed, truth, lambda: simulation.pad))
 
 
 class ModelledSight:
     """Sightings of the board made from the truth, in the place of `BoardLocalizer`."""
 
-    def __init__(self, board: TagBoard, mount: CameraMount, true: CameraMount, settings: LocalizerConfig, rng: np.random.Generator,
-                 truth: StateHistory, pad: Callable[[], PerchSurface], averaging: bool = False,
-                 calibration: CalibrationSigma = CalibrationSigma()) -> None:
+    def __init__(self, config: TargetLocalizerConfig, scenario: Scenario, seed: int, truth: StateHistory, pad: Callable[[], PerchSurface]) -> None:
         """
         Args:
-            board: geometry of the tags.
-            mount: the camera as calibrated.
-            true: the camera as it is.
-            settings: of the localiser whose place it takes.
-            rng: of the corners' errors.
+            config: of the localiser.
+            scenario: says which vehicle flies, and how wrong its calibration is.
+            seed: of the calibration's and the corners' errors.
             truth: the vehicle's last states.
             pad: gives the true pad as it is now.
-            averaging: compute the paper's average too.
-            calibration: how well the lens is known.
+
+        Raises:
+            ConfigError: no such vehicle or board.
         """
-        self._truth, self._pad = truth, pad
-        self._board, self._mount, self._true, self._settings, self._rng = board, mount, true, settings, rng
-        self._averaging, self._lens_sigma = averaging, calibration.lens
+        self._truth, self._pad, self._config = truth, pad, config
+        self._board, self._mount = load_board(config.board), load_vehicle(scenario.vehicle).mounts[config.camera]
+        self._true = true_mounts(scenario, {config.camera: self._mount}, seed)[config.camera]
+        self._rng = seeding.stream(seed, "tag_corners")
         self._last = self._searched = -np.inf
         self._R_CS: np.ndarray | None = None
 
     def process(self, image: Any, exposed: float, body: BodyState | None) -> Localization:
         """What the localiser would say of an image, which is not looked at; arguments as those of `Localizer.process`."""
-        settings = self._settings
+        settings = self._config.localizer
         tracking = exposed - self._last <= settings.lost_after
         if not tracking:
             self._R_CS = None
@@ -96,14 +90,14 @@ class ModelledSight:
         rays = self._mount.camera.unproject(measured.reshape(-1, 2)).reshape(-1, 4, 3)
         corners_S = self._board.corners_S[[self._board.ids.index(i) for i in ids]]
         try:
-            pose = solve_board(self._mount.camera, corners_S, rays, sigma, ids, self._R_CS, lens_sigma=self._lens_sigma)
+            pose = solve_board(self._mount.camera, corners_S, rays, sigma, ids, self._R_CS, lens_sigma=self._config.calibration.lens)
         except LocalizationRefusal as refusal:
             return Localization(None, message=str(refusal))
         if not settings.min_range <= np.linalg.norm(pose.p_CS) <= settings.max_range:
             return Localization(None, message="not a board of this size")
         self._last, self._R_CS = exposed, pose.R_CS
         complete = len(ids) == len(self._board.ids)
-        average = average_board(self._mount.camera, corners_S, rays, ids) if self._averaging and complete else None
+        average = average_board(self._mount.camera, corners_S, rays, ids) if self._config.mode == "average" and complete else None
         return Localization(pose, average, complete)
 
     def middle(self, exposed: float) -> int:

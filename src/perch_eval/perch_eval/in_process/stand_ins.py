@@ -33,7 +33,11 @@ class MappedWorldParameters:
 
 def mapped(lines: Sequence[Segment], rng: np.random.Generator) -> tuple[Segment, ...]:
     """Lines as a mapper finds them: each end is off by `MAP_ERROR`."""
-    return tuple(Segment.between(*(end + MAP_ERROR * rng.normal(size=3) for end in line.ends), line.radius, line.id) for line in lines)
+    out = []
+    for line in lines:
+        start, end = (end + MAP_ERROR * rng.normal(size=3) for end in line.ends)
+        out.append(Segment.between(start, end, line.radius, line.id))
+    return tuple(out)
 
 
 class MappedWorld(Component[MappedWorldParameters]):
@@ -48,7 +52,7 @@ class MappedWorld(Component[MappedWorldParameters]):
         super().__init__(config)
         length = [2.0 * line.half_length for line in config.lines]
         self._lines = tuple(
-            MappedPowerline(line.id, *(tuple(end.tolist()) for end in line.ends), line.radius, MAP_ERROR**2 * np.eye(3),
+            MappedPowerline(line.id, tuple(line.ends[0].tolist()), tuple(line.ends[1].tolist()), line.radius, MAP_ERROR**2 * np.eye(3),
                             MAP_ERROR * np.sqrt(2.0) / along, 100) for line, along in zip(config.lines, length))
         self._next = 0
 
@@ -67,5 +71,5 @@ class MappedWorld(Component[MappedWorldParameters]):
         """
         if any(cable.sag > 0.0 for cable in scenario.world.cables):
             raise PerchError(f"scenario {scenario.name}: cables that sag have no error model; sensing.target must be rendered")
-        lines = [Segment.between(c.start, c.end, c.radius, k) for k, c in enumerate(scenario.world.cables)]
+        lines = [Segment.between(np.array(c.start), np.array(c.end), c.radius, k) for k, c in enumerate(scenario.world.cables)]
         return cls(MappedWorldParameters("front", mapped(lines, seeding.stream(seed, "line_map"))))
