@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_core.vehicle import Vehicle
-from perch_eval.flight_view import PAD, SQUARE, FlightView
+from perch_eval.flight_view import LIMIT, PAD, SQUARE, FlightView
 from perch_eval.metrics import tilt_degrees
 
 AZIMUTH, ELEVATION = math.radians(-68.0), math.radians(12.0)  # of the observer, from the direction of flight
@@ -31,22 +31,22 @@ def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) 
     """
     times = np.linspace(start, end, instants)
     flown = view.truth.at(np.linspace(start, end, 200))
-    right, up, towards = _observer(flown.p[-1] - flown.p[0])
-    project = lambda points: np.asarray(points) @ np.column_stack([right, up])
+    observer = Observer(flown.p[-1] - flown.p[0])
+    project = observer.project
     figure = Figure(figsize=(10.0, 5.6), layout="constrained")
     axes = figure.add_subplot()
     axes.set_aspect("equal")
     axes.axis("off")
-    _draw_place(axes, view, project)
+    draw_place(axes, view, observer)
     axes.plot(*project(flown.p).T, color="0.6", lw=1.0, zorder=2)
     colors = colormaps["viridis"](np.linspace(0.0, 0.85, instants))
     states = view.truth.at(times)
     tilts = tilt_degrees(states.q)
     for k, (p, q) in enumerate(zip(states.p, states.q)):
         R = so3.quat_to_matrix(q)
-        _draw_vehicle(axes, view.vehicle, p, R, project, towards, colors[k], 3 + k)
+        draw_vehicle(axes, view.vehicle, p, R, observer, colors[k], 3 + k)
         if k == instants - 1 or np.linalg.norm(states.p[k + 1] - p) > LABEL:
-            axes.annotate(f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°", project(p + 0.5 * PAD * DOWN), ha="center", va="top",
+            axes.annotate(f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°", tuple(project(p + 0.5 * PAD * DOWN)), ha="center", va="top",
                           fontsize=7, color="0.25", zorder=50,
                           bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0.0, "pad": 0.5})
     left, low = project(flown.p).min(axis=0) - [0.1, 0.3]
@@ -56,17 +56,32 @@ def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) 
     return figure
 
 
-def _observer(flight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Axes of the picture, right and up, and the direction towards the observer, who sees the flight go to the right."""
-    heading = math.atan2(flight[1], flight[0])
-    a = heading + AZIMUTH
-    towards = np.array([math.cos(ELEVATION) * math.cos(a), math.cos(ELEVATION) * math.sin(a), math.sin(ELEVATION)])
-    right = np.cross([0.0, 0.0, 1.0], towards)
-    right /= np.linalg.norm(right)
-    return right, np.cross(towards, right), towards
+class Observer:
+    """Who sees the flight go to the right, from so far away that lines stay parallel.
+
+    Attributes:
+        towards: direction from the flight to the observer, shape (3,).
+    """
+
+    def __init__(self, flight: np.ndarray) -> None:
+        """
+        Args:
+            flight: from its start to its end [m], shape (3,).
+        """
+        a = math.atan2(flight[1], flight[0]) + AZIMUTH
+        self.towards = np.array([math.cos(ELEVATION) * math.cos(a), math.cos(ELEVATION) * math.sin(a), math.sin(ELEVATION)])
+        right = np.cross([0.0, 0.0, 1.0], self.towards)
+        right /= np.linalg.norm(right)
+        self._axes = np.column_stack([right, np.cross(self.towards, right)])
+
+    def project(self, points: Any) -> np.ndarray:
+        """Points in W as they are in the picture [m], shape (..., 3) -> (..., 2)."""
+        return np.asarray(points) @ self._axes
 
 
-def _draw_place(axes: Any, view: FlightView, project: Any) -> None:
+def draw_place(axes: Any, view: FlightView, observer: Observer) -> None:
+    """The pad with its tags, and the cables."""
+    project = observer.project
     if view.pad is not None:
         p, R = view.pad
         surface = lambda centre, half: project(p + (np.asarray(centre) + half * SQUARE) @ R[:, :2].T)
@@ -78,15 +93,18 @@ def _draw_place(axes: Any, view: FlightView, project: Any) -> None:
         axes.plot(*project(np.array([a, b])).T, color="0.2", lw=2.5, solid_capstyle="round", zorder=1)
 
 
-def _draw_vehicle(axes: Any, vehicle: Vehicle, p: np.ndarray, R: np.ndarray, project: Any, towards: np.ndarray, color: Any, order: float) -> None:
-    """Arms and rotor discs, the ones behind first; front rotors are red."""
+def draw_vehicle(axes: Any, vehicle: Vehicle, p: np.ndarray, R: np.ndarray, observer: Observer, color: Any, order: float) -> list[Any]:
+    """Arms, rotor discs, the ones behind first, and thrust axis; front rotors are red. Returns what was drawn."""
+    project = observer.project
     rotors = np.column_stack([vehicle.rotor_xy, np.zeros(len(vehicle.rotor_xy))])
     radius = 0.42 * float(np.min([np.linalg.norm(a - b) for i, a in enumerate(rotors) for b in rotors[:i]]))
     centres = p + (rotors + [0.0, 0.0, 0.02]) @ R.T
+    drawn = []
     for arm in p + rotors @ R.T:
-        axes.plot(*project(np.array([p, arm])).T, color=color, lw=2.4, solid_capstyle="round", zorder=order)
+        drawn += axes.plot(*project(np.array([p, arm])).T, color=color, lw=2.4, solid_capstyle="round", zorder=order)
     ring = radius * (np.outer(np.cos(DISC), R[:, 0]) + np.outer(np.sin(DISC), R[:, 1]))
-    for k in np.argsort(centres @ towards):
-        edge = "#d62728" if rotors[k][0] > 0.0 else color
-        axes.add_collection(PolyCollection([project(centres[k] + ring)], facecolor=(*color[:3], 0.35), edgecolor=edge, lw=1.0, zorder=order + 0.1))
-    axes.plot(*project(np.array([p, p + 0.12 * R[:, 2]])).T, color="#d62728", lw=1.4, zorder=order + 0.2)
+    for k in np.argsort(centres @ observer.towards):
+        edge = LIMIT if rotors[k][0] > 0.0 else color
+        drawn.append(axes.add_collection(PolyCollection(
+            [project(centres[k] + ring)], facecolor=(*color[:3], 0.35), edgecolor=edge, lw=1.0, zorder=order + 0.1)))
+    return drawn + axes.plot(*project(np.array([p, p + 0.12 * R[:, 2]])).T, color=LIMIT, lw=1.4, zorder=order + 0.2)
