@@ -103,7 +103,7 @@ def test_rows_of_other_code_are_flown_again_and_dropped(tmp_path, monkeypatch):
     file.write_text(json.dumps(row(code="before")) + "\n" + json.dumps(row(node="mission")) + "\n")
     kept = campaign.load(file, "now")
     assert set(campaign.load(file)) == {CASE, other} and list(kept) == [other]
-    campaign.fly_all([], file, tmp_path, kept)
+    campaign.fly_all([], file, tmp_path, kept, 1)
     assert list(campaign.load(file)) == [other]
 
 

@@ -80,3 +80,25 @@ def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
     while not getattr(asking, "answers", []):
         executor.spin_once(0.1)
     assert asking.answers == [Unavailable("service plan_perch is not there")]
+
+
+class Silent(Serving):
+    """Takes a request, and ends before its answer."""
+
+    def on_plan_perch(self, request, reply) -> None:
+        """Never."""
+        self.asked = True
+
+
+def test_a_request_whose_server_ended_is_answered_by_the_one_that_was_started_anew_and_once(executor):
+    asking, silent = node(executor, Asking).component, node(executor, Silent)
+    asking.plan_perch(REQUEST, 0)
+    while not hasattr(silent.component, "asked"):
+        executor.spin_once(0.1)
+    for _ in range(2):
+        node(executor, Serving)
+    while not getattr(asking, "answers", []):
+        executor.spin_once(0.1)
+    for _ in range(20):
+        executor.spin_once(0.05)
+    assert [answer.message for answer in asking.answers] == [NONE.message]

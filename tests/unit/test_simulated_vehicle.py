@@ -86,6 +86,19 @@ def test_commands_that_no_motor_follows_are_refused_and_the_last_good_one_counts
     assert seen["diagnostics"][-1].message == "motors stopped: no motor_command"
 
 
+def test_a_command_that_was_overtaken_does_not_undo_the_newer_one():
+    flown, seen = vehicle()
+    stamps = []
+    for _ in range(30):
+        flown.advance()
+        stamps.append(flown.time)
+        if len(stamps) > 1:
+            flown.on_motor_command(MotorCommand(stamps[-1], True, (500.0,) * 4))
+            flown.on_motor_command(MotorCommand(stamps[-2], False, (0.0,) * 4))
+    assert flown.simulation.plant.rotor_speed.min() > 300.0
+    assert [line.text for line in seen["log"] if "older than the one before" in line.text]
+
+
 @pytest.mark.slow
 def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_looked_at():
     flown, seen = vehicle("front")

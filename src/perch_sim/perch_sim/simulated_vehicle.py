@@ -16,7 +16,7 @@ from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
-    Transform, limits, nanoseconds, rotated)
+    Transform, limits, nanoseconds, rotated, seconds)
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing, DrawnInProcesses
@@ -126,6 +126,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
         try:
             if kind != simulation.vehicle.actuation.type:
                 raise MotorCommandError(f"{simulation.vehicle.name} takes {simulation.vehicle.actuation.type}, not {kind}: ignored")
+            if command.stamp < self._last_command:
+                raise MotorCommandError(f"{kind}: of {seconds(command.stamp):.3f} s, older than the one before: ignored")
             if simulation.loop is not None and command.armed and (said := limits.problem(command)):
                 raise MotorCommandError(f"{kind}: {said}")
             if simulation.loop is None:

@@ -12,8 +12,8 @@ from perch_core.ros import topics
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-DISCOVERY = 5.0  # a node that has just been started may not have found the service that it asks yet [s]
-LOOK = 0.02      # between two looks for it [s]
+DISCOVERY = 5.0  # without a server for so long, a request is given up; a node that was just started finds it later [s]
+LOOK = 0.1       # between two looks for servers [s]
 
 Deliver = Callable[[Client[Any, Any], Any], None]
 
@@ -27,27 +27,36 @@ def connect_clients(node: Node, component: Component[Any], deliver: Deliver) -> 
 
 
 def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: Any, deliver: Deliver) -> Callable[[Any, int], None]:
-    def send(request: Any) -> None:
-        future = client.call_async(row.request_message(request))
-        future.add_done_callback(lambda done: deliver(port, _answer(row, done)))
+    """A request goes to every server that appears until one has answered: who was asked first may have ended, and been started anew."""
+    replies = f"rr{node.resolve_service_name(client.srv_name)}Reply"  # as the middleware names it
 
     def ask(request: Any, due: int) -> None:
-        if client.service_is_ready():
-            send(request)
-            return
-        end = time.monotonic() + DISCOVERY
+        message, asked, calls = row.request_message(request), set[bytes](), list[Any]()
+        unanswered, seen = True, time.monotonic()
+
+        def finish(answer: Any) -> None:
+            nonlocal unanswered
+            if unanswered:
+                unanswered = False
+                node.destroy_timer(timer)
+                for call in calls:
+                    client.remove_pending_request(call)
+                deliver(port, answer)
 
         def look() -> None:
-            ready = client.service_is_ready()
-            if not ready and time.monotonic() < end:
-                return
-            node.destroy_timer(timer)
-            if ready:
-                send(request)
-            else:
-                deliver(port, Unavailable(f"service {client.srv_name} is not there"))
+            nonlocal seen
+            if client.service_is_ready():
+                seen = time.monotonic()
+                servers = {bytes(info.endpoint_gid) for info in node.get_publishers_info_by_topic(replies, no_mangle=True)}
+                if not calls or not servers <= asked:
+                    asked.update(servers)
+                    calls.append(client.call_async(message))
+                    calls[-1].add_done_callback(lambda done: finish(_answer(row, done)))
+            elif time.monotonic() - seen > DISCOVERY:
+                finish(Unavailable(f"service {client.srv_name} is not there"))
 
         timer = node.create_timer(LOOK, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        look()
 
     return ask
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -19,14 +20,14 @@ from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import prepare_worker
 from perch_eval.evaluation.document import machine
 from perch_eval.fork_server import ForkServer
-from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
+from perch_eval.graph_faults.cases import FAULTS, MODES, NAMED, PHASES, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, commit, digest
 
 EXAMPLES = """examples:
   python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on;
                                                                rows of other code are dropped first
-  python3 scripts/faults.py --jobs 2                           flights in lockstep two at a time; real time always alone
+  python3 scripts/faults.py --jobs 1                           one flight at a time
   python3 scripts/faults.py --most 20                          so many more
   python3 scripts/faults.py --only "kill estimator"            cases with these words in their names
   python3 scripts/faults.py --again --only "stop controller"   fly them once more
@@ -45,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--logs", type=Path, default=Path("out/faults"), metavar="DIR", help="logs of the flights (default: %(default)s)")
     out.add_argument("--only", default="", metavar="WORDS", help="cases with all of these words in their names")
     out.add_argument("--most", type=count, metavar="N", help="fly at most so many")
-    out.add_argument("--jobs", type=count, default=1, metavar="N", help="flights in lockstep at a time (default: %(default)s)")
+    out.add_argument("--jobs", type=count, default=len(os.sched_getaffinity(0)), metavar="N", help="flights at a time (default: %(default)s)")
     out.add_argument("--again", action="store_true", help="fly what has been flown, too")
     out.add_argument("--page", action="store_true", help="fly nothing")
     return out
@@ -94,31 +95,27 @@ def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
     return found
 
 
-def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int = 1) -> None:
-    """Fly cases, `jobs` at a time in lockstep, one at a time in real time; each is kept when it has been flown.
+def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int) -> None:
+    """Fly cases, `jobs` at a time; each is kept when it has been flown.
 
     Raises:
         PerchError: a process that flies has died.
     """
     file.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
     progress = Progress(len(missing), what="flights")
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _prepare)
     try:
-        for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
-            own = [case for case in missing if case.mode == mode]
-            pool = ProcessPoolExecutor(at_once, multiprocessing.get_context("spawn"), _prepare)
-            try:
-                flights = {pool.submit(_fly, case, logs): case for case in own}
-                for flight in as_completed(flights):
-                    _keep(flights[flight], flight.result(), file, rows, progress)
-            except BrokenProcessPool:
-                raise PerchError("a process that flies has died: the same command goes on") from None
-            except BaseException:
-                for process in multiprocessing.active_children():
-                    process.terminate()
-                raise
-            finally:
-                pool.shutdown(cancel_futures=True)
+        flights = {pool.submit(_fly, case, logs): case for case in missing}
+        for flight in as_completed(flights):
+            _keep(flights[flight], flight.result(), file, rows, progress)
+    except BrokenProcessPool:
+        raise PerchError("a process that flies has died: the same command goes on") from None
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
     finally:
+        pool.shutdown(cancel_futures=True)
         progress.close()
 
 

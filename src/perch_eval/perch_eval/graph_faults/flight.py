@@ -48,6 +48,7 @@ STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
 GOING = 10.0     # for what processes had open to vanish after their end, on a busy machine [s]
 PORTS, DOMAIN_PORTS = 7400, 250  # first port of domain 0, and ports of each, by the standard of DDS
 _PORT = re.compile(r"(?:sem\.)?fast\w+_port(\d+)")
+NICE = 10        # of flights in lockstep: those in real time go first
 NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
 
 
@@ -109,7 +110,7 @@ class Group:
             folder: receives parameters and logs.
             domain: ROS domain.
         """
-        self._server, self._folder, self._domain = server, folder, domain
+        self._server, self._folder, self._domain, self._nice = server, folder, domain, NICE if case.mode == LOCKSTEP else 0
         self._commands = {one.name: (self._place(one), ros_arguments(one, folder)) for one in launches}
         self.nodes = {f"/{name}" for name in self._commands}
         together = [] if case.alone else [one for one in launches if one.name not in (*SIGHTS, case.node)]
@@ -134,7 +135,7 @@ class Group:
     def start(self, name: str) -> None:
         """Start a node, for the first time or again."""
         what, arguments = self._commands[name]
-        pid = self._server.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)})
+        pid = self._server.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)}, self._nice)
         self.pids[name] = pid
         self._sessions.append(pid)
 
