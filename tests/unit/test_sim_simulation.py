@@ -77,7 +77,7 @@ def test_images_arrive_at_thirty_hertz_after_their_exposure():
             assert 0 <= flight.time - delivery.frame.arrival < 2_000_000
             frames.append(flight.cameras["front"].take().frame)
     assert 58 <= len(frames) <= 61
-    assert [f.index for f in frames] == list(range(len(frames)))
+    assert [f.number for f in frames] == list(range(len(frames)))
 
 
 def test_calibration_errors_belong_to_realism():

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_sim.camera_timing import CameraTiming, Frame
-from perch_sim.drawing import ImageToCome
+from perch_sim.drawing import Exposure, ImageToCome
 from perch_sim.rendering import Pose
 from perch_sim.state_history import Place, StateHistory, between
 
@@ -49,7 +49,7 @@ class CameraStream:
         """
         self.mount = mount
         self._timing, self._begin = timing, draw
-        self._seed, self._drawn = noise.bit_generator.seed_seq, 0
+        self._seed, self._drawn = cast(np.random.SeedSequence, noise.bit_generator.seed_seq), 0
         self._velocity, self._start = target_velocity, start
         self.most_waiting: int | None = None
         self.dropped = 0
@@ -65,7 +65,7 @@ class CameraStream:
             if self._begin is not None and self._overloaded():
                 self.dropped += 1
             elif self._begin is not None:
-                image = self._draw(frame, history)
+                image = self._begin(self._seen(frame, history))
             self._coming.append(Delivery(frame, image))
 
     def due(self, time: int) -> Delivery | None:
@@ -91,11 +91,11 @@ class CameraStream:
         waiting = sum(d.image is not None and not d.image.done() for d in self._coming)
         return self.most_waiting is not None and waiting >= self.most_waiting
 
-    def _draw(self, frame: Frame, history: StateHistory) -> ImageToCome:
+    def _seen(self, frame: Frame, history: StateHistory) -> Exposure:
         places = [history.around(int(t)) for t in np.linspace(frame.start, frame.end, POSES)]
         seed = np.random.SeedSequence(self._seed.entropy, spawn_key=(*self._seed.spawn_key, self._drawn))
         self._drawn += 1
-        return self._begin(partial(_exposure, places, seed, self._velocity * (frame.middle - self._start) * 1e-9))
+        return partial(_exposure, places, seed, self._velocity * (frame.middle - self._start) * 1e-9)
 
 
 def _exposure(places: list[Place], seed: np.random.SeedSequence, shift: np.ndarray) -> tuple[list[Pose], np.random.Generator, np.ndarray]:

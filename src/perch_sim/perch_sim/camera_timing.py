@@ -19,7 +19,7 @@ TRIGGER_JITTER = 50_000  # of the exposure's start, one sigma [ns]
 class Frame(NamedTuple):
     """One exposure. Times in nanoseconds."""
 
-    index: int
+    number: int
     start: int     # of the exposure
     end: int       # of the exposure
     stamp: int     # in the image's header

@@ -100,7 +100,7 @@ class ContactMonitor:
         events = []
         for s in range(len(distances)):
             plate, rest = distances[s, 0] < 0.0, distances[s, 1] < 0.0
-            if self.attached and s == self._attachment.surface:
+            if self._attachment is not None and s == self._attachment.surface:
                 continue
             if plate or rest:
                 event = self._touch(time, s, before, x, rest)
@@ -147,7 +147,7 @@ class ContactMonitor:
 
     def _separations(self, time: float) -> list[ContactEvent]:
         over = [s for s, (last, _) in self._touched.items()
-                if time - last > SEPARATION and not (self.attached and s == self._attachment.surface)]
+                if time - last > SEPARATION and not (self._attachment is not None and s == self._attachment.surface)]
         for s in over:
             del self._touched[s]
         if not over or self._touched:

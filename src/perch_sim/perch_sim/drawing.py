@@ -106,7 +106,8 @@ class _Undrawn:
     on_demand = True
 
     def __init__(self, render: Callable[..., np.ndarray]) -> None:
-        self._render, self._image = render, None
+        self._render = render
+        self._image: np.ndarray | None = None
 
     def done(self, timeout: float = 0.0) -> bool:
         return self._image is not None
@@ -151,7 +152,7 @@ class DrawnInProcesses:
     @property
     def process_ids(self) -> dict[str, int]:
         """Of each camera's process."""
-        return {name: draftsman.process.pid for name, draftsman in self._draftsmen.items()}
+        return {name: draftsman.process.pid or 0 for name, draftsman in self._draftsmen.items()}
 
     def close(self) -> None:
         """End the processes."""
@@ -172,7 +173,8 @@ class _Draftsman:
             fcntl.fcntl(images.fileno(), fcntl.F_SETPIPE_SZ, PIPE_SIZE)
         self.process = spawn.Process(target=_draw_until_closed, args=(orders, images, scene, mount, seed), daemon=True)
         self.process.start()
-        orders.close(), images.close()  # so that the end of the process is the end of the pipe
+        for end in (orders, images):
+            end.close()  # so that the end of the process is the end of the pipe
         self._poll = select.poll()  # Connection.poll makes one for every call, which takes 0.1 ms
         self._poll.register(self._images.fileno(), select.POLLIN)
         self._shape = (mount.camera.height, mount.camera.width, 3)[:3 if mount.colour else 2]
@@ -220,7 +222,8 @@ class _Ordered:
     on_demand = False
 
     def __init__(self, draftsman: _Draftsman) -> None:
-        self._draftsman, self._complete, self._image = draftsman, False, None
+        self._draftsman, self._complete = draftsman, False
+        self._image: np.ndarray | None = None
 
     def complete(self, image: np.ndarray | None) -> None:
         self._complete, self._image = True, image
@@ -245,7 +248,7 @@ def _draw_until_closed(orders: Connection, images: Connection, scene: Scene, mou
     with suppress(EOFError, BrokenPipeError):
         images.send_bytes(GREETING)
         while True:
-            images.send_bytes(renderer.render(*orders.recv()).ravel())
+            images.send_bytes(renderer.render(*orders.recv()).ravel().data)
 
 
 def _seen(scenario: Scenario, seed: int, cameras: Collection[str]) -> list[tuple[str, Scene, CameraMount]]:

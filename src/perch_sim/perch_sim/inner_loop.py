@@ -122,7 +122,8 @@ class InnerLoop:
         self._rotors = (np.array(vehicle.inertia), np.linalg.inv(vehicle.allocation), vehicle.thrust_coefficient, vehicle.speed_min,
                         vehicle.speed_max, vehicle.motor_time_constant)
         self._coming: deque[tuple[int, np.ndarray, np.ndarray | None]] = deque()
-        self._rates, self._attitude = np.zeros(4), None
+        self._rates = np.zeros(4)
+        self._attitude: np.ndarray | None = None
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
         """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop; one

@@ -134,7 +134,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
                 simulation.motors.command(self.time, command.armed, *content)
             else:
                 simulation.loop.command(self.time, command.armed, *content)
-                simulation.motors.command(self.time, command.armed, simulation.plant.rotor_speed)
+                simulation.motors.command(self.time, command.armed, simulation.plant.rotor_speed.tolist())
         except MotorCommandError as error:
             self._counts["commands_refused"] += 1
             self.log(LogLine("error", str(error), 1.0))

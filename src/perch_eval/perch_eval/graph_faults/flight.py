@@ -135,7 +135,8 @@ class Group:
     def start(self, name: str) -> None:
         """Start a node, for the first time or again."""
         what, arguments = self._commands[name]
-        pid = self._server.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)}, self._nice)
+        pid = self._server.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)})
+        os.setpriority(os.PRIO_PROCESS, pid, self._nice)
         self.pids[name] = pid
         self._sessions.append(pid)
 

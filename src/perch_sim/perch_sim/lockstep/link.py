@@ -71,12 +71,12 @@ class Door:
             self._listener = Listener(where, "AF_UNIX", backlog=16)
         except OSError as error:
             raise PerchError(f"another vehicle runs a lockstep in this ROS domain and namespace ({error.strerror})") from None
-        self._socket = self._listener._listener._socket
+        self._socket: socket.socket = self._listener._listener._socket  # type: ignore[attr-defined]  # it accepts without waiting
         self._socket.setblocking(False)
 
     def let_in(self) -> list[tuple[str, frozenset[str], Connection]]:
         """Who has come since the last call: name, the channels that it takes, and its connection."""
-        found = []
+        found: list[tuple[str, frozenset[str], Connection]] = []
         while True:
             try:
                 connection = self._listener.accept()
@@ -86,7 +86,9 @@ class Door:
                 with socket.socket(fileno=os.dup(connection.fileno())) as peer:
                     user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
                     peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
-                greeting = json.loads(connection.recv_bytes(1 << 16)) if user == os.getuid() and connection.poll(1.0) else None
+                if user != os.getuid() or not connection.poll(1.0):
+                    raise OSError("not the same user, or silent")
+                greeting = json.loads(connection.recv_bytes(1 << 16))
                 found.append((str(greeting["node"]), frozenset(map(str, greeting["inputs"])), connection))
             except (OSError, EOFError, ValueError, KeyError, TypeError):
                 connection.close()

@@ -150,11 +150,12 @@ class LocalParticipant(Participant):
         self._handlers = handlers(component)
         self.inputs = frozenset(self._handlers)
         self._emissions = Emissions(component, codec)
-        self._ask = ask
-        self._wakes = [[0, round(port.period * SECOND), port.handler(component)] for port in ports(kind, Wake)]
+        self._ask = ask or local_servers(())
+        self._wakes: list[list[Any]] = [[0, round(port.period * SECOND), port.handler(component)] for port in ports(kind, Wake)]
         self._outside: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
         self._awaited: list[_Awaited] = []
-        self._now, self._batch, self._begun = 0, None, False
+        self._now, self._begun = 0, False
+        self._batch: Sequence[Packet] | None = None
         self._hold = hold
         if hold and hold not in (port.name for port in ports(kind, Action)):
             raise PerchError(f"{self.name}: {hold!r} is none of its actions")
@@ -188,7 +189,7 @@ class LocalParticipant(Participant):
             if self._hold or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self._now):
                 return
             self._take_what_came()
-        now, batch, self._batch = self._now, self._batch, None
+        now, batch, self._batch = self._now, self._batch or (), None
         handle = self._handlers
         for packet in batch:
             handle[packet.channel](packet.value)
@@ -240,7 +241,7 @@ class LocalParticipant(Participant):
         return next((port.name for port in ports(type(self.component), Service) if port.channel(self.component) == channel), None)
 
     def _port(self, kind: type, name: str) -> Any:
-        for port in ports(type(self.component), kind):
+        for port in ports(type(self.component), kind):  # type: ignore[var-annotated]  # of whatever kind
             if port.name == name:
                 return port
         raise PerchError(f"{self.name}: {name!r} is none of its ports of type {kind.__name__}")
@@ -255,12 +256,7 @@ class LocalParticipant(Participant):
         channel, take = port.channel(self.component), port.handler(self.component)
 
         def send(request: Any, due: int = 0) -> None:
-            answer: Future = Answer()
-            if self._ask is None:
-                answer(Unavailable(f"nobody serves {channel!r}"))
-            else:
-                answer = self._ask(channel, request)
-            self._awaited.append(_Awaited(due, take, answer))
+            self._awaited.append(_Awaited(due, take, self._ask(channel, request)))
 
         return send
 

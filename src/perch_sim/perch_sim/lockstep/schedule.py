@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 from perch_core.component import Component
 from perch_core.errors import PerchError
@@ -73,7 +73,8 @@ class _Batch:
 
     def __init__(self, stamp: int, due: int, packets: list[Packet]) -> None:
         self.stamp, self.due, self.packets = stamp, due, packets
-        self.begun, self.results = False, ()
+        self.begun = False
+        self.results: Sequence[Packet] = ()
 
 
 class _Place:
@@ -96,16 +97,20 @@ class _Place:
         self.last = 0
 
     @property
+    def inputs(self) -> frozenset[str]:
+        """Channels that its participant takes."""
+        return frozenset() if self.participant is None else self.participant.inputs
+
+    @property
     def takes_images(self) -> bool:
         """Whether images are among what its participant takes."""
-        return any(channel.endswith("/image_raw") for channel in self.participant.inputs)
+        return any(channel.endswith("/image_raw") for channel in self.inputs)
 
     def awaits(self, arrival: Arrival) -> bool:
         """Whether a frame starts work: with its image for those who take images."""
-        inputs = self.participant.inputs
-        if f"camera_{arrival.camera}/image_raw" in inputs:
+        if f"camera_{arrival.camera}/image_raw" in self.inputs:
             return arrival.image is not None
-        return f"camera_{arrival.camera}/camera_info" in inputs
+        return f"camera_{arrival.camera}/camera_info" in self.inputs
 
 
 class _Routes(dict):
@@ -128,7 +133,7 @@ class Schedule:
         index: number of steps completed.
     """
 
-    def __init__(self, vehicle: Vehicle & Component[Any], participants: Iterable[Participant], tasks: Mapping[str, Task],
+    def __init__(self, vehicle: Vehicle, participants: Iterable[Participant], tasks: Mapping[str, Task],
                  codec: Codec | None = None) -> None:
         """
         Args:
@@ -141,9 +146,9 @@ class Schedule:
             PerchError: a participant has no task.
         """
         self.now, self.index = 0, 0
-        self._vehicle = vehicle
-        self._vehicle_handlers = handlers(vehicle)
-        self._emissions = Emissions(vehicle, codec)
+        self._vehicle, component = vehicle, cast(Component[Any], vehicle)
+        self._vehicle_handlers = handlers(component)
+        self._emissions = Emissions(component, codec)
         self._places = {name: _Place(name, task) for name, task in tasks.items()}
         self._fast = [place for place in self._places.values() if place.task.latency is None]
         self._slow = [place for place in self._places.values() if place.task.latency is not None]
@@ -184,12 +189,13 @@ class Schedule:
         """Go on without a participant, and without what it owes."""
         place = self._places[name]
         place.participant = None
-        place.inbox.clear(), place.coming.clear(), place.done.clear()
+        for queue in (place.inbox, place.coming, place.done):
+            queue.clear()
         self._reroute()
 
     def _reroute(self) -> None:
         self._routes.clear()
-        taken = {channel for place in self._places.values() if place.participant for channel in place.participant.inputs}
+        taken = {channel for place in self._places.values() for channel in place.inputs}
         taken |= set(self._vehicle_handlers)
 
         def is_taken(channel: str) -> bool:
@@ -202,7 +208,7 @@ class Schedule:
 
     def _takers(self, channel: str) -> list[Callable[[Packet], None]]:
         takers: list[Callable[[Packet], None]] = [
-            place.inbox.append for place in self._places.values() if place.participant and channel in place.participant.inputs]
+            place.inbox.append for place in self._places.values() if channel in place.inputs]
         if channel in self._vehicle_handlers:
             handle = self._vehicle_handlers[channel]
             takers.append(lambda packet: handle(packet.value))
@@ -251,13 +257,13 @@ class Schedule:
         """
         for images in self._undrawn.values():
             if len(images) > MOST_UNDRAWN:
-                images[0].ready(timeout)
+                _is_drawn(images[0], timeout)
                 return True
         for place in self._slow:
             if place.coming and place.coming[0].due <= self.now and not place.coming[0].begun:
                 image = _first_undrawn(place.coming[0])
                 if image is not None:
-                    image.value.ready(timeout)
+                    _is_drawn(image.value, timeout)
                     return True
         return False
 
@@ -337,7 +343,8 @@ class Schedule:
 
     def _work(self, place: _Place) -> None:
         """Take results and begin batches in their order, as far as that goes."""
-        coming = place.coming
+        coming, participant = place.coming, place.participant
+        assert participant is not None  # an empty place has no batches
         while coming:
             batch = coming[0]
             if not batch.begun:
@@ -351,8 +358,8 @@ class Schedule:
                         after[:0] = [packet for packet in batch.packets if packet not in lost]
                         continue
                 batch.begun = True
-                place.participant.begin(batch.stamp, batch.packets)
-            results = place.participant.results()
+                participant.begin(batch.stamp, batch.packets)
+            results = participant.results()
             if results is None:
                 return
             batch.results = results
@@ -369,7 +376,7 @@ class Schedule:
         """Whether a camera's frames arrive faster than they are drawn: the flight waits even where nobody else does."""
         crowded = False
         for images in self._undrawn.values():
-            while images and images[0].ready(0.0):
+            while images and _is_drawn(images[0]):
                 images.popleft()
             crowded = crowded or len(images) > MOST_UNDRAWN
         return crowded
@@ -383,10 +390,15 @@ def _is_image(packet: Packet) -> bool:
     return packet.channel.endswith("/image_raw")
 
 
+def _is_drawn(image: CameraImage, timeout: float = 0.0) -> bool:
+    """Whether an image is there, or is within a time [s]."""
+    return image.ready is None or image.ready(timeout)
+
+
 def _first_undrawn(batch: _Batch) -> Packet | None:
     """The first packet of a batch whose image is still being drawn."""
     return next((packet for packet in batch.packets
-                 if _is_image(packet) and packet.value.ready is not None and not packet.value.ready(0.0)), None)
+                 if _is_image(packet) and not _is_drawn(packet.value)), None)
 
 
 def _is_lost(packet: Packet) -> bool:

@@ -53,7 +53,7 @@ def _levels(texture: np.ndarray) -> list[np.ndarray]:
 def face_texture(scene: Scene, number: int, face: Face) -> np.ndarray:
     """Full-resolution texture of `scene.faces()[number]`, uint8: rows run along -up, columns along right."""
     rng = np.random.default_rng([scene.seed, number])
-    if face.kind == "pad":
+    if face.kind == "pad" and scene.board is not None:
         return textures.pad(scene.board, face.texel, rng)
     cols, rows = (max(8, round(2 * half / face.texel)) for half in face.half)
     return textures.blobs(rng, rows, cols, face.texel, scene.contrast)

@@ -117,7 +117,7 @@ class Scene:
         faces = list(_room_faces(self.room_low, self.room_high))
         if self.target is not None:
             faces += _panel_faces(self.target, depth=PAD_THICKNESS if self.board else 0.0, moving=True)
-        if self.board is not None:
+        if self.board is not None and self.target is not None:
             pad = PerchSurface(self.target.p_WS, self.target.R_WS, self.board.pad_size)
             texel = self.board.tags[0].size / self.board.modules / PAD_TEXELS_PER_MODULE
             faces.append(_surface_face(pad, "pad", texel, moving=True))

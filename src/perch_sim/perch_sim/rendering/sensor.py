@@ -64,7 +64,8 @@ class Sensor:
 
     def lit(self, region: Region) -> Region:
         """What falls on a region and, blurred, around it."""
-        return tuple(slice(max(part.start - BLUR_REACH, 0), min(part.stop + BLUR_REACH, size)) for part, size in zip(region, self._size))
+        rows, cols = (slice(max(part.start - BLUR_REACH, 0), min(part.stop + BLUR_REACH, size)) for part, size in zip(region, self._size))
+        return rows, cols
 
     def expose(self, light: np.ndarray, rng: np.random.Generator, region: Region | None = None) -> np.ndarray:
         """A noisy image of what falls on the sensor, uint8, black outside the region.

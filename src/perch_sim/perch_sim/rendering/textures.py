@@ -29,7 +29,8 @@ def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast
     Returns:
         uint8, shape (rows, cols).
     """
-    total, weight_sum = None, 0.0
+    total: np.ndarray = np.empty((rows, cols), np.uint8)
+    weight_sum = 0.0
     for scale, weight in zip(SCALES, WEIGHTS):
         step = max(scale / texel, 1.5)
         small = rng.normal(128.0, 40.0, (int(rows / step) + 3, int(cols / step) + 3))
@@ -38,7 +39,7 @@ def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast
         cv2.LUT(layer, EDGE, dst=layer)  # in place: new pages for every layer take as long as what is done with them
         weight_sum += weight
         share = weight / weight_sum
-        total = layer if total is None else cv2.addWeighted(total, 1.0 - share, layer, share, 0.0, dst=total)
+        total = layer if share == 1.0 else cv2.addWeighted(total, 1.0 - share, layer, share, 0.0, dst=total)
     sample = total[:: max(1, rows // 256), :: max(1, cols // 256)].astype(float)
     mean = sample.mean()
     spread = max(np.percentile(np.abs(sample - mean), 99), 1.0)
@@ -92,5 +93,7 @@ def _print(board: TagBoard, rows: int, cols: int) -> tuple[np.ndarray, np.ndarra
                 ends = np.array([corner, corner + board.grid.spacing * tag.size * np.sign(corner - tag.centre)])
                 u, v = np.sort(np.rint((extent[::-1] / 2 - ends[:, ::-1]) * scale).astype(int), axis=0).clip(0, shape[::-1]).T
                 image[slice(*v), slice(*u)], bare[slice(*v), slice(*u)] = BLACK, 0
-    return tuple(sum(samples[a::OVERSAMPLING, b::OVERSAMPLING].astype(np.uint16)
-                     for a in range(OVERSAMPLING) for b in range(OVERSAMPLING)) for samples in (image, bare))
+    shifts = [(a, b) for a in range(OVERSAMPLING) for b in range(OVERSAMPLING)]
+    printed, paper = (np.array([samples[a::OVERSAMPLING, b::OVERSAMPLING] for a, b in shifts]).sum(axis=0, dtype=np.uint16)
+                      for samples in (image, bare))
+    return printed, paper

@@ -11,7 +11,6 @@ import os
 import time
 from collections.abc import Callable
 from functools import partial
-from multiprocessing.connection import Connection
 from typing import Any
 
 from perch_core.component import Client, Component, Input, Service, Unavailable, ports
@@ -47,7 +46,7 @@ class ParticipantNode(ComponentNode):
         hold = self.declare_parameter("lockstep_hold", "").value
         self.declare_parameter("lockstep", True)
         self.participant = LocalParticipant(self.component, codec=topics, ask=self._ask, hold=hold, name=name)
-        self.participant.begin = partial(self.guarded, "step", self.participant.begin)
+        self.participant.begin = partial(self.guarded, "step", self.participant.begin)  # type: ignore[method-assign]
         self._observed = [port for port in ports(component, Input) if port.channel(self.component) in OBSERVED and port.value is Serialized]
         self.participant.inputs -= {port.channel(self.component) for port in self._observed}
         self._intake = Intake(self)
@@ -55,7 +54,7 @@ class ParticipantNode(ComponentNode):
         self._answers: dict[str, Answer] = {}
         self._asked: dict[str, float] = {}  # channel -> when its last request was made, monotonic clock [s]
         self._busy = False  # with a batch
-        self._vehicle: Connection | None = None
+        self._vehicle: Any = None  # the connection to it, where there is one
         self._waiting = Waiting()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         wiring.participants[name] = self.participant
@@ -68,8 +67,8 @@ class ParticipantNode(ComponentNode):
         for port in self._client_ports():  # the participant's own, which keep the time of answers
             setattr(self.component, port.name, asks[port.channel(self.component)])
         self.serve()
-        for port in self._observed:
-            self._intake.add(port)
+        for observed in self._observed:
+            self._intake.add(observed)
         if self._asking:
             self.create_timer(1.0, self._give_up, clock=self._steady)
         if self.wiring.schedule_here:

@@ -32,6 +32,8 @@ SETTLED_LOOKS = 3   # everybody has to be there this often in a row before the f
 class VehicleNode(ComponentNode):
     """`SimulatedVehicle` with its schedule."""
 
+    component: Any  # a `perch_sim.lockstep.schedule.Vehicle` that says whether it is ready, and diagnoses itself
+
     def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
         """
         Args:
@@ -167,7 +169,7 @@ class VehicleNode(ComponentNode):
     def _publish_drawn(self) -> None:
         waiting = []
         for publication, image in self._undrawn:
-            if not image.ready(0.0):
+            if image.ready is not None and not image.ready(0.0):
                 waiting.append((publication, image))
             elif image.pixels() is not None:
                 publication.send(image)
