@@ -133,11 +133,11 @@ class Schedule:
         index: number of steps completed.
     """
 
-    def __init__(self, vehicle: Vehicle, participants: Iterable[Participant], tasks: Mapping[str, Task],
+    def __init__(self, vehicle: Component[Any], participants: Iterable[Participant], tasks: Mapping[str, Task],
                  codec: Codec | None = None) -> None:
         """
         Args:
-            vehicle: owns time.
+            vehicle: owns time: a `Vehicle`.
             participants: who takes part from the beginning.
             tasks: of all who may take part, in the order in which they work within a step.
             codec: of what the vehicle emits; None: it never leaves this process.
@@ -146,9 +146,9 @@ class Schedule:
             PerchError: a participant has no task.
         """
         self.now, self.index = 0, 0
-        self._vehicle, component = vehicle, cast(Component[Any], vehicle)
-        self._vehicle_handlers = handlers(component)
-        self._emissions = Emissions(component, codec)
+        self._vehicle = cast(Vehicle, vehicle)
+        self._vehicle_handlers = handlers(vehicle)
+        self._emissions = Emissions(vehicle, codec)
         self._places = {name: _Place(name, task) for name, task in tasks.items()}
         self._fast = [place for place in self._places.values() if place.task.latency is None]
         self._slow = [place for place in self._places.values() if place.task.latency is not None]
