@@ -3,7 +3,7 @@
 A straight wire lies on a plane through the optical centre, under any lens: every ridge point votes for the great circles that it may
 lie on. Whether the points on one are more than chance is asked of the image itself: beside the arc, where the wire is not, ridges
 in the same direction say how common they are. Kerbs, roofs and the edges of fields are ridges, too; but they end within the image,
-and most have something else on either side. A wire crosses the image, or runs beside one that does.
+and most have something else on either side. A wire comes into the image over its border and crosses it, or runs beside one that does.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ SEEN = 0.5                         # share of the pieces of an arc that show a r
 TESTS = 6.0                        # log10 of the arcs that an image could hold
 CHANCE = -10.0                     # log10 of the arcs as good that chance would put into an image, at most
 CROSSES, BESIDE_ONE = 0.6, 0.4     # share of its great circle in the image that a wire covers: alone, beside one that covers that much
+SHORT = 0.05                       # share of its great circle that a wire alone leaves free at one end: it comes from outside the image
 PARALLEL = np.radians(10.0)        # directions in the image of wires of one line
 WHOLE = 0.4                        # salience of a thick wire as a whole, as a share of its rims', at least
 LOBE = 8.0                         # the rims of a line are ridges of the other sign, so far from it at its level [px]
@@ -45,6 +46,7 @@ class Arc:
         bright: brighter than what is on both sides.
         chance: log10 of how many arcs as good are expected by chance.
         share: of the part of the circle that the camera sees.
+        short: by what share of that part the arc ends before the border of the image that it comes nearest to.
         salience: curvature across it times its number of points.
         level: of the pyramid, mostly.
     """
@@ -55,6 +57,7 @@ class Arc:
     bright: bool
     chance: float
     share: float
+    short: float
     salience: float
     level: float
 
@@ -76,9 +79,8 @@ def wires(found: Ridges, camera: Camera, tolerance: float, least: float) -> list
         whole = [arc for arc in lines if arc.bright == arcs[0].bright and arc.salience > WHOLE * arcs[0].salience]
         kept.append(max(whole, key=lambda arc: arc.level))  # the rims of a thick wire are lines as well
         arcs = [arc for arc in arcs if arc not in lines and not _same_line(arc, kept[-1], rays, camera.fx)]
-    across = [arc for arc in kept if arc.share > CROSSES]
-    return [one for one in kept if one.share > CROSSES
-            or one.share > BESIDE_ONE and any(_parallel(one, other) for other in across)]
+    across = [arc for arc in kept if arc.share > CROSSES and arc.short < SHORT]
+    return [one for one in kept if one in across or one.share > BESIDE_ONE and any(_parallel(one, other) for other in across)]
 
 
 def _same_line(one: Arc, other: Arc, rays: np.ndarray, focal: float) -> bool:
@@ -191,19 +193,20 @@ def _along(found, rays, normals, left, normal, camera, tolerance, least) -> tupl
     chance = TESTS + float(binom.logsf(shown[begin:end].sum() - 1, count, min(max(usual, 0.02), 1.0))) / np.log(10.0)
     points = points[np.argsort(along[points], kind="stable")]
     low, high = along[points[0]], along[points[-1]]
-    share = (high - low) / _visible(camera, forward, side, 0.5 * (low + high))
-    return Arc(near[points], float(np.std(off[points])), normal, bool(found.bend[at[0]] < 0.0), chance, float(share),
+    first, last = _visible(camera, forward, side, 0.5 * (low + high))
+    share, short = (high - low) / (last - first), min(low - first, last - high) / (last - first)
+    return Arc(near[points], float(np.std(off[points])), normal, bool(found.bend[at[0]] < 0.0), chance, float(share), float(short),
                float(np.median(np.abs(found.bend[at])) * count), float(np.median(found.level[at]))), used
 
 
-def _visible(camera: Camera, forward: np.ndarray, side: np.ndarray, middle: float) -> float:
-    """Angle of the great circle that the camera sees around a place on it [rad]."""
+def _visible(camera: Camera, forward: np.ndarray, side: np.ndarray, middle: float) -> tuple[float, float]:
+    """Angles along the great circle between which the camera sees it around a place on it [rad]."""
     angles = middle + np.linspace(-np.pi, np.pi, 721)
     pixels, valid = camera.project(np.cos(angles)[:, None] * forward + np.sin(angles)[:, None] * side)
     hidden = ~(valid & camera.contains(pixels))
     hidden[0] = hidden[-1] = True
     ends = np.flatnonzero(hidden)
-    return float(angles[ends[ends > 360].min()] - angles[ends[ends < 360].max()])
+    return float(angles[ends[ends < 360].max()]), float(angles[ends[ends > 360].min()])
 
 
 def _densest(shown: np.ndarray) -> tuple[int, int]:
