@@ -103,7 +103,7 @@ def effort(tmp_path, seeds: int) -> Effort:
 def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):
     handed = []
 
-    def pool(work, tasks, jobs):
+    def pool(work, tasks, jobs, dead):
         for task in tasks:
             handed.append(task)
             yield task, asdict(RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values))
@@ -124,7 +124,7 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
 @pytest.mark.parametrize("outcome, message, verdict", [("missed", "no adhesion; recovered to a hover", HOLDS),
                                                        ("failed", "crashed: a cable in the rotors", FAILS)])
 def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outcome, message, verdict):
-    def pool(work, tasks, jobs):
+    def pool(work, tasks, jobs, dead):
         for task in tasks:
             end = ("perched", "perched", "") if task.run.values["grips"] else ("missed_pad", outcome, message)
             errors = {"perching_position_m": 0.01, "perching_tilt_deg": 1.0}

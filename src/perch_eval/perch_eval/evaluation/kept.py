@@ -11,7 +11,7 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.results import RunResult
-from perch_eval.campaign.workers import in_processes
+from perch_eval.campaign.workers import dead, in_processes
 from perch_eval.evaluation.sections import Effort
 from perch_eval.page import finite
 from perch_eval.revision import digest
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], dict[str, Any]], good: Callable[[dict[str, Any]], bool],
-             key: Callable[[T], str] = str) -> list[dict[str, Any]]:
+             key: Callable[[T], str] = str, dead: Callable[[T], dict[str, Any]] | None = None) -> list[dict[str, Any]]:
     """Figures of flights, a mapping each, in the order of the jobs.
 
     Args:
@@ -30,6 +30,10 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
         work: flies one job, in a process of its own.
         good: what is counted as good on the way.
         key: of a job in the file.
+        dead: figures of a job at which processes die again and again.
+
+    Raises:
+        PerchError: processes die at a job, and there is no `dead`.
     """
     effort.state.mkdir(parents=True, exist_ok=True)
     file = effort.state / f"{name}_{digest()}.json"
@@ -37,7 +41,7 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
     missing = [job for job in jobs if key(job) not in known]
     before = [known[key(job)] for job in jobs if key(job) in known]
     progress = Progress(len(jobs), len(before), sum(map(good, before)), name.replace("_", " "))
-    for job, result in in_processes(work, missing, effort.jobs):
+    for job, result in in_processes(work, missing, effort.jobs, dead):
         known[key(job)] = finite(result)
         progress.add(good(result))
         temporary = file.with_suffix(".part")
@@ -49,7 +53,8 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
 
 def flown(effort: Effort, name: str, tasks: Sequence[Task], good: Callable[[RunResult], bool] = lambda r: r.cause == SUCCESS) -> list[RunResult]:
     """Runs of a campaign's engine, which keep their numbers when others are added; arguments as those of `computed`."""
-    found = computed(effort, name, tasks, _carried_out, lambda row: good(RunResult(**row)), lambda task: str(task.run.number))
+    found = computed(effort, name, tasks, _carried_out, lambda row: good(RunResult(**row)), lambda task: str(task.run.number),
+                     lambda task: asdict(dead(task)))
     return [RunResult(**row) for row in found]
 
 
