@@ -56,6 +56,7 @@ class World:
         self.mission.command.receivers.append(self.obey)
         self.mission.log.receivers.append(self.lines.append)
         self.mission.plan_perch = self.mission.plan_powerline = lambda request, due: (self.requests.append((request, due)), self.planner(request))
+        self.mission.plan_way_out = lambda request, due: self.mission.on_plan_way_out(PerchPlan(success=False, message="none"))
         self.goal = Sent(PerchGoal(**goal))
 
     def plan(self, request):

@@ -10,7 +10,6 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample,
     LawChosen, MotorCommand, OdometryState, PowerlineMap, RatesThrust, TrajectoryOrder, nanoseconds, seconds)
-from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
@@ -171,8 +170,6 @@ class Controller(Component[ControllerParameters]):
     def on_recovery(self, order: TrajectoryOrder) -> None:
         """Keep a way out of the trajectory with the same id."""
         try:
-            if isinstance(order.trajectory, FlatTrajectory):
-                raise PerchError("a way out must carry states")
             if (start := order.trajectory.start_time) > seconds(self._stamps.newest) + LONGEST_PLAN:
                 raise PerchError(f"it starts at {start:.1f} s, long after what is flown")
             way_out = order._replace(at_end=AtEnd.HOLD, contact_time=0.0, recovery_start=0.0)

@@ -41,7 +41,8 @@ class FlightController:
     def __init__(self, vehicle: Vehicle, law: Law, gains: GeometricGains, settings: FlightSettings) -> None:
         self.law = law
         self.maneuvers = Maneuvers(vehicle, gains, settings)
-        self.supervisor = Supervisor(self.maneuvers)
+        self._schedule = Schedule(self.maneuvers)
+        self.supervisor = Supervisor(self.maneuvers, lambda reason: self._schedule.leave(reason, self.law))
         self.gate = OdometryGate(settings.odometry)
         self.odometry_age = inf
         self.margin = 1.0
@@ -51,7 +52,6 @@ class FlightController:
         self._thrust = ThrustBelief(vehicle, self.maneuvers, settings.rotors)
         self._imu_stamp = -inf
         self._refused = ""
-        self._schedule = Schedule(self.maneuvers)
         self._smooth = SmoothPosition()
         self._period = MeasuredPeriod()
 

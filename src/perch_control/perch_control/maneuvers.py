@@ -40,7 +40,8 @@ class Maneuvers:
         unseen: IMU samples since then: time [s], rates [rad/s], specific force [m/s^2].
         rotors: rotor speeds, or the inner loop, as the lag model has them.
         source, start: running reference and the time at which it began [s].
-        order, trajectory_id: trajectory that is being tracked, None in all states but TRACKING; the id stays until another one or the motors' stop.
+        order, trajectory_id: trajectory that is being tracked, or a planned way out of it while RECOVERING, else None; the id stays until
+            another one or the motors' stop.
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
         events: what has happened since the last step.
@@ -99,9 +100,12 @@ class Maneuvers:
         """Follow a reference from now on."""
         self.source, self.start = source, self.now
 
-    def track(self, order: Order, source: Any) -> None:
-        """Follow a trajectory, by the reference made from it."""
-        self.enter(State.TRACKING, f"tracking trajectory {order.id}")
+    def track(self, order: Order, source: Any, leaving: str = "") -> None:
+        """Follow a trajectory, by the reference made from it; `leaving`: why it is flown, a planned way out."""
+        if leaving:
+            self.enter(State.RECOVERING, f"recovering as planned: {leaving}")
+        else:
+            self.enter(State.TRACKING, f"tracking trajectory {order.id}")
         self.attached_to = None
         self.order, self.source, self.start, self.trajectory_id = order, source, order.start, order.id
         met = {AtEnd.CONTACT: order.source.duration, AtEnd.RECOVER: order.recovery_start}.get(order.at_end, -1.0)
@@ -200,7 +204,7 @@ class Maneuvers:
         """Position, velocity and acceleration from which a manoeuvre goes on: without a jump of the reference where the
         vehicle follows it, from the state where it does not."""
         near = dist(setpoint.p, self.belief[0:3]) < _FOLLOWED
-        if near and self.state in (State.TRACKING, State.HOVERING):
+        if near and (self.order is not None or self.state is State.HOVERING):
             return setpoint.p, setpoint.v, setpoint.a
         return self.belief[0:3], self.belief[3:6], _ZERO
 

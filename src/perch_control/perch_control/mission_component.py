@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
@@ -23,7 +23,7 @@ from perch_control.mission.moves import Moves
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission.requests import flown_order, perch_request, plan_answer, powerline_request
 from perch_control.mission.values import (
-    TICK, ControllerState, Inputs, Mode, Outcome, Outputs, Plan, PlanQuery, Refusal, Result, State, Target)
+    TICK, ControllerState, Inputs, Mode, Outcome, Outputs, PlanQuery, Result, State, Target)
 from perch_control.period import MeasuredPeriod
 from perch_control.stamp_guard import Stamp, StampGuard
 
@@ -57,6 +57,7 @@ class _Running:
         started: the machine has taken it.
         waiting_since: the host's time since which it waits for odometry [ns].
         pending: the query whose answer counts.
+        way_out: the same, for a way out of a perch on a surface.
     """
 
     goal: Goal
@@ -64,6 +65,7 @@ class _Running:
     started: bool = False
     waiting_since: int | None = None
     pending: _Asked | None = None
+    way_out: _Asked | None = None
 
 
 class _Departing:
@@ -98,6 +100,7 @@ class Mission(Component[MissionParameters]):
     recovery = Output(TrajectoryOrder, "recovery")
     command = Output(ControllerCommand, "controller/command")
     plan_perch = Client(PerchPlanRequest, PerchPlan, "plan_perch")
+    plan_way_out = Client(PerchPlanRequest, PerchPlan, "plan_way_out")
     plan_powerline = Client(PowerlinePlanRequest, PowerlinePlan, "plan_powerline")
     perch = Action(PerchGoal, PerchFeedback, PerchResult, "perch")
     depart = Service(Ask, Done, "depart")
@@ -119,7 +122,7 @@ class Mission(Component[MissionParameters]):
         self._map: PowerlineMap | None = None
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
-        self._asked: dict[str, list[_Asked]] = {"plan_perch": [], "plan_powerline": []}
+        self._asked: dict[str, list[_Asked]] = {"plan_perch": [], "plan_way_out": [], "plan_powerline": []}
         self._used = self._heard = -1          # odometry of the last tick, and the host's time then [ns]
         self._told = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
         self._diagnosed: int | None = None
@@ -254,15 +257,19 @@ class Mission(Component[MissionParameters]):
         if status is not None and odometry.stamp - status.stamp > STALE:  # it answers every sample, whatever its state
             self._finish(running, stamp, Outcome(Result.TRACKING_LOST, f"the controller is silent: no controller/status for {seconds(STALE):g} s"))
             return
-        time, answer, pending = seconds(stamp), None, running.pending
+        time = seconds(stamp)
         if not running.started:
             running.started = True
             running.machine.start(goal_of(running.goal.value, self.config.mission), time)
-        if pending is not None and stamp >= pending.due and pending.answer is not None:
-            running.pending, answer = None, plan_answer(pending.answer)
-        self._act(running, stamp, running.machine.tick(self._inputs(running, time, odometry, answer)))
+        plan, way_out = running.pending, running.way_out
+        inputs = self._inputs(running, time, odometry)
+        if plan is not None and stamp >= plan.due and plan.answer is not None:
+            running.pending, inputs = None, replace(inputs, plan=plan_answer(plan.answer))
+        if way_out is not None and stamp >= way_out.due and way_out.answer is not None and not isinstance(way_out.answer, Unavailable):
+            running.way_out, inputs = None, replace(inputs, way_out=plan_answer(way_out.answer))
+        self._act(running, stamp, running.machine.tick(inputs))
 
-    def _inputs(self, running: _Running, time: float, x: OdometryState, answer: Plan | Refusal | None) -> Inputs:
+    def _inputs(self, running: _Running, time: float, x: OdometryState) -> Inputs:
         status, estimator = self._status, self._estimator
         state = State(np.array(x.p_WB), np.array(x.q_WB), np.array(x.v_WB), np.array(x.w_B))
         return Inputs(
@@ -270,7 +277,7 @@ class Mission(Component[MissionParameters]):
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0, trajectory_time=status.trajectory_time if status else 0.0,
-            target=running.machine.target(self._pad_now(x), self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3), plan=answer,
+            target=running.machine.target(self._pad_now(x), self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3),
             cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
 
     def _act(self, running: _Running, stamp: int, outputs: Outputs) -> None:
@@ -283,7 +290,9 @@ class Mission(Component[MissionParameters]):
         if outputs.way_out is not None:
             self.recovery(TrajectoryOrder.of(outputs.trajectory_id, outputs.way_out.trajectory, AtEnd.HOLD))
         if outputs.query is not None:
-            self._ask(running, stamp, outputs.query)
+            running.pending = self._ask(running, stamp, outputs.query)
+        if outputs.way_out_query is not None:
+            running.way_out = self._ask(running, stamp, outputs.way_out_query)
         if running.machine.phase.value != "idle":
             self._tell(running, stamp)
         if outputs.outcome is not None:
@@ -300,19 +309,21 @@ class Mission(Component[MissionParameters]):
 
     # -- planners ----------------------------------------------------------------------------------------------------
 
-    def _ask(self, running: _Running, stamp: int, query: PlanQuery) -> None:
+    def _ask(self, running: _Running, stamp: int, query: PlanQuery) -> _Asked:
         surface = running.goal.value.mode == Mode.SURFACE
-        asked = running.pending = _Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time)))
-        under_way = self._asked["plan_perch" if surface else "plan_powerline"]
-        under_way[:] = [other for other in under_way if stamp - other.made < FORGOTTEN] + [asked]
-        if surface:
-            self.plan_perch(perch_request(query), asked.due)
-        else:
-            self.plan_powerline(powerline_request(query), asked.due)
+        channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
+        asked = _Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time)))
+        self._asked[channel] = [other for other in self._asked[channel] if stamp - other.made < FORGOTTEN] + [asked]
+        getattr(self, channel)(perch_request(query) if surface else powerline_request(query), asked.due)
+        return asked
 
     def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:
         """Keep it until it counts."""
         self._take_answer(self._asked["plan_perch"], plan)
+
+    def on_plan_way_out(self, plan: PerchPlan | Unavailable) -> None:
+        """Keep it until it counts."""
+        self._take_answer(self._asked["plan_way_out"], plan)
 
     def on_plan_powerline(self, plan: PowerlinePlan | Unavailable) -> None:
         """Keep it until it counts."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 from perch_control.admission import AtEnd, Order, check_joints
@@ -18,7 +19,7 @@ class Schedule:
 
     def __init__(self, maneuvers: Maneuvers) -> None:
         self._maneuvers = maneuvers
-        self._pending: tuple[Order, Any] | None = None  # a trajectory and the reference made from it
+        self._pending: tuple[Order, Any, str] | None = None  # a trajectory, the reference made from it, and why it is a way out
         self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
 
     @property
@@ -28,7 +29,7 @@ class Schedule:
 
     def put(self, order: Order, source: Any) -> None:
         """The next trajectory, by the reference made from it."""
-        self._pending = order, source
+        self._pending = order, source, ""
 
     def drop(self) -> None:
         """Nothing is to follow."""
@@ -42,26 +43,27 @@ class Schedule:
         """
         m = self._maneuvers
         check_joints(order.source.trajectory, m.settings.joint_gap)
-        self._ways_out = [o for o in self._ways_out if o.id == order.id and o.start >= m.now][-_MOST:] + [order]
+        known = (m.trajectory_id, order.id)  # the next trajectory has ways out before it is flown
+        self._ways_out = [o for o in self._ways_out if o.id in known and o.start >= m.now][-_MOST:] + [order]
 
     def leave(self, reason: str, law: Any) -> bool:
-        """Leave a trajectory by the next recovery that was planned for it; False where none is near.
+        """Leave a trajectory by the next way out that was planned of it; False where none is near.
 
         Until that recovery starts the trajectory is flown on, for `leave_time` at most: braking out of a tilted attitude at
         speed needs more room than a planned way out.
         """
         m, order = self._maneuvers, self._maneuvers.order
-        if order is None or order.recovery_start < 0.0:
+        if order is None or order.at_end not in (AtEnd.CONTACT, AtEnd.RECOVER):
             return False
-        own = order.start + order.recovery_start
+        own = order.start + order.recovery_start if order.recovery_start >= 0.0 else inf
         if m.now >= own:
             m.message = f"{reason}; the recovery is under way"
             return True
         ways = [o for o in self._ways_out if o.id == order.id and o.start >= m.now]
-        start = min([o.start for o in ways] + [own])
+        start = min([o.start for o in ways] + [own])  # a plan may end in a recovery of its own
         if start - m.now > m.settings.leave_time:
             return False
-        self._pending = next(((o, law.prepare(o.source, False)) for o in ways if o.start == start), None)
+        self._pending = next(((o, law.prepare(o.source, False), reason) for o in ways if o.start == start), None)
         m.message = f"{reason}; planned recovery in {start - m.now:.2f} s"
         return True
 
@@ -71,7 +73,7 @@ class Schedule:
         if self._pending is None:
             self._leave_the_wire(law)
             return
-        order, source = self._pending
+        order, source, leaving = self._pending
         resting = m.state in (State.ARMED, State.ATTACHED)
         if not (resting or m.state in (State.TRACKING, State.HOVERING)):
             self._pending = None
@@ -80,7 +82,7 @@ class Schedule:
             # From rest there is nothing to continue; in the air the new reference is reached without a jump.
             begin = m.now - order.start
             end = order.recovery_start if order.recovery_start > begin else source.duration  # the wire is met there
-            m.track(order, source if resting else blended(m.expected(m.now), source, begin, end))
+            m.track(order, source if resting else blended(m.expected(m.now), source, begin, end), leaving)
 
     def _leave_the_wire(self, law: Any) -> None:
         """Where the appended recovery is due, take the one that is kept ready for then: it begins where the vehicle is by now.

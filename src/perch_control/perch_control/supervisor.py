@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from perch_core.vector3 import norm
 from perch_control.admission import AtEnd, Order
 from perch_control.maneuvers import Maneuvers
@@ -18,8 +20,9 @@ _COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
 class Supervisor:
     """Watches a flight and acts on it through its manoeuvres. Owns the monitors, which start anew with each state."""
 
-    def __init__(self, maneuvers: Maneuvers) -> None:
-        self._maneuvers = maneuvers
+    def __init__(self, maneuvers: Maneuvers, leave: Callable[[str], bool]) -> None:
+        """`leave`: takes the reason for which a trajectory is left by a planned way out, and returns whether there is one."""
+        self._maneuvers, self._leave = maneuvers, leave
         self._carried: CarriedTilted | None = None  # while motors run
         self.restart()
 
@@ -37,8 +40,14 @@ class Supervisor:
             m.descend(f"the estimator has diverged: {message}", moving=False)
         elif state == _COASTING and vio_age > s.coasting_land_time:
             m.descend(f"no VIO for {vio_age:.1f} s")
-        elif state == _COASTING and vio_age > s.coasting_time and m.state is State.TRACKING and not m.committed:
-            m.stop(f"hover: no VIO for {vio_age:.1f} s")
+        elif state == _COASTING and vio_age > s.coasting_time:
+            self._give_up(f"no VIO for {vio_age:.1f} s")
+
+    def _give_up(self, reason: str) -> None:
+        """Leave a trajectory by a planned way out, or brake; where even the hardest brake would end in the surface, go on."""
+        m = self._maneuvers
+        if m.state is State.TRACKING and not self._leave(reason) and not m.committed:
+            m.stop(f"hover: {reason}")
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample: time [s], in B [rad/s, m/s^2]. Running motors that only press the vehicle onto something are stopped."""

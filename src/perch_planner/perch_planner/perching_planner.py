@@ -1,4 +1,4 @@
-"""The perching planner as a component: service `plan_perch`, requests to plans or typed refusals. [M:IV-C]"""
+"""The perching planner as a component: services `plan_perch` and `plan_way_out`, requests to plans or typed refusals. [M:IV-C]"""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_planner import planner, refusals
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.refusals import PerchRefusal
+from perch_planner.way_out import plan_way_out
 
 OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
 OBJECTIVES = {4: "snap", 3: "jerk"}
+Method = Callable[[PerchProblem, PerchSettings, Vehicle], planner.PerchPlan]
 
 
 class PerchPlanError(IntEnum):
@@ -46,7 +48,7 @@ class PerchingPlannerParameters(PerchSettings):
     """Parameters of the component: those of the planner, and the vehicle it plans for."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    contact_time: float = quantity(0.3, unit="s", low=0.0, high=10.0, doc="wait for contact after the end")
+    contact_time: float = quantity(0.3, unit="s", above=0.0, high=10.0, doc="wait for contact after the end")
     time_limit: float = quantity(2.0, unit="s", above=0.0, high=60.0, doc="wall-clock limit of a plan, from the request on")
 
 
@@ -57,6 +59,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
     changeable = tuple(field.name for field in fields(PerchingPlannerParameters) if field.name != "vehicle")
 
     plan_perch = Service(PerchPlanRequest, PerchPlan, "plan_perch")
+    plan_way_out = Service(PerchPlanRequest, PerchPlan, "plan_way_out")
 
     def __init__(self, config: PerchingPlannerParameters) -> None:
         super().__init__(config)
@@ -68,24 +71,32 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
     def on_plan_perch(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
         """Plan, and reply when there is an answer."""
+        self._plan(planner.plan, request, reply)
+
+    def on_plan_way_out(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
+        """Plan from the start to a hover in front of the surface; waypoints, times and the impact's options do not matter."""
+        self._plan(plan_way_out, request, reply)
+
+    def _plan(self, method: Method, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
         limit = self.config.time_limit
-        answer = partial(self._answer, request, reply, limit)
+        answer = partial(self._answer, method is planner.plan, request, reply, limit)
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            arguments = (problem, perch_settings(request, self.config, problem.surface), self._vehicle)
+            arguments = (method, problem, perch_settings(request, self.config, problem.surface), self._vehicle)
         except PerchError as error:
             answer(error)
             return
         self.work(Job(solve, arguments, answer, limit, isolated=True))
 
-    def _answer(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
+    def _answer(self, perch: bool, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
         """Reply with a plan, or with the error that there is in its place."""
         if isinstance(found, planner.PerchPlan):
-            answer = perch_plan(found, request, float(self.config.contact_time))
+            answer = perch_plan(found, request, float(self.config.contact_time) if perch else 0.0)
         else:
             answer = refused(found, limit)
-            self.warn(f"no plan: {answer.message}")
+            if perch:  # near the contact, ways out are refused one after the other
+                self.warn(f"no plan: {answer.message}")
         self.diagnostics(Diagnostics(limits.stamp_of(request), {
             "success": answer.success, "error_code": int(answer.error_code), "iterations": answer.iterations,
             "solve_ms": 1e3 * answer.solve_time}))
@@ -96,19 +107,20 @@ def _load(settings: PerchSettings, vehicle: Vehicle) -> None:
     """Plan once, so that the kernels are there before the first request."""
     surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
     try:
-        planner.plan(PerchProblem(StartState(np.array([0.0, 0.0, 1.5])), surface), settings, vehicle)
+        for method in (planner.plan, plan_way_out):
+            method(PerchProblem(StartState(np.array([0.0, 0.0, 1.5])), surface), settings, vehicle)
     except PerchRefusal:  # these limits may leave no plan; the kernels are there all the same
         pass
 
 
-def solve(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> planner.PerchPlan:
-    """Plan; the job of a request.
+def solve(method: Method, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> planner.PerchPlan:
+    """Plan by `planner.plan` or `plan_way_out`; the job of a request.
 
     Raises:
         PerchRefusal: there is no plan; code solver where the numerics failed in a way that nobody had foreseen.
     """
     try:
-        return planner.plan(problem, settings, vehicle)
+        return method(problem, settings, vehicle)
     except (PerchError, MemoryError):
         raise
     except Exception as error:  # whoever asked must get an answer whatever happens here
@@ -164,10 +176,10 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: 
 
 
 def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time: float) -> PerchPlan:
-    """The answer that carries a plan."""
+    """The answer that carries a plan; `contact_time`: how long a contact is awaited after it [s], 0: it ends in a hover."""
     trajectory = FlatTrajectory(found.trajectory.durations, found.trajectory.coefficients, seconds(request.start))
     return PerchPlan(
-        success=True, message=f"contact after {found.duration:.3f} s", trajectory=trajectory, contact_time=contact_time,
+        success=True, message=f"{'contact' if contact_time else 'hovering'} after {found.duration:.3f} s", trajectory=trajectory, contact_time=contact_time,
         certificates=found.certificates, iterations=found.iterations, solve_time=float(found.solve_time))
 
 

@@ -93,6 +93,10 @@ class MissionMachine(ABC):
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
         """The target has been seen for long enough, and the vehicle rests: what is done now."""
 
+    def committed(self, time: float) -> str:
+        """Why what is flown can no longer be left at a time [s]; empty: it can."""
+        return ""
+
     def holds(self, inputs: Inputs) -> bool:
         """In a recovery: the vehicle is held after all."""
         return False
@@ -247,6 +251,8 @@ class MissionMachine(ABC):
         elif inputs.controller in (ControllerState.DISARMED, ControllerState.ARMED):
             outputs.commands.append((Command.DISARM, "cancelled"))
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
+        elif why := self.committed(inputs.time):
+            self.message = f"cancelled too late: {why}"
         else:
             outputs.commands.append((Command.HOVER, "cancelled"))
             self._missed(inputs, "cancelled")

@@ -1,4 +1,5 @@
-"""What the mission asks while a perch on a surface is flown: the same perch to the target as it is seen nearer (M's future work)."""
+"""What the mission asks while a perch on a surface is flown: the same perch to the target as it is seen nearer (M's future work), and
+ways out of it."""
 
 from __future__ import annotations
 
@@ -9,6 +10,9 @@ import numpy as np
 
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, Plan, PlanQuery, Refusal, Target
+from perch_control.mission.ways_out import DECISION, WaysOut
+
+_SPACING = 0.05  # between the starts of ways out [s]
 
 
 @dataclass(frozen=True)
@@ -20,12 +24,26 @@ class RunningPerch:
         target: the place that it was made for.
         asked: target of the newest query.
         asked_at: time of the newest query [s].
+        ways_out: those that are known.
     """
 
     plan: Plan
     target: Target
     asked: Target
+    ways_out: WaysOut
     asked_at: float = -math.inf
+
+    @classmethod
+    def begun(cls, plan: Plan, target: Target, settings: MissionSettings) -> RunningPerch:
+        """A planner's answer in flight. From `contact_early` before the contact on, it may come: there is no way out any more."""
+        return cls(plan, target, target, WaysOut(plan.start_time - _SPACING, plan.end - settings.contact_early, _SPACING))
+
+    def way_out(self, time: float, goal: Goal, settings: MissionSettings) -> PlanQuery | None:
+        """The query for the next way out at a tick [s]; None: there is nothing to ask for."""
+        start, zero = self.ways_out.next(time + settings.planner_latency + DECISION), np.zeros(3)
+        if start is None:
+            return None
+        return PlanQuery(start, zero, zero, zero, zero, 0.0, self.target, goal, settings.planner_latency, current=self.plan.trajectory, recovery=True)
 
     def better(self, answer: Plan | Refusal | None, time: float, settings: MissionSettings) -> RunningPerch | None:
         """The plan to fly instead of this one, from the answer to the newest query; None: this one."""
@@ -33,7 +51,7 @@ class RunningPerch:
             return None
         if abs(answer.end - self.plan.end) > settings.replan_shift:
             return self  # a detour: the running plan is better
-        return replace(self, plan=answer, target=self.asked)
+        return replace(RunningPerch.begun(answer, self.asked, settings), asked_at=self.asked_at)
 
     def query(self, time: float, target: Target | None, goal: Goal, settings: MissionSettings,
               start: float, latency: float) -> tuple[RunningPerch, PlanQuery] | None:

@@ -20,11 +20,11 @@ from perch_core.trajectory import FlatTrajectory, SampledTrajectory, StateSample
 from perch_core.values import AtEnd
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import TICK, Goal, Plan, PlanQuery, Refusal, State, Target
+from perch_control.mission.ways_out import DECISION, WaysOut
 from perch_control.reference import normalised
 from perch_control.smooth_position import BEFORE
 
 _AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
-_DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
 
 
 class RunningPlan:
@@ -34,11 +34,12 @@ class RunningPlan:
         plan: what is flown.
         target: the place that it was made for.
         states: of the plan, with unit quaternions.
-        covered: start of the latest way out that is known [s].
+        ways_out: those that are known; nearer to the contact the plan's own recovery is the way out.
     """
 
     def __init__(self, plan: Plan, target: Target, settings: MissionSettings, states: SampledTrajectory, replanned_at: float = -math.inf) -> None:
-        self.plan, self.target, self.states, self.covered = plan, target, states, plan.start_time
+        self.plan, self.target, self.states = plan, target, states
+        self.ways_out = WaysOut(plan.start_time, plan.end - settings.way_out_until, settings.way_out_spacing)
         self._settings, self._replanned_at = settings, replanned_at
         self._asked: PlanQuery | None = None
         self._leaving = False  # the way out from the wire has been asked for
@@ -69,14 +70,12 @@ class RunningPlan:
         """
         if self._asked is not None:
             return None
-        s, start = self._settings, time + self._settings.ahead_latency + _DECISION
-        if goal.replan and target is not None and self._better(target, time, start):
+        s, soonest = self._settings, time + self._settings.ahead_latency + DECISION
+        if goal.replan and target is not None and self._better(target, time, soonest):
             self._replanned_at = time
-            return self._ask(start, self.state(start), target, goal, perch_pose=self._perch_pose(target))
-        start = max(start, self.covered + s.way_out_spacing)
-        if start < self.plan.end - s.way_out_until:
+            return self._ask(soonest, self.state(soonest), target, goal, perch_pose=self._perch_pose(target))
+        if (start := self.ways_out.next(soonest)) is not None:
             return self._ask(start, self.state(start), self.target, goal, recovery=True)
-        soonest = time + s.ahead_latency + _DECISION
         if not self._leaving and self.plan.end - TICK < soonest < self.plan.end + s.contact_time:
             self._leaving = True
             start = max(soonest, self.plan.end)
@@ -93,7 +92,7 @@ class RunningPlan:
         if query is None:
             return None, None
         if query.recovery:
-            self.covered = query.start_time  # a refusal, too: the next one is asked for further on
+            self.ways_out.answered(query.start_time, plan.message if isinstance(plan, Refusal) else "")
         if isinstance(plan, Refusal) or plan.start_time <= time:
             return None, None
         if query.recovery:
@@ -118,7 +117,7 @@ class RunningPlan:
         s = self._settings
         if not goal.replan or target is None or not self._seen_better(target):
             return None
-        if not self.plan.start_time + _DECISION < time < self.plan.end - BEFORE:
+        if not self.plan.start_time + DECISION < time < self.plan.end - BEFORE:
             return None
         offset = target.p_WS - self.target.p_WS
         if not s.shift_distance < float(np.linalg.norm(offset)) < s.shift_max:
@@ -126,7 +125,7 @@ class RunningPlan:
         rest = self.states.rest_of(time - self.plan.start_time, offset)
         left = self.plan.end - rest.start_time
         following = RunningPlan(Plan(rest, left, AtEnd.RECOVER, float(left)), target, s, rest, self._replanned_at)
-        following.covered, following._asked = self.covered, self._asked  # ways out stay: centimetres do not matter there
+        following.ways_out, following._asked = self.ways_out, self._asked  # ways out stay: centimetres do not matter there
         following._leaving = self._leaving
         return following
 
@@ -136,7 +135,7 @@ class RunningPlan:
     def _better(self, target: Target, time: float, start: float) -> bool:
         s = self._settings
         return (self._seen_better(target) and self.plan.end - start > s.powerline_replan_until
-                and start > self.plan.start_time + _DECISION and time - self._replanned_at >= s.powerline_replan_period
+                and start > self.plan.start_time + DECISION and time - self._replanned_at >= s.powerline_replan_period
                 and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.shift_max)
 
     def _perch_pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:

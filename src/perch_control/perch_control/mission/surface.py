@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_perch import RunningPerch
-from perch_control.mission.values import Command, Inputs, Outputs, Plan, Target
+from perch_control.mission.values import Command, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Target
+from perch_control.mission.ways_out import WaysOut
 
 
 class SurfaceMission(PerchingMission[RunningPerch]):
-    """Find the pad, plan, perch; where asked, plan again to the pad as it is seen nearer."""
+    """Find the pad, plan, perch; where asked, plan again to the pad as it is seen nearer. Ways out of the plan are kept ready."""
 
     unseen = "no tags seen"
+    _asked_way_out: tuple[PlanQuery, WaysOut] | None = None
 
     @property
     def latency(self) -> float:
@@ -19,16 +21,30 @@ class SurfaceMission(PerchingMission[RunningPerch]):
 
     def running(self, plan: Plan, target: Target) -> RunningPerch:
         """A plan in flight."""
-        return RunningPerch(plan, target, target)
+        return RunningPerch.begun(plan, target, self.settings)
 
     def better(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Refine the target in flight and continue from the running plan's future (M's future work)."""
-        if not self._goal.replan:
-            return
+        """Follow the target as it is seen nearer, and keep ways out ready."""
+        if inputs.way_out is not None and self._asked_way_out is not None:
+            (query, ways), self._asked_way_out = self._asked_way_out, None
+            if isinstance(inputs.way_out, Refusal):
+                ways.answered(query.start_time, inputs.way_out.message)
+            else:
+                ways.answered(query.start_time, "")
+                if ways is self._running.ways_out:
+                    outputs.way_out, outputs.trajectory_id = inputs.way_out, self._flown_id
+        if self._goal.replan:
+            self._plan_again(inputs, outputs)
+        if self._asked_way_out is None and (asked := self._running.way_out(inputs.time, self._goal, self.settings)) is not None:
+            self._asked_way_out, outputs.way_out_query = (asked, self._running.ways_out), asked
+
+    def _plan_again(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Continue from the running plan's future to the target as it is seen now (M's future work)."""
         better = self._running.better(inputs.plan, inputs.time, self.settings)
         if better is not None:
             if better is not self._running:
                 self._fly_better(better, outputs)
+                outputs.way_out = None  # of the plan before
             return
         start = inputs.time + self.settings.lead(self.latency)
         asked = self._running.query(inputs.time, self._usable_now(inputs)[0], self._goal, self.settings, start, self.latency)
@@ -38,3 +54,7 @@ class SurfaceMission(PerchingMission[RunningPerch]):
     def not_held(self, outputs: Outputs) -> None:
         """Stop: the trajectory has no way on."""
         outputs.commands.append((Command.HOVER, "no adhesion"))
+
+    def committed(self, time: float) -> str:
+        """Ways out end shortly before the contact, or where the planner finds none."""
+        return self._running.ways_out.committed(time) if self.phase in (Phase.TRACKING, Phase.VERIFYING) else ""

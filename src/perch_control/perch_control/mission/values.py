@@ -131,7 +131,7 @@ class PlanQuery:
         current: the trajectory being flown, to be continued from `start_time`; None: start from p, v, a, j.
         duration: time from the start to contact [s] that the new plan should keep; None: chosen by the planner.
         state: full state at the start, of a powerline plan that is being flown; None: level, with this yaw.
-        recovery: plan the way out from `state` alone.
+        recovery: plan the way out alone, from `state`, or from `current` at `start_time`.
         perch_pose: where to end (position [m], attitude xyzw); None: as the target and the goal's pitch say.
     """
 
@@ -200,6 +200,7 @@ class Inputs:
     plan: Plan | Refusal | None = None
     cancel: bool = False
     imu_period: float = NOMINAL_PERIOD  # [s]
+    way_out: Plan | Refusal | None = None
 
 
 @dataclass(frozen=True)
@@ -221,4 +222,5 @@ class Outputs:
     way_out: Plan | None = None                # a recovery to keep ready, out of the trajectory with this id
     trajectory_id: int = 0
     query: PlanQuery | None = None
+    way_out_query: PlanQuery | None = None     # of a perch on a surface
     outcome: Outcome | None = None

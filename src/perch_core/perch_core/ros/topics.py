@@ -141,6 +141,8 @@ class ServiceRow:
 SERVICES = (
     ServiceRow("plan_perch", PlanPerch, planning.perch_request_value, planning.perch_plan_message, planning.perch_request_message,
                planning.perch_plan_value),
+    ServiceRow("plan_way_out", PlanPerch, planning.perch_request_value, planning.perch_plan_message, planning.perch_request_message,
+               planning.perch_plan_value),
     ServiceRow("plan_powerline", PlanPowerline, planning.powerline_request_value, planning.powerline_plan_message,
                planning.powerline_request_message, planning.powerline_plan_value),
     ServiceRow("set_controller", SetController, flight.choose_law_value, flight.law_chosen_message),

@@ -52,7 +52,7 @@ class Certificate:
 
 @dataclass(frozen=True, kw_only=True)
 class PerchPlanRequest:
-    """Request of `plan_perch`; fields as in perch_msgs/srv/PlanPerch, whose options are None where they are left to the planner.
+    """Request of `plan_perch` and `plan_way_out`; fields as in perch_msgs/srv/PlanPerch, whose options are None where they are left to the planner.
 
     Attributes:
         start: stamp of the trajectory's start [ns].
@@ -92,14 +92,14 @@ class PerchPlanRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class PerchPlan:
-    """Answer of `plan_perch`; fields as in perch_msgs/srv/PlanPerch.
+    """Answer of `plan_perch` and `plan_way_out`; fields as in perch_msgs/srv/PlanPerch.
 
     Attributes:
         success: there is a plan.
         error_code: as in the service.
         message: what failed, by how much, and what to change.
         trajectory: from the request's start to the contact; None without success.
-        contact_time: how long the contact is awaited after the end [s].
+        contact_time: how long the contact is awaited after the end [s]; 0: of a way out, which ends in a hover.
         certificates: every bound with its proof.
         iterations: QPs solved.
         solve_time: wall-clock time [s]; it tells nothing of the plan, and nothing may depend on it.

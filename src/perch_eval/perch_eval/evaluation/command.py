@@ -18,7 +18,7 @@ EXAMPLES = """examples:
   python3 scripts/evaluate.py --seeds 20            20 seeds a condition
   python3 scripts/evaluate.py --full --jobs 2       100 seeds, and what goes beyond the papers; interrupted, the same command goes on
   python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_flights, p_inspection,
-                                                    p_cable, c_faults, c_comparison)
+                                                    p_cable, c_faults, c_comparison, c_way_out)
 
 exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
 2 the caller's mistake, 130 interrupted"""
@@ -33,11 +33,12 @@ PARTS: dict[str, Part] = {
     "m_planning": _part("planning_times:planning_sections"), "m_flights": _part("perching:perching_sections"),
     "p_powerline": _part("powerline:powerline_sections"), "p_flights": _part("powerline:flown_sections"),
     "p_inspection": _part("inspection:inspection_sections"), "p_cable": _part("cable:cable_sections"),
-    "c_faults": _part("control:fault_sections"), "c_comparison": _part("control:comparison_sections")}
+    "c_faults": _part("control:fault_sections"), "c_comparison": _part("control:comparison_sections"),
+    "c_way_out": _part("ways_out:sections")}
 FLIGHTS = {"seeds": "flights of each perch condition", "line-seeds": "flights of each powerline scenario", "layouts": "random layouts of the inspection"}
 QUICK = {"seeds": 5, "line-seeds": 1, "layouts": 3}
 FULL = {"seeds": 100, "line-seeds": 10, "layouts": 20}
-BEYOND_PAPERS = ("c_faults", "c_comparison")
+BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out")
 """Hundreds of flights of their own: with --full, or by name."""
 
 

@@ -56,7 +56,7 @@ def fault_sections(effort: Effort) -> list[Section]:
                     f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. "
                     f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
                     + _searched(r) + " / ".join(r["events"]))
-    _write(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
+    write_page(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
     out.data = {"flights": flown}
     return [out]
 
@@ -95,7 +95,7 @@ def comparison_sections(effort: Effort) -> list[Section]:
     for c in CONTROLLERS:
         own = [r for r in flown if r["controller"] == c and r["maneuver"] == "perch"]
         out.show(f"{c}: perches that hold, all conditions", f"{sum(r['outcome'] == 'perched' for r in own)}/{len(own)}")
-    _write(effort, "comparison", text, {"flights": flown})
+    write_page(effort, "comparison", text, {"flights": flown})
     out.data = {"flights": flown}
     return [out]
 
@@ -128,6 +128,7 @@ def _compared(job: tuple[str, str, str, int]) -> dict[str, Any]:
     return {"controller": controller, "condition": condition, "maneuver": maneuver, "seed": seed, **asdict(fly(*job))}
 
 
-def _write(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
+def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
+    """A page of its own beside the results, and its figures as JSON."""
     (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by(effort), *lines[1:]]) + "\n")
     (effort.out / f"{name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")

@@ -80,7 +80,8 @@ def perch_plan_message(plan: PerchPlan) -> PlanPerch.Response:
         certificates=[certificate_message(c) for c in plan.certificates], iterations=int(plan.iterations), solve_time=float(plan.solve_time))
     if plan.trajectory is not None:
         msg.trajectory = trajectory_message(plan.trajectory)
-        msg.trajectory.at_end, msg.trajectory.contact_time = msg.trajectory.AT_END_CONTACT, float(plan.contact_time)
+        msg.trajectory.contact_time = float(plan.contact_time)
+        msg.trajectory.at_end = msg.trajectory.AT_END_CONTACT if plan.contact_time else msg.trajectory.AT_END_HOLD
     return msg
 
 

@@ -1,0 +1,78 @@
+"""Flights whose goal is cancelled at a given time before the planned contact, and how they end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perch_core.values import NANOSECONDS, AtEnd, ControllerStatus, seconds
+from perch_control.modes import State
+from perch_eval.goal import goal_of
+from perch_eval.in_process import Sensing, arrange
+from perch_sim.scenario import load_scenario
+
+LIMIT = 60 * NANOSECONDS   # for the whole flight [ns]
+LINGER = NANOSECONDS // 2  # flown on after the goal's end [ns]
+AT_REST = 0.3              # speed of a hover [m/s]
+
+
+@dataclass(frozen=True)
+class Aborted:
+    """One flight.
+
+    Attributes:
+        scenario, seed, before: what was flown, and when the goal was cancelled: time before the planned contact [s].
+        planned: the vehicle left the plan by a planned way out.
+        end: hovering, attached, or what the controller's state is called otherwise; broken where the vehicle has hit something.
+        message: the mission's words.
+        rate: largest body rate after the cancellation [rad/s].
+        margin: least thrust margin of a rotor's command after it.
+        distance: least distance of the centre of mass from the surface's plane after it [m]; of a wire's scenario meaningless.
+        settled: from the cancellation to the goal's end [s].
+    """
+
+    scenario: str
+    seed: int
+    before: float
+    planned: bool
+    end: str
+    message: str
+    rate: float
+    margin: float
+    distance: float
+    settled: float
+
+
+def fly_aborted(scenario: str, seed: int, before: float) -> Aborted:
+    """Fly a scenario, and cancel its goal `before` seconds ahead of the planned contact.
+
+    Raises:
+        PerchError: the scenario is refused.
+    """
+    what = load_scenario(scenario)
+    loop = arrange(what, seed, Sensing())
+    goal = loop.send("mission", goal_of(what))
+    stamp, cancelled, ended = 0, 0, 0
+    rate, distance = 0.0, np.inf
+    while stamp < LIMIT and not (ended and stamp - ended > LINGER):
+        stamp = loop.step()
+        if not cancelled:
+            orders = [order for order in loop.trace.values("trajectory")[-1:] if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER)]
+            for order in orders:
+                length = order.recovery_start if order.at_end == AtEnd.RECOVER else order.trajectory.duration
+                if order.trajectory.start_time + length - seconds(stamp) <= before:
+                    cancelled, goal.cancel_requested = stamp, True
+        else:
+            x, pad = loop.vehicle.simulation.state, loop.vehicle.simulation.pad
+            rate = max(rate, float(np.linalg.norm(x.w_WB_B)))
+            distance = min(distance, float((x.p_WB - pad.p_WS) @ pad.normal))
+            ended = ended or (stamp if goal.result is not None else 0)
+    simulation = loop.vehicle.simulation
+    statuses: list[ControllerStatus] = [s for s in loop.trace.values("controller/status") if s.stamp >= cancelled]
+    loop.close()
+    state = State(statuses[-1].state)
+    hovering = state is State.HOVERING and float(np.linalg.norm(simulation.state.v_WB)) < AT_REST
+    end = "broken" if simulation.plant.crashed else "hovering" if hovering else state.name.lower()
+    return Aborted(scenario, seed, before, any("as planned" in s.message for s in statuses), end, goal.result.message if goal.result else "no end",
+                   rate, min(s.thrust_margin for s in statuses), distance, seconds(max(ended, cancelled) - cancelled))

@@ -1,0 +1,157 @@
+"""Ways out of planned perches: from each instant of a plan to a hover, and flights that are cancelled on the way."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from perch_control.mission.settings import MissionSettings
+from perch_core.errors import PlanningRefusal
+from perch_core.surface import PerchSurface
+from perch_core.vehicle import load_vehicle
+from perch_eval.control_flights.aborted import fly_aborted
+from perch_eval.evaluation.control import write_page
+from perch_eval.evaluation.kept import computed
+from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.in_process.parameters import NodeParameters
+from perch_sim.scenario import load_scenario
+
+RATE = 20.0                                               # instants per second of a plan [Hz]
+INCLINATIONS = (60, 90, 120)                              # [deg]
+LINES = ("line_20", "line_20_pa", "line_80", "line_80_pa", "line_180")
+PLANS, LINE_PLANS = 20, 2                                 # of each
+EDGES = (0.05, 0.1, 0.15, 0.3, 0.5, 0.7, 1.0, math.inf)   # of time to contact [s]
+FLOWN = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights that are cancelled, each at another time
+EARLIEST = 1.4                                            # time to contact at which the first of them is cancelled [s]
+SURE = MissionSettings().contact_early                    # nearer to the contact a surface may already be touched [s]
+BAR = 0.99                                                # share of the instants before that
+
+
+@dataclass(frozen=True)
+class Instant:
+    """A state of a plan: time to contact [s], and why there is no way out of it; empty: there is one."""
+
+    left: float
+    refusal: str
+
+
+def sections(effort: Effort) -> list[Section]:
+    """Share of instants with a way out, and cancelled flights; writes `way_out.md` and `way_out.json`."""
+    out = Section("c_way_out", "Ways out of planned perches",
+                  f"Each plan is asked {RATE:g} times a second for a way out: a trajectory from its state at that time to a hover, with all limits "
+                  f"proved (surfaces) or checked at 1 ms (powerlines). Surfaces: {PLANS} plans each, 1.2 to 3 m away, by the planner as shipped; "
+                  f"powerlines: {LINE_PLANS} starts each.")
+    table = ["| plans | " + " | ".join(_span(k) for k in range(len(EDGES))) + " | all |", "| --- " * (len(EDGES) + 2) + "|"]
+    jobs = [(name, seed) for name in map(str, INCLINATIONS) for seed in range(1, PLANS + 1)]
+    jobs += [(name, seed) for name in LINES for seed in range(1, LINE_PLANS + 1)]
+    made = computed(effort, "ways_out", jobs, _planned, lambda r: not r["refused"])
+    reasons: Counter[str] = Counter()
+    for name in (*map(str, INCLINATIONS), *LINES):
+        plans = [r for r in made if r["name"] == name]
+        instants = [Instant(*pair) for r in plans for pair in r["instants"]]
+        cells = []
+        for low, high in zip((0.0, *EDGES), EDGES):
+            within = [not x.refusal for x in instants if low <= x.left < high]
+            cells.append(f"{sum(within)} of {len(within)}" if within else "")
+        kept = [not x.refusal for x in instants]
+        title = f"{name} deg" if name.isdigit() else name
+        table.append(f"| {title} | " + " | ".join(cells) + f" | {sum(kept)} of {len(kept)} |")
+        reasons.update(f"{title}: {x.refusal}" for x in instants if x.refusal)
+        early = [not x.refusal for x in instants if x.left >= SURE]
+        out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{sum(early)} of {len(early)}", "",
+                  sum(early) >= BAR * len(early) if early else None, f"at least {100 * BAR:g} %")
+    flown = computed(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
+    text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "", *table, "", "## Refused", ""]
+    text += [f"* {n}x {reason}" for reason, n in reasons.most_common()] or ["None."]
+    text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
+             "plan by a planned way out; *attached*: cancelled too late, the perch went on.", "",
+             "| scenario | n | hovering | of these by a way out | attached | other | least thrust margin | largest body rate [rad/s] |",
+             "| --- " * 8 + "|"]
+    for name, n in FLOWN.items():
+        own = [r for r in flown if r["scenario"] == name]
+        ends = Counter(r["end"] for r in own)
+        left = [r for r in own if r["planned"]]
+        text.append(f"| {name} | {n} | {ends['hovering']} | {sum(r['planned'] for r in own if r['end'] == 'hovering')} | {ends['attached']} | "
+                    f"{n - ends['hovering'] - ends['attached']} | {min((r['margin'] for r in left), default=math.nan):.2f} | "
+                    f"{max((r['rate'] for r in left), default=math.nan):.1f} |")
+        out.claim(f"{name}: cancelled on the way", f"{ends['hovering']} hovering, {ends['attached']} attached of {n}", "",
+                  ends["hovering"] + ends["attached"] == n, "all")
+    text += ["", "| scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | the mission's words |",
+             "| --- " * 7 + "|"]
+    text += [f"| {r['scenario']} | {r['seed']} | {r['before']:.2f} | {r['end']} | {'yes' if r['planned'] else 'no'} | {r['settled']:.2f} | {r['message']} |"
+             for r in flown]
+    write_page(effort, "way_out", text, {"plans": made, "flights": flown})
+    out.data = {"plans": made, "flights": flown}
+    return [out]
+
+
+def _span(k: int) -> str:
+    low = (0.0, *EDGES)[k]
+    return f"{low:g} to {EDGES[k]:g}" if math.isfinite(EDGES[k]) else f"from {low:g}"
+
+
+def _aborts() -> Iterator[tuple[str, int, float]]:
+    """Scenario, seed, and time before the contact [s]."""
+    for name, n in FLOWN.items():
+        for k in range(n):
+            yield name, k + 1, round(EARLIEST * (1.0 - (k + 0.5) / n), 3)
+
+
+def _flown(job: tuple[str, int, float]) -> dict[str, Any]:
+    return asdict(fly_aborted(*job))
+
+
+def _planned(job: tuple[str, int]) -> dict[str, Any]:
+    """The instants of one plan."""
+    name, seed = job
+    rng = np.random.default_rng(seed)
+    try:
+        found = list(_surface(int(name), rng) if name.isdigit() else _line(name, seed, rng))
+        return {"name": name, "seed": seed, "refused": "", "instants": [[x.left, x.refusal] for x in found]}
+    except PlanningRefusal as refusal:
+        return {"name": name, "seed": seed, "refused": str(refusal), "instants": []}
+
+
+def _surface(inclination: int, rng: np.random.Generator) -> Iterator[Instant]:
+    from perch_planner.perching_planner import PerchingPlannerParameters
+    from perch_planner.planner import plan
+    from perch_planner.problem import PerchProblem, StartState
+    from perch_planner.way_out import plan_way_out
+
+    settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters)
+    vehicle = load_vehicle("snapdragon")
+    place = np.array([rng.uniform(1.2, 3.0), rng.uniform(-0.5, 0.5), rng.uniform(1.2, 1.8)])
+    problem = PerchProblem(StartState((0.0, 0.0, 1.2)), PerchSurface.from_inclination(place, math.radians(inclination)))
+    perch = plan(problem, settings, vehicle).trajectory
+    for t in np.arange(0.0, perch.duration, 1.0 / RATE).tolist():
+        refusal = ""
+        try:
+            plan_way_out(replace(problem, start=StartState.on(perch, t)), settings, vehicle)
+        except PlanningRefusal as problem_with_it:
+            refusal = str(problem_with_it)
+        yield Instant(perch.duration - t, refusal)
+
+
+def _line(name: str, seed: int, rng: np.random.Generator) -> Iterator[Instant]:
+    from perch_planner.powerline import problem
+    from perch_planner.powerline.planner import PowerlinePlanner
+    from perch_planner.powerline.starts import random_start
+
+    vehicle = load_vehicle("rpg")
+    planner, setup = PowerlinePlanner(vehicle), problem.load(f"powerline_{name}")
+    request = setup.request(vehicle) if seed == 1 else random_start(setup.request(vehicle), setup, vehicle, rng)
+    perch = planner.plan(request).perch
+    if perch is None:
+        raise PlanningRefusal("solver", "perch", -1.0, "no perch")
+    for t in np.arange(0.0, perch.duration, 1.0 / RATE).tolist():
+        refusal, state = "", perch.states[int(np.searchsorted(perch.times, t))]
+        try:
+            planner.plan(replace(request, start=state, recovery_only=True, hover=request.start[:3]))
+        except PlanningRefusal as problem_with_it:
+            refusal = str(problem_with_it)
+        yield Instant(perch.duration - t, refusal)

@@ -1,0 +1,92 @@
+"""Ways out of a perch: from a state in motion to a hover in front of the surface, with the limits and proofs of a plan.
+
+A way out ends at rest where a stop of least snap from the start would end, kept away from the surface, the floor and the ceiling.
+It is short, so that no durations are searched for: a few are tried, the gentle one first, then with a knot early on, since a
+vehicle that is already turned to the surface has to turn back at once.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+
+from perch_core.config import replace
+from perch_core.trajectory import FlatTrajectory
+from perch_core.vehicle import Vehicle
+from perch_planner import refusals
+from perch_planner.certificates import certificates
+from perch_planner.contact_constraints import Contact
+from perch_planner.planner import PerchPlan
+from perch_planner.problem import Limits, PerchProblem, PerchSettings
+from perch_planner.refusals import PerchRefusal
+from perch_planner.search import Outcome, Search
+
+DURATIONS = (1.2, 0.8, 1.8)  # [s]
+TURN = 0.3                   # of the first piece, where the vehicle turns back [s]
+AWAY = 0.5                   # least distance of the hover from the surface's plane [m]
+_CODES = {"body_rate": refusals.BODY_RATE, "thrust": refusals.THRUST_FLOOR, "rotor_thrust": refusals.THRUST_FLOOR}
+
+
+class _Hover(Contact):
+    """Rest at a place [m] at the end: no impact window, no tube."""
+
+    def __init__(self, problem: PerchProblem, settings: PerchSettings, place: np.ndarray) -> None:
+        start = problem.start
+        self.velocity, self.points = np.zeros(3), np.array([start.p, place])
+        self.problem = (self.points, start.v, start.a, start.j, np.ones(3, np.int64), np.arange(1, 4), np.zeros((3, 3)), problem.surface.R_WS,
+                        self.velocity, settings.impact_acceleration, settings.tube_tolerance, settings.tube_floor, 0.0, settings.tube_step,
+                        -np.inf, np.inf, np.inf)
+
+
+def hover_place(problem: PerchProblem, limits: Limits, duration: float) -> np.ndarray:
+    """Where a way out ends [m], shape (3,).
+
+    A stop of least snap has the quintic velocity with the start's v, a and j and rest at the end; its integral is the first term.
+    """
+    start, surface = problem.start, problem.surface
+    place = start.p + duration * (start.v / 2.0 + duration * (start.a / 10.0 + duration * start.j / 120.0))
+    place = place + max(AWAY - float((place - surface.p_WS) @ surface.normal), 0.0) * surface.normal
+    place[2] = min(max(place[2], limits.height[0] + limits.extension), limits.height[1])
+    return place
+
+
+def plan_way_out(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> PerchPlan:
+    """Plan a way out.
+
+    Args:
+        problem: start and surface.
+        settings: parameters of the planner; the jerk is minimised.
+        vehicle: mass, thrust range and extension.
+
+    Returns:
+        A plan that keeps every limit, each with its proof.
+
+    Raises:
+        PerchRefusal: none was found; with the limit that the last one breaks.
+    """
+    begin, limits = perf_counter(), Limits.of(settings, vehicle)
+    search = Search(problem, replace(settings, objective="jerk"), vehicle, limits)
+    best: Outcome | None = None
+    for durations in [(T,) for T in DURATIONS] + [(TURN, T - TURN) for T in DURATIONS]:
+        search.contact = _Hover(problem, settings, hover_place(problem, limits, sum(durations)))
+        outcome = search.try_durations(np.array(durations))
+        if outcome.proved:
+            trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
+            return PerchPlan(trajectory, certificates(outcome.results, limits, vehicle.mass), search.iterations, perf_counter() - begin,
+                             tuple(search.attempts))
+        best = outcome if best is None or outcome.results is not None else best
+    raise _refusal(best, search, limits, vehicle.mass)
+
+
+def _refusal(best: Outcome | None, search: Search, limits: Limits, mass: float) -> PerchRefusal:
+    """Why there is no way out: a limit that the last stop breaks."""
+    if best is None or best.results is None:
+        return PerchRefusal(refusals.THRUST_FLOOR, "thrust range [M:eq16]", -np.inf, "no way out: no stop keeps the thrust within its range",
+                            iterations=search.iterations)
+    proofs = certificates(best.results, limits, mass)
+    broken = next((proof for proof in proofs if not proof.holds), None)
+    if broken is None:
+        return PerchRefusal(refusals.THRUST_FLOOR, "thrust range of the single rotors", -np.inf,
+                            "no way out: no stop keeps each rotor's thrust within its range", proofs, search.iterations)
+    return PerchRefusal(_CODES.get(broken.quantity, refusals.BOX), broken.quantity, broken.margin, f"no way out: {broken}", proofs, search.iterations)
