@@ -87,11 +87,6 @@ class FlightController:
         return self._thrust.health
 
     @property
-    def thrust_known(self) -> float | None:
-        """Thrust / mass as measured, as a share of the file's, at most 1; None without the augmentation: nothing is made of it."""
-        return min(self.health.mean, 1.0) if self.compensator is not None else None
-
-    @property
     def blind(self) -> bool:
         """A descent without position is under way."""
         return self.maneuvers.blind is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from perch_control.odometry_gate import OdometryLimits
 from perch_control.recovery import RecoverySettings
@@ -17,27 +18,27 @@ class FlightSettings:
     """When the supervisor steps in, and how hover, landing and descent are flown."""
 
     brake_deceleration: float = quantity(4.0, unit="m/s^2", above=0.0, high=20.0)
-    brake_hard: float = quantity(8.0, unit="m/s^2", above=0.0, high=20.0, doc="at most, where the trajectory leads to a surface")
-    leave_time: float = quantity(0.6, unit="s", low=0.0, high=5.0,
-                                 doc="an abort flies on for at most so long, to where a planned recovery begins")
+    brake_hard: ClassVar[float] = 8.0  # at most, where the trajectory leads to a surface [m/s^2]
+    leave_time: ClassVar[float] = 0.6  # an abort flies on for at most so long, to where a planned recovery begins [s]
     land_speed: float = quantity(0.35, unit="m/s", above=0.0, high=2.0)
-    ground_time: float = quantity(0.25, unit="s", above=0.0, doc="descent has stopped for so long: on the ground")
-    ground_gap: float = quantity(0.12, unit="m", above=0.0, doc="the descending reference is so far below the vehicle")
+    ground_time: ClassVar[float] = 0.25  # descent has stopped for so long: on the ground [s]
+    ground_gap: ClassVar[float] = 0.12  # the descending reference is so far below the vehicle [m]
     descent_share: float = quantity(0.93, unit="-", above=0.5, high=1.0, doc="thrust / weight of a descent without position")
     descent_speed: float = quantity(0.6, unit="m/s", above=0.0, doc="the same: a faster fall is braked, as far as the velocity is known")
-    descent_gain: float = quantity(4.0, unit="1/s", low=0.0, high=20.0, doc="the same: braking per speed ...")
-    descent_braking: float = quantity(5.0, unit="m/s^2", low=0.0, high=9.0, doc="... and at most so much")
-    impact_acceleration: float = quantity(25.0, unit="m/s^2", above=0.0, doc="specific force that counts as hitting the ground in a descent without position")
-    start_gap: float = quantity(0.35, unit="m", above=0.0, doc="largest distance between a trajectory's start and the vehicle")
-    start_speed_gap: float = quantity(1.0, unit="m/s", above=0.0, doc="the same for the velocity")
-    start_late: float = quantity(0.5, unit="s", low=0.0, doc="oldest start stamp that is accepted")
-    joint_gap: float = quantity(0.02, unit="m", above=0.0, doc="largest step inside a trajectory; ten times this for the velocity [m/s]")
-    tilt_margin_deg: float = quantity(45.0, unit="deg", above=0.0, high=180.0, doc="tilt away from the reference's thrust direction")
-    rate_factor: float = quantity(1.6, unit="-", above=1.0, doc="body rate over the vehicle's body_rate_max")
+    descent_gain: ClassVar[float] = 4.0  # the same: braking per speed ... [1/s]
+    descent_braking: ClassVar[float] = 5.0  # ... and at most so much [m/s^2]
+    # specific force that counts as hitting the ground in a descent without position [m/s^2]
+    impact_acceleration: ClassVar[float] = 25.0
+    start_gap: ClassVar[float] = 0.35  # largest distance between a trajectory's start and the vehicle [m]
+    start_speed_gap: ClassVar[float] = 1.0  # the same for the velocity [m/s]
+    start_late: ClassVar[float] = 0.5  # oldest start stamp that is accepted [s]
+    joint_gap: ClassVar[float] = 0.02  # largest step inside a trajectory; ten times this for the velocity [m/s] [m]
+    tilt_margin_deg: ClassVar[float] = 45.0  # tilt away from the reference's thrust direction [deg]
+    rate_factor: ClassVar[float] = 1.6  # body rate over the vehicle's body_rate_max
     position_error_max: float = quantity(1.0, unit="m", above=0.0)
-    fault_time: float = quantity(0.12, unit="s", low=0.0, doc="tilt, rate or position are out for so long before the supervisor acts")
+    fault_time: ClassVar[float] = 0.12  # tilt, rate or position are out for so long before the supervisor acts [s]
     missed_speed: float = quantity(1.0, unit="m/s", above=0.0, doc="faster than this after the planned contact: it was missed")
-    down_time: float = quantity(1.2, unit="s", above=0.0, doc="at rest and tilted for so long, or without any sensor: motors off")
+    down_time: ClassVar[float] = 1.2  # at rest and tilted for so long, or without any sensor: motors off [s]
     margin_time: float = quantity(1.0, unit="s", above=0.0, doc="rotors at their limit for so long: land")
     margin_min: float = quantity(0.02, unit="-", low=0.0, high=0.5, doc="thrust margin that counts as none")
     margin_perch: float = quantity(0.15, unit="-", low=0.0, high=0.5, doc="a perch is refused where the mean margin in hover is less")

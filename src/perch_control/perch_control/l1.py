@@ -10,6 +10,7 @@ All on accelerations: force / mass in W [m/s^2], moment / inertia in B [rad/s^2]
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 from math import exp
 
 from perch_core.config import quantity
@@ -28,11 +29,11 @@ _LONGEST_GAP = 0.025  # a longer time between samples starts the predictor anew 
 class L1Settings:
     """Bandwidths and bounds."""
 
-    predictor: float = quantity(10.0, unit="1/s", above=0.0, high=400.0, doc="decay of the prediction error")
+    predictor: ClassVar[float] = 10.0  # decay of the prediction error [1/s]
     force_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0)
     moment_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=200.0)
-    force_max: float = quantity(6.0, unit="m/s^2", low=0.0, doc="largest acceleration that is made up for")
-    moment_max: float = quantity(60.0, unit="rad/s^2", low=0.0, doc="largest angular acceleration that is made up for")
+    force_max: ClassVar[float] = 6.0  # largest acceleration that is made up for [m/s^2]
+    moment_max: ClassVar[float] = 60.0  # largest angular acceleration that is made up for [rad/s^2]
 
 
 @compiled

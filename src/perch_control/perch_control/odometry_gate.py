@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import acos, degrees, hypot, isfinite, radians, sqrt
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,8 @@ class OdometryLimits:
 
     timeout: float = quantity(0.05, unit="s", above=0.0, high=5.0, doc="without usable odometry for longer: descent without position")
     position_jump: float = quantity(0.25, unit="m", above=0.0, doc="largest step between two samples beyond the motion")
-    velocity_jump: float = quantity(1.5, unit="m/s", above=0.0, doc="largest step between two samples")
-    attitude_jump_deg: float = quantity(20.0, unit="deg", above=0.0, high=180.0, doc="largest step beyond the rotation")
+    velocity_jump: ClassVar[float] = 1.5  # largest step between two samples [m/s]
+    attitude_jump_deg: ClassVar[float] = 20.0  # largest step beyond the rotation [deg]
     confirm: float = quantity(0.03, unit="s", low=0.0, doc="a jump that stays for so long, and is as certain as what was before it to within the largest "
                              "steps, is the new truth: hover there")
 

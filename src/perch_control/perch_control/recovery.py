@@ -9,6 +9,7 @@ direction leads the present one by a bounded angle, which keeps most of the thru
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 from math import cos, radians, sin
 
 from perch_core.config import quantity
@@ -22,20 +23,20 @@ from perch_control.reference import Setpoint, Vector
 class RecoverySettings:
     """How a recovery flies."""
 
-    push_time: float = quantity(0.04, unit="s", low=0.0, high=1.0, doc="longest push away from the surface")
-    push_clearance: float = quantity(0.10, unit="m", low=0.0, doc="the push ends at this distance from where contact was missed")
-    thrust_share: float = quantity(0.95, unit="-", above=0.0, high=1.0, doc="share of the greatest thrust while pushing and turning")
-    turn_ahead_deg: float = quantity(50.0, unit="deg", above=5.0, high=90.0, doc="the commanded direction leads the present one by so much")
-    away_speed: float = quantity(0.5, unit="m/s", low=0.0, doc="speed away from the surface until the clearance is reached")
+    push_time: ClassVar[float] = 0.04  # longest push away from the surface [s]
+    push_clearance: ClassVar[float] = 0.10  # the push ends at this distance from where contact was missed [m]
+    thrust_share: ClassVar[float] = 0.95  # share of the greatest thrust while pushing and turning
+    turn_ahead_deg: ClassVar[float] = 50.0  # the commanded direction leads the present one by so much [deg]
+    away_speed: ClassVar[float] = 0.5  # speed away from the surface until the clearance is reached [m/s]
     away_distance: float = quantity(0.5, unit="m", low=0.0, doc="distance from the surface at which to hover")
-    velocity_gain: float = quantity(6.0, unit="1/s", above=0.0)
-    climb_gain: float = quantity(1.0, unit="1/s", low=0.0, doc="vertical speed per height lost")
-    climb_speed_max: float = quantity(1.0, unit="m/s", above=0.0)
-    acceleration_max: float = quantity(4.0, unit="m/s^2", above=0.0, doc="horizontal")
-    level_deg: float = quantity(25.0, unit="deg", above=0.0, high=90.0, doc="hand-over to hover below this tilt ...")
-    rate: float = quantity(3.0, unit="rad/s", above=0.0, doc="... this body rate ...")
-    speed: float = quantity(0.8, unit="m/s", above=0.0, doc="... and this speed")
-    timeout: float = quantity(6.0, unit="s", above=0.0, doc="then descend")
+    velocity_gain: ClassVar[float] = 6.0  # [1/s]
+    climb_gain: ClassVar[float] = 1.0  # vertical speed per height lost [1/s]
+    climb_speed_max: ClassVar[float] = 1.0  # [m/s]
+    acceleration_max: ClassVar[float] = 4.0  # horizontal [m/s^2]
+    level_deg: ClassVar[float] = 25.0  # hand-over to hover below this tilt ... [deg]
+    rate: ClassVar[float] = 3.0  # ... this body rate ... [rad/s]
+    speed: ClassVar[float] = 0.8  # ... and this speed [m/s]
+    timeout: ClassVar[float] = 6.0  # then descend [s]
 
 
 def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:

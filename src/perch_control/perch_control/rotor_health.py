@@ -8,6 +8,7 @@ for rotors that fail in flight, a slow one knows the ratio well enough to plan w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 from math import exp
 
 from perch_control.debounce import Debounce
@@ -23,19 +24,18 @@ _GREATEST = 1.1        # a vehicle is believed to be no stronger than this
 class RotorHealthSettings:
     """When rotors count as weak, and what is still flown then."""
 
-    time_constant: float = quantity(0.05, unit="s", above=0.0, high=1.0,
-                                    doc="of the filter; with 0.316 m/s^2 of noise at 500 Hz the ratio is good to 1 %")
+    time_constant: ClassVar[float] = 0.05  # of the filter; with 0.316 m/s^2 of noise at 500 Hz the ratio is good to 1 % [s]
     weak: float = quantity(0.77, unit="-", low=0.0, high=1.0,
                            doc="felt / promised thrust below which the rotors are weak; +20 % mass reads 0.83, -15 % on one rotor 0.96")
-    hold: float = quantity(0.02, unit="s", low=0.0, high=1.0, doc="for so long")
-    thrust_least: float = quantity(0.5, unit="-", above=0.0, high=1.0, doc="promised thrust / weight below which the ratio is not judged")
-    rate_most: float = quantity(10.0, unit="rad/s", above=0.0, doc="body rate above which it is not judged")
-    reserve: float = quantity(0.95, unit="-", above=0.0, high=1.0, doc="a trajectory may ask for this share of what is left")
-    hover_least: float = quantity(1.12, unit="-", above=0.0, high=2.0, doc="greatest thrust / weight that is left, below which the vehicle lands at once")
-    touch_speed: float = quantity(1.2, unit="m/s", above=0.0, doc="such a landing does not lean where it would touch the ground faster than this")
-    lean_deg: float = quantity(15.0, unit="deg", above=0.0, high=45.0,
-                               doc="it leans so far to brake its speed across, or as far as the weight is still carried ...")
-    lean_most_deg: float = quantity(30.0, unit="deg", above=0.0, high=60.0, doc="... but no further than this")
+    hold: ClassVar[float] = 0.02  # for so long [s]
+    thrust_least: ClassVar[float] = 0.5  # promised thrust / weight below which the ratio is not judged
+    rate_most: ClassVar[float] = 10.0  # body rate above which it is not judged [rad/s]
+    reserve: ClassVar[float] = 0.95  # a trajectory may ask for this share of what is left
+    hover_least: ClassVar[float] = 1.12  # greatest thrust / weight that is left, below which the vehicle lands at once
+    touch_speed: ClassVar[float] = 1.2  # such a landing does not lean where it would touch the ground faster than this [m/s]
+    # it leans so far to brake its speed across, or as far as the weight is still carried ... [deg]
+    lean_deg: ClassVar[float] = 15.0
+    lean_most_deg: ClassVar[float] = 30.0  # ... but no further than this [deg]
 
 
 class RotorHealth:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,11 +24,10 @@ _UP = np.array([0.0, 0.0, 1.0])
 class AdhesionLimits:
     """Limits of the adhesion test."""
 
-    window: float = quantity(0.06, unit="s", above=0.0, high=1.0, doc="time over which the specific force is averaged")
-    unbalanced: float = quantity(3.0, unit="m/s^2", above=0.0, high=20.0,
-                                 doc="largest difference between the mean specific force and gravity of a body at rest")
-    speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0)
-    tilt_deg: float = quantity(25.0, unit="deg", above=0.0, high=90.0, doc="between b3 and the surface normal")
+    window: ClassVar[float] = 0.06  # time over which the specific force is averaged [s]
+    unbalanced: ClassVar[float] = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
+    speed: ClassVar[float] = 0.5  # [m/s]
+    tilt_deg: ClassVar[float] = 25.0  # between b3 and the surface normal [deg]
     distance: float = quantity(0.25, unit="m", above=0.0, high=2.0, doc="from the localised pad's centre")
 
 

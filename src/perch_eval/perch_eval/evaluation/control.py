@@ -71,8 +71,8 @@ def comparison_sections(effort: Effort) -> list[Section]:
                   f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
                   "(line: as commanded; perch: the plan), RMS per axis x, y, z; "
                   f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
-                  "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover, flies the perch with it, and the plan "
-                  "is asked for with it (`thrust_max` of `plan_perch`; the node `mission` does not ask so). Every flight: comparison.md.")
+                  "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover and flies the perch with it. "
+                  "Every flight: comparison.md.")
     text = ["# Controllers compared", "", out.about]
     for maneuver in MANEUVERS:
         text += ["", f"## {maneuver.capitalize()}", "", "RMSE x, y, z [cm]; outcome, per seed where they differ.", "",
