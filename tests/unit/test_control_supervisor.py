@@ -319,7 +319,7 @@ def test_an_abort_leaves_by_the_next_planned_recovery():
     assert loop.controller.maneuvers.order.start == start, "flown on until it begins"
     loop.run(0.15)
     assert loop.controller.maneuvers.order.start == pytest.approx(start + 0.6)
-    assert "under way" in loop.controller.abort()
+    assert loop.controller.state is State.RECOVERING and "recovering as planned: stop it" in loop.controller.abort()
     loop.run(1.2)
     assert loop.controller.state is State.HOVERING
     assert np.linalg.norm(loop.controller.maneuvers.belief[3:6]) < 0.1

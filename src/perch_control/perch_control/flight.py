@@ -42,7 +42,7 @@ class FlightController:
         self.law = law
         self.maneuvers = Maneuvers(vehicle, gains, settings)
         self._schedule = Schedule(self.maneuvers)
-        self.supervisor = Supervisor(self.maneuvers, lambda reason: self._schedule.leave(reason, self.law))
+        self.supervisor = Supervisor(self.maneuvers, self._leave)
         self.gate = OdometryGate(settings.odometry)
         self.odometry_age = inf
         self.margin = 1.0
@@ -184,6 +184,9 @@ class FlightController:
             self._schedule.drop()
             self.maneuvers.stop(reason)
         return self.maneuvers.message
+
+    def _leave(self, reason: str) -> bool:
+        return self._schedule.leave(reason, self.law)
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample; used in a descent without position, and kept for its beginning. Time [s], in B [rad/s, m/s^2].

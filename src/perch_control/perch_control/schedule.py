@@ -53,7 +53,7 @@ class Schedule:
         speed needs more room than a planned way out.
         """
         m, order = self._maneuvers, self._maneuvers.order
-        if order is None or order.at_end not in (AtEnd.CONTACT, AtEnd.RECOVER):
+        if order is None or (order.recovery_start < 0.0 and order.at_end is not AtEnd.CONTACT):
             return False
         own = order.start + order.recovery_start if order.recovery_start >= 0.0 else inf
         if m.now >= own:
