@@ -218,7 +218,7 @@ class ScriptedFlight:
         return any(status.trajectory_id == order for status in self.loop.trace.values("controller/status"))
 
     def perch_plan(self, p: np.ndarray, start: float, shift: np.ndarray) -> FlatTrajectory:
-        """The planner's perch from a hover; with L1, on the thrust that the controller has measured of it in hover.
+        """The planner's perch from a hover.
 
         Args:
             p: hover [m], as estimated.
@@ -228,11 +228,9 @@ class ScriptedFlight:
         Raises:
             PerchError: there is none.
         """
-        pad, planner = self.simulation.pad, self.loop.components["perching_planner"].config
-        left, vehicle = self.controller.flight.thrust_known, self.simulation.vehicle
-        thrust = None if left is None else left * (planner.thrust_max or planner.thrust_reserve * 4.0 * vehicle.thrust_max)
+        pad = self.simulation.pad
         [answer] = self.loop.request("perching_planner", "plan_perch", PerchPlanRequest(
-            start=nanoseconds(start), p=p, p_WS=pad.p_WS + shift, q_WS=so3.quat_from_matrix(pad.R_WS), thrust_max=thrust))
+            start=nanoseconds(start), p=p, p_WS=pad.p_WS + shift, q_WS=so3.quat_from_matrix(pad.R_WS)))
         if not answer.success:
             raise PerchError(answer.message)
         return answer.trajectory

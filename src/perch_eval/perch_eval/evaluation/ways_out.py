@@ -126,7 +126,7 @@ def _surface(inclination: int, rng: np.random.Generator) -> Iterator[Instant]:
     settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters)
     vehicle = load_vehicle("snapdragon")
     place = np.array([rng.uniform(1.2, 3.0), rng.uniform(-0.5, 0.5), rng.uniform(1.2, 1.8)])
-    problem = PerchProblem(StartState((0.0, 0.0, 1.2)), PerchSurface.from_inclination(place, math.radians(inclination)))
+    problem = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))
     perch = plan(problem, settings, vehicle).trajectory
     for t in np.arange(0.0, perch.duration, 1.0 / RATE).tolist():
         refusal = ""
