@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from perch_core import so3
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
-from perch_perception.tags import BoardLocalizer
+from perch_perception.tags import BoardLocalizer, TagDetector, refine_corners
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import load_scenario
 
@@ -42,7 +43,34 @@ def figures(quick: bool) -> list[Figure]:
                   figure("tags: frame, searching (10 Hz at most)", "ms", first),
                   figure("tags: all four within 1 s", "share", [float(np.mean(acquired))], 0.99, "min >="),
                   figure("tags: flips", "frames", [float(flips)], 0.0, "max ==")]
-    return everything + out
+    return everything + out + (_beside_pupil(hovers) if find_spec("pupil_apriltags") else [])
+
+
+def _beside_pupil(hovers: int) -> list[Figure]:
+    """Corners in the same images by us and by pupil-apriltags (`pip install pupil-apriltags`), which knows no lens."""
+    from pupil_apriltags import Detector
+
+    theirs, out = Detector(families="tag36h11", quad_decimate=1.0), []
+    for scenario_name, name, _, _ in PLACES:
+        scenario = load_scenario(scenario_name)
+        mount, board = load_vehicle(scenario.vehicle).mounts["front"], load_board(scenario.target.board)
+        renderer, surface, rng = Renderer(build_scene(scenario, seed=5), mount, seed=5), scenario.surface, np.random.default_rng(5)
+        errors: dict[str, list[np.ndarray]] = {"ours": [], "pupil-apriltags": []}
+        for _ in range(hovers):
+            p_WB, R_WB = np.array([0.0, 0.0, scenario.mission.takeoff_height]) + rng.normal(0, 0.08, 3), so3.exp(rng.normal(0, 0.05, 3))
+            image, (p_WC, R_WC) = renderer.render([(p_WB, R_WB)], rng), mount.pose(p_WB, R_WB)
+            truth = mount.camera.project((board.corners_S @ surface.R_WS.T + surface.p_WS - p_WC) @ R_WC)[0]
+            found = TagDetector(board, mount.camera).search(image)
+            refined = refine_corners(image, mount.camera, found.corners, modules=board.modules)
+            errors["ours"] += [np.linalg.norm(corners - truth[board.ids.index(number)], axis=1)
+                               for number, corners in zip(found.ids, mount.camera.project(refined.rays_C)[0])]
+            # their corners (lb, rb, rt, lt) of a marker turned by 180 deg, in pixels counted from the first one's corner
+            errors["pupil-apriltags"] += [np.linalg.norm(tag.corners[[1, 0, 3, 2]] - 0.5 - truth[board.ids.index(tag.tag_id)], axis=1)
+                                          for tag in theirs.detect(image) if tag.tag_id in board.ids]
+        for who, each in errors.items():
+            out += [figure(f"tags: found by {who}, one search, {name}", "share", [len(each) / (hovers * len(board.ids))])]
+            out += [figure(f"tags: corners by {who}, {name}", "px", np.concatenate(each))] if each else []
+    return out
 
 
 def _sightings(scenario_name, hovers, frames, acquired):
