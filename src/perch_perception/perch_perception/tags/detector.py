@@ -75,8 +75,8 @@ class TagDetector:
         """Corners (n, 4, 2) in pixels of the image and numbers (n,) of what a detector finds."""
         if self.board.corner_squares:
             image = cv2.dilate(image, np.ones((2 * CUT - 1,) * 2, np.uint8))
-        corners, ids, _ = detector.detectMarkers(image)
-        corners = np.array(corners, float).reshape(-1, 4, 2)
+        found, ids, _ = detector.detectMarkers(image)
+        corners = np.array(found, float).reshape(-1, 4, 2)
         if self.board.corner_squares and len(corners):
             out = corners - corners.mean(axis=1, keepdims=True)
             corners = corners + (CUT - 1) * np.sqrt(2.0) * out / np.linalg.norm(out, axis=2, keepdims=True)
@@ -84,7 +84,7 @@ class TagDetector:
 
     def _select(self, found: list[tuple[np.ndarray, np.ndarray]]) -> Detection:
         """Keep what belongs to the board and is wholly inside the image; what several detectors see counts once."""
-        rejected, kept = [], []
+        rejected, kept = list[str](), list[tuple[int, np.ndarray]]()
         for corners, number in ((c, int(n)) for places, ids in found for c, n in zip(places, ids)):
             side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
             if number not in self.board.ids:

@@ -90,7 +90,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
     Raises:
         LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
     """
-    keep, dropped = np.arange(len(ids)), []
+    keep, dropped = np.arange(len(ids)), list[int]()
     best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start)
     # of two tags that disagree, either may be wrong
     while best.misfit > _limit(_freedom(len(keep))) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:

@@ -48,7 +48,7 @@ class RefinedCorners:
 
     @property
     def valid(self) -> np.ndarray:
-        return self.measured.all(axis=1)
+        return np.asarray(self.measured.all(axis=1))
 
 
 def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, rounds: int = 2,
