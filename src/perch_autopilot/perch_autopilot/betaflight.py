@@ -140,7 +140,7 @@ class Betaflight(Component[BetaflightParameters]):
                 self._answered = now
             elif frame.command == msp.STATUS:
                 self._status = msp.status(frame)
-                self._judge_arming(now)
+                self._judge_arming(self._status, now)
             elif frame.command == msp.ATTITUDE:
                 self._attitude = msp.attitude(frame)
             elif frame.command == msp.ANALOG:
@@ -158,14 +158,14 @@ class Betaflight(Component[BetaflightParameters]):
                 raise msp.MspError(f"the battery has {voltage:g} V: the thrust curve of {self.config.vehicle} (actuation.battery) is of "
                                    f"{low:g} to {high:g} V")
 
-    def _judge_arming(self, now: int) -> None:
+    def _judge_arming(self, status: msp.Status, now: int) -> None:
         """Say why it does not arm; it names no reason where another one than we has the switch."""
-        if not self._wanted or self._status.armed:
+        if not self._wanted or status.armed:
             self._wanted_since = None
         elif self._wanted_since is None:
             self._wanted_since = now
         elif now - self._wanted_since > _REFUSED:
-            reasons = "; ".join(self._status.refusals) or (
+            reasons = "; ".join(status.refusals) or (
                 "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == "following" else "commands had stopped: disarm first")
             self.log(LogLine("error", f"the autopilot refuses to arm: {reasons}", 2.0))
 

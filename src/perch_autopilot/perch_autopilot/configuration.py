@@ -35,7 +35,7 @@ class Configuration:
     @property
     def settings(self) -> dict[str, str]:
         """Name -> value of the lines `set name = value`."""
-        return dict(found.groups() for line in self.lines if (found := _SET.fullmatch(line)))
+        return _settings(self.lines)
 
     @property
     def identity(self) -> str:
@@ -123,9 +123,13 @@ def dump_lines(answer: str) -> list[str]:
     return [" ".join(line.split()) for line in answer.splitlines() if line.strip() and not line.startswith("#")]
 
 
+def _settings(lines: Sequence[str]) -> dict[str, str]:
+    return {found[1]: found[2] for line in lines if (found := _SET.fullmatch(line))}
+
+
 def differences(wanted: Sequence[str], found: Sequence[str]) -> list[str]:
     """What a dump has otherwise than it was wanted, each in words."""
-    settings = dict(pair.groups() for line in found if (pair := _SET.fullmatch(line)))
+    settings = _settings(found)
     lines, wrong = set(found), []
     for line in wanted:
         pair = _SET.fullmatch(line)

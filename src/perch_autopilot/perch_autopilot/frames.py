@@ -12,6 +12,8 @@ from math import sqrt
 
 import numpy as np
 
+from perch_core.arrays import Numbers
+
 _H = sqrt(0.5)
 
 
@@ -19,12 +21,12 @@ WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 BODY = np.diag([1.0, -1.0, -1.0])
 
 
-def world(v: np.ndarray) -> np.ndarray:
+def world(v: Numbers) -> np.ndarray:
     """A vector of the world, ENU <-> NED; any unit."""
     return WORLD @ v
 
 
-def body(v: np.ndarray) -> np.ndarray:
+def body(v: Numbers) -> np.ndarray:
     """A vector of the body, FLU <-> FRD; any unit."""
     return BODY @ v
 

@@ -90,7 +90,7 @@ class FirmwareLoop:
                 look at it.
             sample: what the IMU has read last.
         """
-        motors = np.array(self.sitl.step(sample.gyro, sample.accel, (x[6], x[3], x[4], x[5]), self.channels(now / NANOSECONDS)))
+        motors = np.asarray(self.sitl.step(sample.gyro, sample.accel, (x[6], x[3], x[4], x[5]), self.channels(now / NANOSECONDS)))
         turn = motors > 0.5 * self._idle
         self._turning = bool(turn.all())
         throttle = np.clip((motors - self._idle) / (1.0 - self._idle), 0.0, 1.0)

@@ -146,10 +146,11 @@ class Mavlink(Component[MavlinkParameters]):
         except LinkError as error:
             self.log(LogLine("error", str(error), 1.0))
         command = self._command
-        fresh = command is not None and 0 <= now - self._came <= _STALE
-        if fresh:
+        if command is not None and not 0 <= now - self._came <= _STALE:
+            command = None
+        if command is not None:
             self._target(command)
-        ask = self.offboard.ask(now * 1e-9, fresh and command.armed, fresh)
+        ask = self.offboard.ask(now * 1e-9, command is not None and command.armed, command is not None)
         if ask is Ask.MODE:
             self._order(176, 1.0, *_mode_words(self.offboard.mode))                    # MAV_CMD_DO_SET_MODE
         elif ask is not Ask.NOTHING:

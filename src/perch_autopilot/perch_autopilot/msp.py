@@ -90,7 +90,8 @@ class Parser:
     def feed(self, data: bytes) -> list[Frame]:
         """What `data` completes; bytes that are no frame are skipped, a torn frame costs its first byte only."""
         self._bytes += data
-        buffer, found = self._bytes, []
+        buffer = self._bytes
+        found: list[Frame] = []
         while True:
             start = buffer.find(b"$M")
             if start < 0:
@@ -107,7 +108,7 @@ class Parser:
                 self._skip()
             elif len(buffer) < size + 6:
                 return found
-            elif _checksum(buffer[3:size + 5]) != buffer[size + 5]:
+            elif _checksum(bytes(buffer[3:size + 5])) != buffer[size + 5]:
                 self.torn += 1
                 self._skip()
             else:

@@ -73,13 +73,13 @@ class IsolatedProgram:
                 word, handed = b"", []
             if word != b"ok":
                 self.process.kill()
-                reason = (self.process.stderr.read() or b"").decode(errors="replace").strip().splitlines()
-                self.process.wait()
+                reason = self.process.communicate()[1].decode(errors="replace").strip().splitlines()
                 raise NamespaceError(f"no network namespace for Betaflight: {reason[-1] if reason else 'no answer'}")
         finally:
             ours.close()
             theirs.close()
-        self.process.stderr.close()
+        if self.process.stderr is not None:
+            self.process.stderr.close()
         self.received, self.sent, self.stream = (socket.socket(fileno=number) for number in handed)
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import degrees, sqrt
 
+from perch_core.arrays import Numbers
 from perch_core.errors import ConfigError
 from perch_core.vehicle import GRAVITY, Vehicle
 
@@ -95,7 +96,7 @@ class Sticks:
         """Throttle [us] that carries a share of the weight."""
         return self.channels((0.0, 0.0, 0.0), share * GRAVITY)[2]
 
-    def channels(self, rates: tuple[float, float, float], thrust: float) -> tuple[int, int, int, int]:
+    def channels(self, rates: Numbers, thrust: float) -> tuple[int, int, int, int]:
         """Pulse widths [us] of roll, pitch, throttle, yaw.
 
         Args:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from perch_core.arrays import Numbers
 from perch_core.timing import CONTROL_PERIOD
 from perch_autopilot import firmware, msp
 from perch_autopilot.configuration import Cli, CliError, Configuration
@@ -79,7 +80,7 @@ class Sitl:
         if not memory.exists():
             self._launch(draft)
             Cli(self.send, self.receive).apply(self._configuration)
-            self._running.process.wait(_START)  # saving restarts it, which here is its end
+            self._firmware.process.wait(_START)  # saving restarts it, which here is its end
             self._launch(draft)
             Cli(self.send, self.receive).check(self._configuration)
             self.close()
@@ -90,23 +91,23 @@ class Sitl:
 
     def _launch(self, memory: Path) -> None:
         self.close()
-        self._running = IsolatedProgram([self._program], memory.parent, MOTORS)
-        self._running.received.settimeout(_ANSWER)
+        self._running = running = IsolatedProgram([self._program], memory.parent, MOTORS)
+        running.received.settimeout(_ANSWER)
         last = time.monotonic() + _START
         while True:
             try:
-                self._running.stream.connect(("127.0.0.1", SERIAL))
+                running.stream.connect(("127.0.0.1", SERIAL))
                 return
             except ConnectionRefusedError:
-                if self._running.process.poll() is not None:
-                    raise FirmwareError(f"Betaflight's firmware ended at its start, code {self._running.process.returncode}") from None
+                if running.process.poll() is not None:
+                    raise FirmwareError(f"Betaflight's firmware ended at its start, code {running.process.returncode}") from None
                 if time.monotonic() > last:
                     raise Frozen(f"Betaflight's firmware does not open its port {SERIAL} within {_START:g} s") from None
                 time.sleep(0.01)
 
     # -- cycles ------------------------------------------------------------------------------------------------------
 
-    def step(self, gyro: Sequence[float], force: Sequence[float], q_wxyz: Sequence[float], channels: Sequence[int]) -> tuple[float, ...]:
+    def step(self, gyro: Numbers, force: Numbers, q_wxyz: Numbers, channels: Sequence[int]) -> tuple[float, ...]:
         """One cycle of the firmware.
 
         Args:
@@ -122,7 +123,7 @@ class Sitl:
             Frozen: no answer.
         """
         self.time += CONTROL_PERIOD
-        running = self._running
+        running = self._firmware
         p, q, r = gyro
         x, y, z = force
         w, i, j, k = q_wxyz
@@ -136,25 +137,31 @@ class Sitl:
             raise Frozen(f"Betaflight's firmware has not answered for {_ANSWER:g} s at {self.time:.3f} s") from None
         return tuple(min(max(motors[n], 0.0), 1.0) for n in _FROM_PACKET)
 
+    @property
+    def _firmware(self) -> IsolatedProgram:
+        if self._running is None:
+            raise FirmwareError("Betaflight's firmware has been ended")
+        return self._running
+
     # -- CLI and MSP -------------------------------------------------------------------------------------------------
 
     def send(self, data: bytes) -> None:
         """Bytes to its serial port."""
-        self._running.stream.settimeout(_ANSWER)
-        self._running.stream.sendall(data)
+        self._firmware.stream.settimeout(_ANSWER)
+        self._firmware.stream.sendall(data)
 
     def receive(self, timeout: float) -> bytes:
         """Bytes that have come from its serial port within a time [s]."""
-        self._running.stream.settimeout(timeout)
+        self._firmware.stream.settimeout(timeout)
         try:
-            return self._running.stream.recv(4096)
+            return self._firmware.stream.recv(4096)
         except TimeoutError:
             return b""
 
     @property
     def file(self) -> int:
         """File number of its serial port, for another that speaks MSP."""
-        return self._running.stream.fileno()
+        return self._firmware.stream.fileno()
 
     def status(self) -> msp.Status:
         """Of the firmware, as MSP tells it."""

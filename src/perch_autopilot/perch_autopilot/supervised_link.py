@@ -60,12 +60,13 @@ class LinkSupervisor:
 
     def work(self, timeout: float) -> None:
         """Handle what arrives within a time [s]; send a frame when it is due."""
-        sources = [one for one in (None if self._node_gone else self._control, self._link and self._link.file) if one is not None]
-        ready = select.select(sources, [], [], timeout)[0]
-        if self._control in ready:
+        control = [] if self._node_gone else [self._control.fileno()]
+        link = [] if self._link is None else [self._link.file]
+        ready = select.select(control + link, [], [], timeout)[0]
+        if ready and ready[0] in control:
             self._receive()
         if self._link is not None and self._link.file in ready:
-            self._forward()
+            self._forward(self._link)
         now = self._clock()
         if now >= self._due:
             self._due = max(self._due + self._period, now - self._period)
@@ -93,7 +94,8 @@ class LinkSupervisor:
             self._close_link(error)
 
     def _close_link(self, error: LinkError) -> None:
-        self._link.close()
+        if self._link is not None:
+            self._link.close()
         self._link, self._opened = None, self._clock()
         self._notify(b"M" + str(error).encode())
 
@@ -112,9 +114,9 @@ class LinkSupervisor:
         elif packet[:1] == b"H" and len(packet) == 1 + THROTTLES.size:
             self._watchdog.set_throttles(*THROTTLES.unpack_from(packet, 1))
 
-    def _forward(self) -> None:
+    def _forward(self, link: Link) -> None:
         try:
-            self._notify(b"D" + self._link.read())
+            self._notify(b"D" + link.read())
         except LinkError as error:
             self._close_link(error)
 
@@ -154,7 +156,8 @@ class SupervisedLink:
             self._control.close()
             output = self.process.communicate(timeout=5.0)[1].decode(errors="replace").strip().splitlines()
             raise LinkError(output[-1] if output else f"{address}: the process that holds the link does not start")
-        self.process.stderr.close()
+        if self.process.stderr is not None:
+            self.process.stderr.close()
         self._control.setblocking(False)
 
     def command(self, armed: bool, sticks: tuple[int, int, int, int]) -> None:
