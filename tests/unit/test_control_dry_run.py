@@ -51,6 +51,7 @@ def test_a_second_flight_loads_nothing_more():
 
 
 def test_nodes_start_without_libraries_that_their_flight_does_not_need():
-    nodes = ("perch_sim.vio_model_node", "perch_control.controller_node", "perch_planner.perching_planner_node", "perch_eval.recorder_node")
+    nodes = ("perch_sim.vio_model_node", "perch_control.controller_node", "perch_planner.perching_planner_node", "perch_eval.recorder_node",
+             *(f"perch_perception.{name}_node" for name in ("estimator", "vio", "target_localizer", "powerline_mapper")))
     program = f"import sys, {', '.join(nodes)}; print(*{{'scipy.optimize', 'scipy.stats', 'osqp', 'matplotlib'}} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout.strip() == ""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from perch_core import so3
-from scipy.stats import chi2
+from perch_core.probability import chi2_quantile
 
 
 def nees(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
@@ -81,7 +81,7 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int, pro
     if samples.ndim != 2 or samples.shape[1] != len(times):
         raise ValueError(f"samples of shape {samples.shape} do not fit {len(times)} times")
     runs, tail = len(samples), 0.5 * (1 - probability)
-    low, high = chi2.ppf([tail, 1 - tail], runs * dimension) / runs
+    low, high = chi2_quantile(np.array([tail, 1 - tail]), runs * dimension) / runs
     return Consistency(name, dimension, np.asarray(times), samples.mean(axis=0), (float(low), float(high)), runs)
 
 

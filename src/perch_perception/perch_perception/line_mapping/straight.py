@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-from scipy.stats import binom
 
 from perch_core.camera import Camera
+from perch_core.probability import binomial_tail
 from perch_perception.line_mapping.ridges import Ridges
 
 TURNS = np.radians(np.arange(-9.0, 9.1, 1.5))  # about the ray, by which a ridge's direction may be wrong
@@ -190,7 +190,8 @@ def _along(found, rays, normals, left, normal, camera, tolerance, least) -> tupl
     beside = within & (np.abs(off) > BESIDE[0]) & (np.abs(off) < BESIDE[1])
     cells = len(np.unique(piece[beside] + 2 * pieces * np.floor(off[beside] / (2.0 * tolerance)).astype(int)))
     usual = cells / (count * (BESIDE[1] - BESIDE[0]) / tolerance)
-    chance = TESTS + float(binom.logsf(shown[begin:end].sum() - 1, count, min(max(usual, 0.02), 1.0))) / np.log(10.0)
+    with np.errstate(divide="ignore"):  # so good that chance never does it
+        chance = TESTS + float(np.log10(binomial_tail(int(shown[begin:end].sum()), count, min(max(usual, 0.02), 1.0))))
     points = points[np.argsort(along[points], kind="stable")]
     low, high = along[points[0]], along[points[-1]]
     first, last = _visible(camera, forward, side, 0.5 * (low + high))

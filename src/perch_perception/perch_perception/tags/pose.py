@@ -22,11 +22,11 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from scipy.stats import chi2
 
 from perch_core import so3
 from perch_core.camera import Camera
 from perch_core.errors import PerchError
+from perch_core.probability import chi2_quantile
 
 MAX_ITERATIONS = 12
 SAME_POSE = np.radians(0.5)        # branches closer than this are one and the same minimum [rad]
@@ -124,7 +124,7 @@ def _freedom(tags: int) -> int:
 @lru_cache(maxsize=256)
 def _limit(freedom: int) -> float:
     """chi^2 over its degrees of freedom that `CONSISTENT` of the boards keep."""
-    return float(chi2.ppf(CONSISTENT, freedom)) / freedom
+    return float(chi2_quantile(CONSISTENT, freedom)) / freedom
 
 
 def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=None) -> BoardPose:

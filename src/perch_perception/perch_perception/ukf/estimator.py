@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
+from perch_core.probability import chi2_quantile
 from perch_core.values import ImuSample
 from perch_perception.ukf import kernels, start
 from perch_perception.ukf import layout as at
@@ -38,7 +38,7 @@ class Estimator:
         self.config = config
         self._transform = UnscentedTransform(config)
         self._imu = ImuBuffer(config.imu, config.faults, config.history)
-        self._gates = {m: float(chi2.ppf(config.gate_probability, m)) for m in (6, 9)}
+        self._gates = {m: float(chi2_quantile(config.gate_probability, m)) for m in (6, 9)}
         self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
         self._heard = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
         self._resting = False             # the base is one of rest

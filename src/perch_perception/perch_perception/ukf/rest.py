@@ -10,9 +10,9 @@ So position and heading are as certain after an hour as they were when the rest 
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from perch_core import so3
+from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
@@ -24,7 +24,7 @@ def stopped(belief: Belief, config: UkfConfig) -> Belief | None:
     H = np.zeros((3, at.ERROR_SIZE))
     H[:, at.D_VELOCITY] = np.eye(3)
     innovation = _innovation(belief, H, -belief.x[at.VELOCITY], np.full(3, config.rest.velocity**2))
-    return UnscentedTransform.correct(belief, innovation) if innovation.nis < chi2.ppf(config.gate_probability, 3) else None
+    return UnscentedTransform.correct(belief, innovation) if innovation.nis < chi2_quantile(config.gate_probability, 3) else None
 
 
 def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:

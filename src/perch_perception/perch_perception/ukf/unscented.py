@@ -1,7 +1,7 @@
 """The unscented transforms of the UKF: prediction through IMU steps and the update with a pose.
 
-Sigma points and weights are filterpy's (`MerweScaledSigmaPoints`) on the error vector; the points live on the
-manifold through `layout.plus`/`minus`. Prediction runs in `kernels.unscented_run`; without numba, in the vectorised
+Sigma points and weights are the scaled ones of van der Merwe on the error vector; the points live on the manifold
+through `layout.plus`/`minus`. Prediction runs in `kernels.unscented_run`; without numba, in the vectorised
 form here. The update is in `update_kernels`. The equations are in docs/estimation.md, section UKF.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from filterpy.kalman import MerweScaledSigmaPoints
+from scipy.linalg import cholesky
 
 from perch_core import so3
 from perch_core.errors import PerchError
@@ -66,8 +66,13 @@ class UnscentedTransform:
 
     def __init__(self, config: UkfConfig) -> None:
         self.config = config
-        self.points = MerweScaledSigmaPoints(at.ERROR_SIZE, config.alpha, config.beta, config.kappa)
-        self.scale = 0.5 / self.points.Wm[1]
+        n = at.ERROR_SIZE
+        spread = config.alpha**2 * (n + config.kappa) - n
+        self.Wm = np.full(2 * n + 1, 0.5 / (n + spread))  # weights for the mean, and for the covariance
+        self.Wc = self.Wm.copy()
+        self.Wm[0] = spread / (n + spread)
+        self.Wc[0] = self.Wm[0] + (1.0 - config.alpha**2 + config.beta)
+        self.scale = 0.5 / self.Wm[1]
 
     def predict(self, belief: Belief, run: np.ndarray, stamp: int) -> Belief:
         """Belief after a run of IMU steps that ends at `stamp`.
@@ -84,7 +89,7 @@ class UnscentedTransform:
             return Belief(stamp, belief.x, belief.P)
         if COMPILED:
             x, P = np.empty(at.NOMINAL_SIZE), np.empty((at.ERROR_SIZE, at.ERROR_SIZE))
-            Wm, Wc = self.points.Wm, self.points.Wc
+            Wm, Wc = self.Wm, self.Wc
             if not kernels.unscented_run(belief.x, belief.P, run, self.scale, Wm[0], Wc[0], Wm[1], x, P):
                 raise CovarianceError(f"covariance at {belief.stamp} ns is not positive definite")
         else:
@@ -107,9 +112,9 @@ class UnscentedTransform:
             q = so3.quat_multiply(middle, half)
         points[:, at.POSITION], points[:, at.VELOCITY], points[:, at.QUATERNION] = p, v, q
         deviations = at.minus(points, points[0])
-        mean = self.points.Wm @ deviations
+        mean = self.Wm @ deviations
         centred = deviations - mean
-        return at.plus(points[0], mean), (centred * self.points.Wc[:, None]).T @ centred
+        return at.plus(points[0], mean), (centred * self.Wc[:, None]).T @ centred
 
     def process_noise(self, run: np.ndarray) -> np.ndarray:
         """Covariance that a run's IMU noise and bias walks add, shape (15, 15).
@@ -142,7 +147,7 @@ class UnscentedTransform:
         m = len(R)
         z = np.concatenate([pose.p_WB, pose.q_WB, pose.v_B if m == 9 else ()])
         residual, S, gain = np.empty(m), np.empty((m, m)), np.empty((at.ERROR_SIZE, m))
-        Wm, Wc = self.points.Wm, self.points.Wc
+        Wm, Wc = self.Wm, self.Wc
         nis = update_kernels.innovate(belief.x, belief.P, z, R, self.scale, Wm[0], Wc[0], Wm[1], residual, S, gain)
         if nis < 0.0:
             raise CovarianceError("covariance is not positive definite")
@@ -161,6 +166,7 @@ class UnscentedTransform:
 
     def _sigma_points(self, P: np.ndarray) -> np.ndarray:
         try:
-            return self.points.sigma_points(np.zeros(at.ERROR_SIZE), P)
+            root = cholesky(self.scale * P)
         except np.linalg.LinAlgError:
             raise CovarianceError("covariance is not positive definite") from None
+        return np.vstack([np.zeros(at.ERROR_SIZE), root, -root])

@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 from perch_core.jit import compiled
+from perch_core.probability import chi2_quantile
 from scipy.linalg import lapack, qr
-from scipy.stats import chi2
 
 
 class Gate:
     """chi2 thresholds of one probability, kept by dimension."""
 
     def __init__(self, probability: float, most: int = 400) -> None:
-        self._limits = np.concatenate([[0.0], chi2.ppf(probability, np.arange(1, most + 1))])
+        self._limits = np.concatenate([[0.0], chi2_quantile(probability, np.arange(1, most + 1))])
 
     def limit(self, dimension: int) -> float:
         """Largest normalised innovation squared of this dimension that passes."""

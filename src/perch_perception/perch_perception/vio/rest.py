@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 from perch_core import so3
+from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
-from scipy.stats import chi2
 
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import state as at
 from perch_perception.vio.msckf import Msckf
 
-_STANDS = float(chi2.ppf(1.0 - 1e-6, 3))
+_STANDS = float(chi2_quantile(1.0 - 1e-6, 3))
 _BIASES = np.r_[9:15]
 
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from perch_core import so3
 from perch_core.camera import CameraMount
+from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
-from scipy.stats import chi2
 
 from perch_perception.vio import ekf
 from perch_perception.vio.bearing import POINT, Bearings, residuals
@@ -30,7 +30,7 @@ _G = np.array([0.0, 0.0, -GRAVITY])
 _ITERATIONS = 10
 _SETTLED = 0.01  # of chi^2
 _LEAST_POINTS = 6
-_DIFFERENT = float(chi2.ppf(0.99, 5))
+_DIFFERENT = float(chi2_quantile(0.99, 5))
 _TRACK_PROBABILITY = 0.999
 # of the unknowns: tilt (2), velocity, biases, calibration, then 9 for the noise of each interval; those with a prior are in its sigmas
 _TILT, _VELOCITY, _BIASES, _CALIBRATION, _NOISE = slice(0, 2), slice(2, 5), slice(5, 11), slice(11, 22), 22
@@ -148,7 +148,7 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
             return None
         s, here = end
         good = used.copy()
-        good[used] = here.distances < chi2.ppf(_TRACK_PROBABILITY, here.dof)
+        good[used] = here.distances < chi2_quantile(_TRACK_PROBABILITY, here.dof)
         if (good == used).all():
             break
         used = good
@@ -156,7 +156,7 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
             return None
     misfit = (here.distances.sum() + s.z @ s.z) / (here.dof.sum() - 5)
     m = np.array([len(x.frames) for x in sights])[~used]
-    return _at_the_end(s, here, used, sigma, float(misfit), here.cost + float(chi2.ppf(_TRACK_PROBABILITY, 2 * m - 3).sum()))
+    return _at_the_end(s, here, used, sigma, float(misfit), here.cost + float(chi2_quantile(_TRACK_PROBABILITY, 2 * m - 3).sum()))
 
 
 def _descend(s: _Unknowns, linearise: Callable[[_Unknowns], _Linear | None], sigma: np.ndarray,
