@@ -198,9 +198,13 @@ def test_the_planning_process_may_be_killed_in_the_middle(isolated: Asked, tmp_p
     (job, future), = futures
     while not (tmp_path / "begun").exists():
         time.sleep(0.01)
-    os.kill(isolated.runner.pid, signal.SIGKILL)
+    killed = isolated.runner.pid
+    os.kill(killed, signal.SIGKILL)
     job.then(future.exception(120.0))
     assert answers[0].error_code == PerchPlanError.SOLVER and "ended" in answers[0].message
+    while isolated.runner.pid == killed:
+        time.sleep(0.01)
+    assert isolated.runner.wait_ready()  # its start does not count against the limit of a plan
     assert isolated(request()).success
 
 

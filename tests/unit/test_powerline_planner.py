@@ -158,7 +158,7 @@ def test_the_report_holds_what_was_planned(planned: PlannedProblem, tmp_path: Pa
 def test_plan_script_plans_and_refuses(tmp_path: Path) -> None:
     def run(*arguments: str) -> subprocess.CompletedProcess:
         return subprocess.run([sys.executable, str(ROOT / "scripts" / "plan.py"), *arguments, "--out", str(tmp_path)],
-                              capture_output=True, text=True, check=False, timeout=300)
+                              capture_output=True, text=True, check=False, timeout=600)
 
     done = run("powerline_line_20")
     assert done.returncode == 0 and "perch of 2." in done.stdout and (tmp_path / "plan.png").is_file(), done.stderr
