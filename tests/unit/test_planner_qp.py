@@ -14,7 +14,7 @@ from perch_planner.cutting import limit_cuts
 from perch_planner.linear_bounds import Bounds
 from perch_planner.paper import paper_m
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
-from perch_planner.reduced_rows import appended, rows_of
+from perch_planner.reduced_rows import rows_of, stacked
 from perch_planner.yaw_profile import yaw_coefficients
 
 VEHICLE = load_vehicle("snapdragon")
@@ -61,13 +61,13 @@ def program(contact: Contact, durations: np.ndarray, order: int = 4, everywhere:
     """The reduced program with the rows of tube and window, what is given at the knots, and its values."""
     given, values, bubbles, bounds = conditions(durations, everywhere, contact.velocity, contact.problem)
     made = reduced_qp.assemble(durations, given, values, bubbles, reference_element.GRAMS[order], order)
-    return made, rows_of(*made, *bounds), given, values
+    return made, rows_of(made, bounds), given, values
 
 
 def solved(made, rows, solver: str = "daqp") -> np.ndarray:
     solution = solvers.least_norm(*rows, solver)
     assert solution.solved, (solver, solution.status, solution.residual)
-    return reduced_qp.coefficients(*made, solution.w)
+    return reduced_qp.coefficients(made, solution.w)
 
 
 @pytest.mark.parametrize("objective, order", [("snap", 4), ("jerk", 3)])
@@ -180,7 +180,7 @@ def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
     x, bound = np.array([1.0, 0.0, 0.0]), jerk - 2.0 * force - 1.0
     cut = Bounds(np.array([0, 0]), np.array([0, 0]), np.array([0.4, 0.4]), np.array([3, 2]), np.array([x, -2.0 * x]),
                  np.array([-np.inf]), np.array([bound]))
-    jerk, force = at(solved(made, appended(*rows, made, tuple(cut))))
+    jerk, force = at(solved(made, stacked(rows, rows_of(made, tuple(cut)))))
     assert jerk - 2.0 * force <= bound + 1e-5
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 Array = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
 """Floats, any shape; a plain `np.ndarray` may hold anything."""
+Indices = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+Flags = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 Numbers = Sequence[float] | np.ndarray
 """Floats in order: a tuple, a list, an array with one axis."""
 Vector3 = tuple[float, float, float]

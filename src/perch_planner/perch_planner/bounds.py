@@ -10,6 +10,7 @@ from math import comb
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 
 ROUNDING = 1e-13
@@ -23,9 +24,9 @@ BELOW, VIOLATED, UNDECIDED = 1, 0, -1
 
 
 @compiled
-def largest(values):
+def largest(values: Array) -> float:
     """The largest entry of a vector."""
-    out = values[0]
+    out: float = values[0]
     for k in range(1, len(values)):
         if values[k] > out:
             out = values[k]
@@ -33,9 +34,9 @@ def largest(values):
 
 
 @compiled
-def smallest(values):
+def smallest(values: Array) -> float:
     """The smallest entry of a vector."""
-    out = values[0]
+    out: float = values[0]
     for k in range(1, len(values)):
         if values[k] < out:
             out = values[k]
@@ -43,7 +44,7 @@ def smallest(values):
 
 
 @compiled
-def magnitude(values):
+def magnitude(values: Array) -> float:
     """The largest absolute value of a vector's entries."""
     out = 0.0
     for k in range(len(values)):
@@ -52,7 +53,7 @@ def magnitude(values):
 
 
 @compiled
-def split(work, left):
+def split(work: Array, left: Array) -> None:
     """De Casteljau at 1/2: the left half is written to `left`, and `work` becomes the right half.
 
     Four levels in one pass: a pass for each level waits for its own stores, and takes three times as long.
@@ -76,7 +77,7 @@ def split(work, left):
 
 
 @compiled
-def stays_below(coefficients, bound):
+def stays_below(coefficients: Array, bound: float) -> tuple[int, float]:
     """Whether a polynomial stays below a bound on [0, 1]. [uses M:alg1]
 
     Args:
@@ -130,7 +131,7 @@ def stays_below(coefficients, bound):
 
 
 @compiled
-def maximum(coefficients, tolerance, floor):
+def maximum(coefficients: Array, tolerance: float, floor: float) -> tuple[float, float, float]:
     """Largest value of a polynomial on [0, 1], enclosed as far as it exceeds `floor`. [defines M:alg1, by subdivision]
 
     Args:
@@ -181,7 +182,7 @@ def maximum(coefficients, tolerance, floor):
 
 
 @compiled
-def bernstein_row(degree, s):
+def bernstein_row(degree: int, s: float) -> Array:
     """Values of the Bernstein basis at s, shape (degree + 1,)."""
     row = np.zeros(degree + 1)
     row[0] = 1.0
@@ -193,7 +194,7 @@ def bernstein_row(degree, s):
 
 
 @compiled
-def _scaled(a):
+def _scaled(a: Array) -> Array:
     """Coefficients times binomials: so scaled, a product is a convolution."""
     n = len(a)
     out = np.empty(n)
@@ -203,7 +204,7 @@ def _scaled(a):
 
 
 @compiled
-def _add_product(a, b, sign, out):
+def _add_product(a: Array, b: Array, sign: float, out: Array) -> None:
     """Add sign a b to `out`; all three are `_scaled`."""
     for i in range(len(a)):
         factor = sign * a[i]
@@ -212,14 +213,14 @@ def _add_product(a, b, sign, out):
 
 
 @compiled
-def _divide_binomials(out):
+def _divide_binomials(out: Array) -> None:
     n = len(out)
     for i in range(n):
         out[i] /= _BINOMIALS[n - 1, i]
 
 
 @compiled
-def product(a, b):
+def product(a: Array, b: Array) -> Array:
     """Bernstein coefficients of the product of two polynomials, shapes (n + 1,), (m + 1,) -> (n + m + 1,)."""
     out = np.zeros(len(a) + len(b) - 1)
     _add_product(_scaled(a), _scaled(b), 1.0, out)
@@ -228,7 +229,7 @@ def product(a, b):
 
 
 @compiled
-def derivative(coefficients, order):
+def derivative(coefficients: Array, order: int) -> Array:
     """Bernstein coefficients of the order-th derivative with respect to s, shape (n + 1,) -> (n + 1 - order,)."""
     out = coefficients.copy()
     n = len(out)
@@ -239,7 +240,7 @@ def derivative(coefficients, order):
 
 
 @compiled
-def time_derivative(coefficients, order, duration):
+def time_derivative(coefficients: Array, order: int, duration: float) -> Array:
     """Bernstein coefficients of the order-th time derivative of a segment, shape (3, n + 1) -> (3, n + 1 - order)."""
     rows, n = coefficients.shape
     work = np.empty(n)
@@ -257,7 +258,7 @@ def time_derivative(coefficients, order, duration):
 
 
 @compiled
-def squared(a):
+def squared(a: Array) -> Array:
     """Bernstein coefficients of |a|^2 for a polynomial vector, shape (3, n + 1) -> (2 n + 1,): half the products."""
     n = a.shape[1]
     out, scaled = np.zeros(2 * n - 1), np.empty(n)
@@ -274,7 +275,7 @@ def squared(a):
 
 
 @compiled
-def cross(a, b):
+def cross(a: Array, b: Array) -> Array:
     """Bernstein coefficients of a x b for polynomial vectors, shapes (3, n + 1), (3, m + 1) -> (3, n + m + 1)."""
     out = np.zeros((3, a.shape[1] + b.shape[1] - 1))
     p, q = np.empty(a.shape), np.empty(b.shape)
@@ -289,17 +290,17 @@ def cross(a, b):
 
 
 @compiled
-def value(coefficients, s):
+def value(coefficients: Array, s: float) -> float:
     """Value at s by de Casteljau's algorithm."""
     work = coefficients.copy()
     for k in range(len(work) - 1, 0, -1):
         for i in range(k):
             work[i] = (1.0 - s) * work[i] + s * work[i + 1]
-    return work[0]
+    return float(work[0])
 
 
 @compiled
-def derivatives_at(coefficients, duration, s, count):
+def derivatives_at(coefficients: Array, duration: float, s: float, count: int) -> Array:
     """Time derivatives 0 to count - 1 of a segment at s, shapes (3, n + 1) -> (count, 3)."""
     out = np.empty((count, 3))
     n = coefficients.shape[1]

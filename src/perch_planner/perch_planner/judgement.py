@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_planner.cutting import limit_cuts, thrust_cuts
+from perch_planner.linear_bounds import BoundArrays
 from perch_planner.plan_checks import check, thrust_extrema
 
 _CUT_REACH = 1.7  # peaks beyond this multiple of the limit are stretched before they are cut
@@ -71,15 +73,16 @@ class Judgement(NamedTuple):
 
 
 @compiled
-def _better_stretched(extrema, high, waypoints):
+def _better_stretched(extrema: Array, high: float, waypoints: int) -> bool:
     """Whether the thrust's peak lies where a longer time lowers it."""
     segment = extrema[:, 4].argmax()
     peak = extrema[segment, 4]
-    return peak > high and (segment < waypoints or peak > _CUT_REACH * high)
+    return bool(peak > high and (segment < waypoints or peak > _CUT_REACH * high))
 
 
 @compiled
-def judge(coefficients, yaw, durations, question, patient, later):
+def judge(coefficients: Array, yaw: Array, durations: Array, question: tuple[Any, ...], patient: bool, later: bool
+          ) -> tuple[Array, Array, tuple[float, float, bool, bool, bool], BoundArrays, BoundArrays]:
     """Check a plan, and find cuts against what breaks a limit.
 
     Args:

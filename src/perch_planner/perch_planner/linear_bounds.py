@@ -6,7 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.arrays import Array, Indices
 from perch_core.jit import compiled
+
+BoundArrays = tuple[Indices, Indices, Array, Indices, Array, Array, Array]
+"""Fields of `Bounds`."""
 
 
 class Bounds(NamedTuple):
@@ -22,13 +26,13 @@ class Bounds(NamedTuple):
         lower, upper: bounds of the sums, infinite where there is none, shape (r,).
     """
 
-    owner: np.ndarray
-    segments: np.ndarray
-    places: np.ndarray
-    orders: np.ndarray
-    direction: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
+    owner: Indices
+    segments: Indices
+    places: Array
+    orders: Indices
+    direction: Array
+    lower: Array
+    upper: Array
 
 
 NONE = Bounds(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64), np.empty((0, 3)), np.empty(0),
@@ -37,7 +41,7 @@ NONE = Bounds(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empt
 
 
 @compiled
-def no_bounds(terms, rows):
+def no_bounds(terms: int, rows: int) -> BoundArrays:
     """Arrays of `Bounds` to be filled in: so many terms of weight zero, so many rows without bounds."""
     return (np.zeros(terms, np.int64), np.zeros(terms, np.int64), np.zeros(terms), np.full(terms, 2), np.zeros((terms, 3)),
             np.full(rows, -np.inf), np.full(rows, np.inf))

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 
 from perch_core import bernstein
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound, spin_rate
@@ -29,7 +30,7 @@ _FINE = 1e-10      # where a limit falls inside the enclosure
 
 
 @compiled
-def specific_force(coefficients, duration):
+def specific_force(coefficients: Array, duration: float) -> Array:
     """f = a + g e3 of a segment, the thrust per mass: shape (3, 15) -> Bernstein coefficients of degree 12, (3, 13) [m/s^2]. [defines M:eq9]"""
     force = time_derivative(coefficients, 2, duration)
     for k in range(force.shape[1]):
@@ -38,7 +39,7 @@ def specific_force(coefficients, duration):
 
 
 @compiled
-def _enclose(coefficients, limit, attained_elsewhere):
+def _enclose(coefficients: Array, limit: float, attained_elsewhere: float) -> tuple[float, float, float]:
     """Attained maximum, proved maximum and place, as far as they exceed the limit or what another segment attains.
 
     Finer where the limit lies between the two.
@@ -51,7 +52,7 @@ def _enclose(coefficients, limit, attained_elsewhere):
 
 
 @compiled
-def thrust_extrema(coefficients, durations, low, high):
+def thrust_extrema(coefficients: Array, durations: Array, low: float, high: float) -> tuple[Array, float, float]:
     """Least and greatest specific thrust of each segment. [M:eq9] [defines M:eq16]
 
     A segment's extrema are enclosed closely where they break a limit or are those of the whole plan; other segments have
@@ -88,7 +89,7 @@ def thrust_extrema(coefficients, durations, low, high):
 
 
 @compiled
-def _values(coefficients, basis):
+def _values(coefficients: Array, basis: Array) -> Array:
     """Values of several polynomials at the places of a table, shapes (r, n + 1), (n + 1, places) -> (r, places)."""
     out = np.zeros((coefficients.shape[0], basis.shape[1]))
     for d in range(coefficients.shape[0]):
@@ -99,7 +100,8 @@ def _values(coefficients, basis):
 
 
 @compiled
-def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
+def _sample(distance: Array, force: Array, jerk: Array, yaw: Array, yaw_rate: Array, s3: Array, extension: float
+            ) -> tuple[float, float, float, float]:
     """Least clearance and greatest body rate over fixed places of a segment: (gap, place, rate, place).
 
     Arrays are Bernstein coefficients with one row for each polynomial.
@@ -124,7 +126,7 @@ def _sample(distance, force, jerk, yaw, yaw_rate, s3, extension):
 
 
 @compiled
-def _widen(out, attained, row, column, value, proved, time):
+def _widen(out: Array, attained: Array, row: int, column: int, value: float, proved: float, time: float) -> None:
     """Take up a segment's attained and proved extremum; column MINIMUM or MAXIMUM."""
     sign = 1.0 if column == MAXIMUM else -1.0
     if sign * proved > sign * out[row, column]:
@@ -134,7 +136,7 @@ def _widen(out, attained, row, column, value, proved, time):
 
 
 @compiled
-def _within(vector, limit):
+def _within(vector: Array, limit: float) -> bool:
     """Whether a polynomial vector is shorter than a limit because its Bernstein coefficients are."""
     for k in range(vector.shape[1]):
         if vector[0, k] ** 2 + vector[1, k] ** 2 + vector[2, k] ** 2 > limit * limit:
@@ -143,15 +145,16 @@ def _within(vector, limit):
 
 
 @compiled
-def _doubt(where, row, segment, place):
+def _doubt(where: Array, row: int, segment: int, place: float) -> None:
     """Note the first place at which a quantity fails."""
     if where[row, 0] < 0.0:
         where[row, 0], where[row, 1] = segment, place
 
 
 @compiled
-def check(coefficients, yaw, durations, thrust, p_S, v_S, s3, low_thrust, high_thrust, speed, low_height, high_height,
-          extension, clearance, rate):
+def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S: Array, v_S: Array, s3: Array,
+          low_thrust: float, high_thrust: float, speed: float, low_height: float, high_height: float, extension: float,
+          clearance: float, rate: float) -> tuple[Array, Array, bool]:
     """Prove every limit of a plan, or find where it fails.
 
     Args:

@@ -17,9 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.arrays import Array, Flags, Indices
 from perch_core.jit import compiled
 from perch_planner.bounds import bernstein_row
 from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, HERMITE, TABLES
+
+ProgramArrays = tuple[Array, Indices, float, Array, Array]
+"""Fields of `ReducedProgram`."""
 
 _POSITIONS = TABLES[0].T.copy()
 
@@ -35,15 +39,15 @@ class ReducedProgram(NamedTuple):
         centre: all unknowns at the unconstrained optimum, shape (n, 3).
     """
 
-    durations: np.ndarray
-    first: np.ndarray
+    durations: Array
+    first: Indices
     time_unit: float
-    spread: np.ndarray
-    centre: np.ndarray
+    spread: Array
+    centre: Array
 
 
 @compiled
-def _first_bubbles(bubbles):
+def _first_bubbles(bubbles: Flags) -> tuple[Indices, int]:
     """Index of the first bubble of each segment among all unknowns, -1 where it has none; number of unknowns."""
     out = np.empty(len(bubbles), np.int64)
     n = 4 * (len(bubbles) + 1)
@@ -56,13 +60,13 @@ def _first_bubbles(bubbles):
 
 
 @compiled
-def index(segment, k, first):
+def index(segment: int, k: int, first: int) -> int:
     """Index of function k of a segment among all unknowns; `first` is that of its first bubble."""
     return 4 * segment + k if k < HERMITE else first + k - HERMITE
 
 
 @compiled
-def _scales(ratio):
+def _scales(ratio: float) -> Array:
     """Factors that turn unknowns (in time units) into coefficients of the functions of a segment, shape (15,)."""
     out = np.ones(FUNCTIONS)
     for k in range(HERMITE):
@@ -71,7 +75,7 @@ def _scales(ratio):
 
 
 @compiled
-def functional(duration, unit, s, order):
+def functional(duration: float, unit: float, s: float, order: int) -> Array:
     """Factors of the segment's functions in the order-th time derivative at place s, shape (15,). [defines M:eq6]"""
     row, scale = bernstein_row(DEGREE - order, s), _scales(duration / unit)
     out = np.zeros(FUNCTIONS)
@@ -85,7 +89,7 @@ def functional(duration, unit, s, order):
 
 
 @compiled
-def _roles(given, first):
+def _roles(given: Flags, first: Indices) -> tuple[Indices, Indices]:
     """For each unknown: 0 given, 1 free, 2 dependent; and the dependent unknown of each inner knot.
 
     Dependent is the knot's highest derivative that is free, or else a bubble beside it.
@@ -108,7 +112,7 @@ def _roles(given, first):
 
 
 @compiled
-def _eliminate(durations, unit, first, role, dependent, particular):
+def _eliminate(durations: Array, unit: float, first: Indices, role: Indices, dependent: Indices, particular: Array) -> Array:
     """All unknowns from the free ones, shape (n, m), with a continuous fourth derivative; completes `particular`. [defines M:eq7]"""
     f, n = len(durations), len(role)
     column = np.full(n, -1)
@@ -149,7 +153,7 @@ def _eliminate(durations, unit, first, role, dependent, particular):
 
 
 @compiled
-def _weigh(durations, unit, first, role, basis, gram, cost_order):
+def _weigh(durations: Array, unit: float, first: Indices, role: Indices, basis: Array, gram: Array, cost_order: int) -> Array:
     """Cost matrix of all unknowns times the basis, segment by segment, shape (n, m). [M:eq5]"""
     n, m = basis.shape
     column = np.cumsum(role == 1) - 1
@@ -173,7 +177,7 @@ def _weigh(durations, unit, first, role, basis, gram, cost_order):
 
 
 @compiled
-def _reduced_cost(weighted, basis, role):
+def _reduced_cost(weighted: Array, basis: Array, role: Indices) -> Array:
     """Cost Z' C Z of the free unknowns themselves, and of those that depend on them, shape (m, m). [defines M:eq4]"""
     m = basis.shape[1]
     out = np.empty((m, m))
@@ -192,7 +196,7 @@ def _reduced_cost(weighted, basis, role):
 
 
 @compiled
-def assemble(durations, given, values, bubbles, gram, cost_order):
+def assemble(durations: Array, given: Flags, values: Array, bubbles: Flags, gram: Array, cost_order: int) -> ProgramArrays:
     """Eliminate the equalities and whiten the cost. [M:eq4-8]
 
     Args:
@@ -248,8 +252,9 @@ def assemble(durations, given, values, bubbles, gram, cost_order):
 
 
 @compiled
-def coefficients(durations, first, unit, spread, centre, w):
-    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; arguments before it: fields of `ReducedProgram`."""
+def coefficients(program: ProgramArrays, w: Array) -> Array:
+    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; program: fields of `ReducedProgram`."""
+    durations, first, unit, spread, centre = program
     m, n = spread.shape
     unknowns = np.empty((3, n))
     for d in range(3):

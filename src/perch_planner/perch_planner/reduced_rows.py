@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
-from perch_planner.reduced_qp import functional, index
+from perch_planner.linear_bounds import BoundArrays
+from perch_planner.reduced_qp import ProgramArrays, functional, index
 from perch_planner.reference_element import FUNCTIONS, HERMITE
+
+Rows = tuple[Array, Array, Array]
+"""Rows and their lower and upper bounds."""
 
 
 @compiled
-def _place(local, segment, first, wide, centre, column, constant):
+def _place(local: Array, segment: int, first: int, wide: Array, centre: Array, column: Array, constant: Array) -> None:
     """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum; wide: `spread` transposed."""
     count = FUNCTIONS if first >= 0 else HERMITE
     for d in range(3):
@@ -30,7 +35,7 @@ def _place(local, segment, first, wide, centre, column, constant):
 
 
 @compiled
-def _normalise(rows, lower, upper):
+def _normalise(rows: Array, lower: Array, upper: Array) -> None:
     """Scale rows and their bounds to unit length."""
     for r in range(len(rows)):
         squared = 0.0
@@ -46,8 +51,10 @@ def _normalise(rows, lower, upper):
 
 
 @compiled
-def rows_of(durations, first, unit, spread, centre, owner, segments, places, orders, direction, lower, upper):
-    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); arguments: fields of `ReducedProgram` and `Bounds`."""
+def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
+    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); fields of `ReducedProgram` and `Bounds`."""
+    durations, first, unit, spread, centre = program
+    owner, segments, places, orders, direction, lower, upper = bounds
     m, wide = len(spread), spread.T.copy()
     rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
     column, constant = np.empty(m), np.empty(3)
@@ -66,7 +73,6 @@ def rows_of(durations, first, unit, spread, centre, owner, segments, places, ord
 
 
 @compiled
-def appended(rows, lower, upper, program, bounds):
-    """The rows of further bounds below those there are; fields of `ReducedProgram` and `Bounds`."""
-    more, low, high = rows_of(*program, *bounds)
-    return np.concatenate((rows, more)), np.concatenate((lower, low)), np.concatenate((upper, high))
+def stacked(above: Rows, below: Rows) -> Rows:
+    """Rows of one program, one set below the other."""
+    return (np.concatenate((above[0], below[0])), np.concatenate((above[1], below[1])), np.concatenate((above[2], below[2])))

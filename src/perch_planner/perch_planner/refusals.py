@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import hypot, sqrt
 
+from perch_core.arrays import Array
 from perch_core.errors import PlanningRefusal
 from perch_core.jit import compiled
 from perch_core.values import Certificate
@@ -29,13 +31,14 @@ class PerchRefusal(PlanningRefusal):
     """
 
     def __init__(self, code: str, constraint: str, margin: float, message: str, certificates: tuple[Certificate, ...] = (),
-                 iterations: int = 0, relaxed: dict[str, float | str] | None = None) -> None:
-        self.certificates, self.iterations, self.relaxed = certificates, iterations, relaxed or {}
+                 iterations: int = 0, relaxed: Mapping[str, float | str] | None = None) -> None:
+        self.certificates, self.iterations, self.relaxed = certificates, iterations, dict(relaxed or {})
         super().__init__(code, constraint, margin, message)
 
 
 @compiled
-def _figures(points, a, R_WS, extension, offset, moving, low_height, high_height, clearance):
+def _figures(points: Array, a: Array, R_WS: Array, extension: float, offset: float, moving: bool, low_height: float,
+             high_height: float, clearance: float) -> tuple[float, float, float, int, float, int, float]:
     """What is known of a plan from its start and its points.
 
     Args:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from math import ceil, floor, inf, log10, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -119,7 +119,7 @@ class _Trials:
         self._search, self._asked, self._left = search, asked, PROGRAMS
         self._tried: dict[frozenset[str], dict[str, float] | None] = {}
 
-    def _used(self, changes: dict[str, float]) -> dict[str, float] | None:
+    def _used(self, changes: dict[str, Any]) -> dict[str, float] | None:
         """What the plan under changed settings takes of each limit, None where none is soon found."""
         if not changes or self._left <= 0:
             return None

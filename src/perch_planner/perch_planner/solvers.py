@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 
 FEASIBILITY = 1e-6
@@ -31,15 +32,15 @@ class Solution(NamedTuple):
         dual: multipliers of the rows, shape (r,), where the next program may start; None: the solver gives none.
     """
 
-    w: np.ndarray
+    w: Array
     solved: bool
     residual: float
     status: str
-    dual: np.ndarray | None = None
+    dual: Array | None = None
 
 
 @compiled
-def _residual(rows, lower, upper, w):
+def _residual(rows: Array, lower: Array, upper: Array, w: Array) -> float:
     """Largest violation of a row; infinite where the answer is not finite."""
     value = rows @ w
     worst = 0.0
@@ -52,14 +53,14 @@ def _residual(rows, lower, upper, w):
 
 
 @compiled
-def _contains_zero(lower, upper):
+def _contains_zero(lower: Array, upper: Array) -> bool:
     for k in range(len(lower)):
         if lower[k] > 0.0 or upper[k] < 0.0:
             return False
     return True
 
 
-def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, dual: np.ndarray | None) -> tuple[np.ndarray, str, np.ndarray]:
+def _daqp(rows: Array, lower: Array, upper: Array, dual: Array | None) -> tuple[Array, str, Array]:
     import daqp
 
     # Without a cost matrix and vector DAQP takes the unit matrix and zero.
@@ -72,7 +73,7 @@ def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, dual: np.ndarr
 _COARSE, _FINE = (1e-3, 1e-4, 1e-5, 1e-6), 1e-8  # tolerances of OSQP, one after the other
 
 
-def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, _: np.ndarray | None) -> tuple[np.ndarray, str, None]:
+def _osqp(rows: Array, lower: Array, upper: Array, _: Array | None) -> tuple[Array, str, None]:
     import osqp
     from scipy import sparse
 
@@ -90,10 +91,10 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, _: np.ndarray 
     return np.asarray(result.x, float), str(result.info.status), None
 
 
-SOLVERS: dict[str, Callable] = {"daqp": _daqp, "osqp": _osqp}
+SOLVERS: dict[str, Callable[[Array, Array, Array, Array | None], tuple[Array, str, Array | None]]] = {"daqp": _daqp, "osqp": _osqp}
 
 
-def least_norm(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: str = "daqp", dual: np.ndarray | None = None) -> Solution:
+def least_norm(rows: Array, lower: Array, upper: Array, solver: str = "daqp", dual: Array | None = None) -> Solution:
     """The shortest w with `lower <= rows @ w <= upper`. [defines M:eq8, in whitened coordinates]
 
     Args:

@@ -14,19 +14,22 @@ from math import cos, sin, sqrt
 
 from perch_core.jit import compiled
 
+Taylor = tuple[float, float, float, float]
+Vector = tuple[Taylor, Taylor, Taylor]
+
 ROUNDING = 1e-9
 ZERO = (0.0, 0.0, 0.0, 0.0)
 
 
 @compiled
-def sizes(a):
+def sizes(a: Taylor) -> tuple[float, float, float]:
     """Greatest absolute values of a function and of its first two derivatives."""
     bend = abs(a[2]) + a[3]
     return abs(a[0]) + abs(a[1]) + 0.5 * bend, abs(a[1]) + bend, bend
 
 
 @compiled
-def greatest(a):
+def greatest(a: Taylor) -> float:
     """An upper bound of the function."""
     bend = a[2] + a[3]
     if bend < -abs(a[1]):
@@ -35,31 +38,31 @@ def greatest(a):
 
 
 @compiled
-def least(a):
+def least(a: Taylor) -> float:
     """A lower bound of the function."""
     return -greatest((-a[0], -a[1], -a[2], a[3]))
 
 
 @compiled
-def add(a, b):
+def add(a: Taylor, b: Taylor) -> Taylor:
     """`a + b`."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
 
 @compiled
-def sub(a, b):
+def sub(a: Taylor, b: Taylor) -> Taylor:
     """`a - b`."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] + b[3]
 
 
 @compiled
-def times(k, a):
+def times(k: float, a: Taylor) -> Taylor:
     """`k a` for a constant."""
     return k * a[0], k * a[1], k * a[2], abs(k) * a[3]
 
 
 @compiled
-def mul(a, b):
+def mul(a: Taylor, b: Taylor) -> Taylor:
     """`a b`; (a b)'' = a'' b + 2 a' b' + a b'', and each of these reaches at most the product of the sizes."""
     a0, a1, a2 = sizes(a)
     b0, b1, b2 = sizes(b)
@@ -69,7 +72,7 @@ def mul(a, b):
 
 
 @compiled
-def chained(value, slope, slope_reach, bend, bend_reach, a):
+def chained(value: float, slope: float, slope_reach: float, bend: float, bend_reach: float, a: Taylor) -> Taylor:
     """g(a) from g, g', g'' at m and how far g' and g'' get from there; g(a)'' = g'' a'^2 + g' a''."""
     _, a1, a2 = sizes(a)
     p, q = bend * a[1] * a[1], slope * a[2]
@@ -78,51 +81,51 @@ def chained(value, slope, slope_reach, bend, bend_reach, a):
 
 
 @compiled
-def inverse_root(a):
+def inverse_root(a: Taylor) -> Taylor:
     """`a^(-1/2)` where `least(a)` is positive; its derivatives are convex or concave, so they change most towards `least(a)`."""
     here, most = 1.0 / sqrt(a[0]), 1.0 / sqrt(least(a))
     return chained(here, -0.5 * here**3, 0.5 * (most**3 - here**3), 0.75 * here**5, 0.75 * (most**5 - here**5), a)
 
 
 @compiled
-def sine(a):
+def sine(a: Taylor) -> Taylor:
     """`sin a`."""
     reach = sizes(a)[0] - abs(a[0])  # no derivative of a sine changes by more
     return chained(sin(a[0]), cos(a[0]), reach, -sin(a[0]), reach, a)
 
 
 @compiled
-def cosine(a):
+def cosine(a: Taylor) -> Taylor:
     """`cos a`."""
     reach = sizes(a)[0] - abs(a[0])
     return chained(cos(a[0]), -sin(a[0]), reach, -cos(a[0]), reach, a)
 
 
 @compiled
-def vector_add(a, b):
+def vector_add(a: Vector, b: Vector) -> Vector:
     """`a + b` of vectors."""
     return add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])
 
 
 @compiled
-def axpy(k, a, b):
+def axpy(k: Taylor, a: Vector, b: Vector) -> Vector:
     """`k a + b` for a number k and vectors."""
     return add(mul(k, a[0]), b[0]), add(mul(k, a[1]), b[1]), add(mul(k, a[2]), b[2])
 
 
 @compiled
-def scale(k, a):
+def scale(k: Taylor, a: Vector) -> Vector:
     """`k a` for a number k and a vector."""
     return mul(k, a[0]), mul(k, a[1]), mul(k, a[2])
 
 
 @compiled
-def dot(a, b):
+def dot(a: Vector, b: Vector) -> Taylor:
     """Scalar product."""
     return add(add(mul(a[0], b[0]), mul(a[1], b[1])), mul(a[2], b[2]))
 
 
 @compiled
-def cross(a, b):
+def cross(a: Vector, b: Vector) -> Vector:
     """Vector product."""
     return (sub(mul(a[1], b[2]), mul(a[2], b[1])), sub(mul(a[2], b[0]), mul(a[0], b[2])), sub(mul(a[0], b[1]), mul(a[1], b[0])))

@@ -6,6 +6,7 @@ from math import sqrt
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.problem import PerchProblem, PerchSettings
@@ -21,21 +22,22 @@ SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 
 
 @compiled
-def _distance(a, b):
-    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+def _distance(a: Array, b: Array) -> float:
+    return sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 @compiled
-def _turn(points, legs, i):
+def _turn(points: Array, legs: Array, i: int) -> float:
     """Length of the difference between the directions of legs i and i + 1."""
     squared = 0.0
     for d in range(3):
         squared += ((points[i + 2, d] - points[i + 1, d]) / legs[i + 1] - (points[i + 1, d] - points[i, d]) / legs[i]) ** 2
-    return np.sqrt(squared)
+    return sqrt(squared)
 
 
 @compiled
-def _along_waypoints(points, v_start, v_end, speed, acceleration, turn_acceleration, last_least):
+def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, acceleration: float, turn_acceleration: float,
+                     last_least: float) -> Array:
     """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns, and longer by
     the time that the difference of the end velocities takes.
 
@@ -95,7 +97,7 @@ def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndar
 
 
 @compiled
-def split_last(durations):
+def split_last(durations: Array) -> Array:
     """Divide a long last segment by knots at which nothing is given.
 
     One polynomial over a long way is too stiff for the rotation at its end: without the knot no plan keeps a 0.25 kg
@@ -118,7 +120,7 @@ def split_last(durations):
 
 
 @compiled
-def split_finely(durations, pieces):
+def split_finely(durations: Array, pieces: Array) -> Array:
     """Divide the last segment so that it ends with given pieces [s], at whose ends nothing is given.
 
     A polynomial that turns the vehicle for 0.45 s asks the rotors for less than they have nearly everywhere, to stay within what they

@@ -250,7 +250,7 @@ STATE = {name: LIMITS[PerchPlanRequest][name] for name in ("p", "v", "a", "j", "
 CURRENT = {"durations": Limit(1e-3, PLAN_LONGEST, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX),
            "coefficients": _coefficients(PLAN_SEGMENTS_MAX)}
 """Of `PerchPlanRequest.current`, whose state at the start is limited as one that is given."""
-POSE = {"position": POSITION, "orientation": Unit(1e-2)}
+POSE: dict[str, Limit | Unit] = {"position": POSITION, "orientation": Unit(1e-2)}
 """Of `PowerlinePlanRequest.perch_pose`."""
 
 

@@ -97,11 +97,11 @@ class PowerlinePlanner:
         Raises:
             PlanningRefusal: bad request, or no trajectory within the limits was found.
         """
-        check_request(request, self.vehicle, self.settings)
+        pose = check_request(request, self.vehicle, self.settings)
         hover = request.start[P] if request.hover is None else np.asarray(request.hover, float)
-        if request.recovery_only:
+        if pose is None:
             return PowerlinePlan(None, self._fly(self._recovery(request, request.start, hover)))
-        perch = self._fly(self._perch(request))
+        perch = self._fly(self._perch(request, pose))
         if not request.with_recovery:
             return PowerlinePlan(perch, None)
         try:
@@ -109,8 +109,8 @@ class PowerlinePlanner:
         except PlanningRefusal as refusal:
             return PowerlinePlan(perch, None, str(refusal))
 
-    def _perch(self, request: PowerlineRequest) -> _Task:
-        s, pose, target = self.settings, request.perch, request.target()
+    def _perch(self, request: PowerlineRequest, pose: PerchPose) -> _Task:
+        s, target = self.settings, request.target()
         turn = aside = 0.0
         if request.perception:
             q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)

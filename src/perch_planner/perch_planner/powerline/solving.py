@@ -11,6 +11,7 @@ constraints), so that it is stopped there, and the second phase ends what it beg
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from perch_planner.powerline.stage_functions import StageFunctions, StageModel, 
 
 # Phase: tolerance, first barrier parameter, push off active bounds. The nearer the guess, the smaller the latter two.
 # "sight" is the first phase of a problem with perception costs.
-PHASES = {
+PHASES: dict[str, dict[str, Any]] = {
     "first": {"tolerance": 1e-2},
     "sight": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
     "second": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
@@ -49,7 +50,7 @@ class Solver:
     model: RotorModel = field(init=False)
     compiled: bool = field(init=False)
     _stages: StageFunctions = field(init=False, repr=False)
-    _problems: dict = field(init=False, repr=False, default_factory=dict)
+    _problems: dict[tuple[Structure, str], Problem] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.model = RotorModel.of(self.vehicle, self.gravity)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from typing import NoReturn
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance, segment_distance
 from perch_core.rotor_model import P, Q, THRUST, V, W
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_planner.powerline.request import PowerlineRequest
+from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 
 END_TRIM = 0.1  # neighbours of one cable touch at their ends: that much of each end does not count as crossing [m]
@@ -19,42 +20,40 @@ CROSSING_COSINE = 0.966  # 15 deg: two estimates of one cable may overlap, lines
 SPEED_MAX = 10.0  # no start of a perch is faster [m/s]
 
 
-def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> None:
-    """Refuse a request that no plan can answer.
+def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> PerchPose | None:
+    """Refuse a request that no plan can answer; return where to perch, None for a recovery alone.
 
     Raises:
         PlanningRefusal: code bad_input, empty_map, start_invalid or perch_in_collision; the message names the value.
     """
-    _finite(request)
+    if np.shape(request.start) != (17,):
+        _refuse("bad_input", "start state", -1.0, f"start state has shape {np.shape(request.start)}, needs (17,)")
+    _finite({"start state": request.start})
+    norm = float(np.linalg.norm(request.start[Q]))
+    if abs(norm - 1) > 1e-2:
+        _refuse("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
     if request.recovery_only:
         _start(request, vehicle, settings, touching_allowed=True)
-        return
-    target = request.target()
+        return None
+    pose, target = request.perch, request.target()
+    if pose is None:
+        _refuse("bad_input", "perch pose", -1.0, "no perch pose is given")
+    _finite({"perch position": pose.p_WB, "perch direction": pose.s3_W, "end velocity": pose.v_W})
     _crossing(request.lines)
     _start(request, vehicle, settings)
-    _perch(request, target, vehicle, settings)
-    _ahead(request, target, vehicle, settings)
+    _perch(request, pose, target, vehicle, settings)
+    _ahead(request, pose, target, vehicle, settings)
+    return pose
 
 
-def _refuse(code: str, constraint: str, margin: float, message: str) -> None:
+def _refuse(code: str, constraint: str, margin: float, message: str) -> NoReturn:
     raise PlanningRefusal(code, constraint, margin, message)
 
 
-def _finite(request: PowerlineRequest) -> None:
-    start = np.asarray(request.start, float)
-    if start.shape != (17,):
-        _refuse("bad_input", "start state", -1.0, f"start state has shape {start.shape}, needs (17,)")
-    values = {"start state": start}
-    if request.perch is not None:
-        values |= {"perch position": request.perch.p_WB, "perch direction": request.perch.s3_W, "end velocity": request.perch.v_W}
-    elif not request.recovery_only:
-        _refuse("bad_input", "perch pose", -1.0, "no perch pose is given")
+def _finite(values: dict[str, np.ndarray]) -> None:
     for name, value in values.items():
         if not np.all(np.isfinite(value)):
             _refuse("bad_input", name, -1.0, f"{name} {np.asarray(value).tolist()} is not finite")
-    norm = float(np.linalg.norm(start[Q]))
-    if abs(norm - 1) > 1e-2:
-        _refuse("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
 
 
 def _crossing(lines: tuple[Segment, ...]) -> None:
@@ -93,8 +92,7 @@ def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSetti
                     f"line {line.id} is nearer than the body at the start: scaled distance {1 + clearance:.2f} < 1; move away first")
 
 
-def _perch(request: PowerlineRequest, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
-    perch = request.perch
+def _perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     if abs(np.linalg.norm(perch.s3_W) - 1) > 1e-3:
         _refuse("bad_input", "perch direction", -1.0, "the wanted direction of b3 is not a unit vector")
     if perch.p_WB[2] < settings.height_min:
@@ -123,12 +121,12 @@ def _reach(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSetti
     return float(np.linalg.norm(request.start[V])) * duration + 0.5 * most * duration**2
 
 
-def _ahead(request: PowerlineRequest, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     mount = vehicle.mounts.get(settings.camera)
     if mount is None:
         _refuse("bad_input", "camera", -1.0, f"vehicle {vehicle.name} has no camera {settings.camera!r}")
     axis_W = so3.quat_to_matrix(request.start[Q]) @ mount.R_BC[:, 2]
-    way = target.closest_point(request.perch.p_WB) - request.start[P]
+    way = target.closest_point(perch.p_WB) - request.start[P]
     bearing = float(np.degrees(so3.angle_between(axis_W, way)))
     if bearing > settings.bearing_max_deg:
         _refuse("bad_input", "line ahead", settings.bearing_max_deg - bearing,
