@@ -43,7 +43,7 @@ def exit_code(work: Callable[[], int], *mistakes: type[Exception], interrupted: 
             raise
         print(f"error: {error}", file=sys.stderr)
     except KeyboardInterrupt:
-        print(f"\n{interrupted}", file=sys.stderr)
+        print(interrupted, file=sys.stderr)
         return 130
     return 2
 
