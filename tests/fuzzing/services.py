@@ -23,7 +23,7 @@ from perch_core.component import Component
 from perch_core.errors import ConfigError, PerchError
 from perch_core.isolated import IsolatedRunner
 from perch_core.ros import topics
-from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.trajectory import FlatSample, FlatTrajectory, SampledTrajectory
 from perch_core.values import (
     Ask, ChooseLaw, MappedPowerline, PerchGoal, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, seconds)
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
@@ -36,11 +36,12 @@ from perch_eval.in_process.parameters import nested
 
 PATIENCE = 15.0   # for an answer: the longest deadline of a planner, and some [s]
 NO_CERTIFICATE = 1.02  # rotor thrusts of a flat trajectory are looked at as the collective thrust alone
-TASKS = {"plan_perch": "perching_planner", "plan_powerline": "powerline_planner", "goal": "mission", "set_controller": "controller",
-         "parameters": "controller", "abort": "controller", "depart": "mission"}
-SHARES = ("plan_perch",) * 12 + ("plan_powerline",) + ("goal",) * 6 + ("set_controller",) * 2 + ("parameters",) * 6 + ("abort", "depart")
-FREE = {"plan_perch": ("current", "start_time"), "plan_powerline": ("start_time", "lines.0.covariance", "lines.0.direction_sigma",
-                                                                              "lines.0.observations", "perch_pose")}
+TASKS = {"plan_perch": "perching_planner", "plan_way_out": "perching_planner", "plan_powerline": "powerline_planner", "goal": "mission",
+         "set_controller": "controller", "parameters": "controller", "abort": "controller", "depart": "mission"}
+SHARES = (*("plan_perch",) * 12, *("plan_way_out",) * 6, "plan_powerline", *("goal",) * 6, *("set_controller",) * 2, *("parameters",) * 6,
+          "abort", "depart")
+FREE = {"plan_perch": ("current", "start_time"), "plan_way_out": ("current", "start_time"),
+        "plan_powerline": ("start_time", "lines.0.covariance", "lines.0.direction_sigma", "lines.0.observations", "perch_pose")}
 """Task -> fields that mean nothing in the requests here; a planner has no clock: any time may be planned for, and the controller
 refuses to fly what does not begin now."""
 
@@ -49,10 +50,11 @@ refuses to fly what does not begin now."""
 def good(task: str) -> Any:
     """A request that makes sense, as a message."""
     row = topics.service(task)
-    if task == "plan_perch":
+    if task in ("plan_perch", "plan_way_out"):
         tilt = np.array([0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5)])
+        motion = {"v": np.array([1.0, 0.0, 0.3]), "a": np.array([1.0, 0.0, 0.0])} if task == "plan_way_out" else {}
         return row.request_message(PerchPlanRequest(start=10**9, p=np.array([0.0, 0.0, 1.2]), p_WS=np.array([1.7, 0.0, 1.2]), q_WS=tilt,
-                                                    waypoints=np.zeros((0, 3))))
+                                                    waypoints=np.zeros((0, 3)), **motion))
     wires = tuple(MappedPowerline(k, (4.0 + k, -2.0, 4.7), (4.0 + k, 2.0, 4.7), 0.01, 1e-4 * np.eye(3), 0.01, 30) for k in (0, 3))
     return row.request_message(PowerlinePlanRequest(start=10**9, p=np.array([0.0, 0.0, 4.3]), q=np.array([0.0, 0.0, 0.0, 1.0]), lines=wires,
                                                     perch_point=np.array([4.0, 0.0, 4.7]), perch_pitch=math.radians(20.0), deadline=10.0))
@@ -75,13 +77,18 @@ def judge_plan(task: str, request: Any, answer: Any, vehicle: Vehicle) -> None:
         raise Nonsense(f"starts at {answer.trajectory.start_time} s, not at {seconds(request.start)} s")
     for problem in sense.nonsense(replace(answer.trajectory, start_time=0.0), math.inf, "trajectory"):  # a time is as large as the clock's
         raise Nonsense(problem)
-    (_judge_flat if task == "plan_perch" else _judge_sampled)(request, answer, vehicle)
+    {"plan_perch": _judge_perch, "plan_way_out": _judge_way_out, "plan_powerline": _judge_sampled}[task](request, answer, vehicle)
     broken = [str(c) for c in answer.certificates if not c.holds]
     if broken:
         raise Nonsense(f"a plan with a broken bound: {broken}")
 
 
-def _judge_flat(request: PerchPlanRequest, answer: PerchPlan, vehicle: Vehicle) -> None:
+def _judge_flat(request: PerchPlanRequest, answer: PerchPlan, vehicle: Vehicle) -> FlatSample:
+    """Make sure of the thrust and of the start.
+
+    Returns:
+        The samples that were looked at.
+    """
     t: FlatTrajectory = answer.trajectory
     x = t.sample_many(np.linspace(0.0, t.duration, 200))
     thrust = vehicle.mass * np.linalg.norm(x.a + [0.0, 0.0, GRAVITY], axis=1)
@@ -92,6 +99,21 @@ def _judge_flat(request: PerchPlanRequest, answer: PerchPlan, vehicle: Vehicle) 
     if request.current is None:
         _near("start position", x.p[0], request.p, 1e-3), _near("start velocity", x.v[0], request.v, 1e-3)
         _near("start acceleration", x.a[0], request.a, 1e-2)
+    return x
+
+
+def _judge_way_out(request: PerchPlanRequest, answer: PerchPlan, vehicle: Vehicle) -> None:
+    x = _judge_flat(request, answer, vehicle)
+    _near("velocity of the hover", x.v[-1], np.zeros(3), 1e-3), _near("acceleration of the hover", x.a[-1], np.zeros(3), 1e-2)
+    surface = np.asarray(request.p_WS) + np.linspace(0.0, answer.trajectory.duration, 200)[:, None] * np.asarray(request.target_velocity)
+    away = (x.p - surface) @ so3.quat_rotate(request.q_WS, np.array([0.0, 0.0, 1.0]))
+    if away[-1] < 0.2 or away.min() < min(away[0], 0.0) - 1e-3:
+        raise Nonsense(f"a way out that ends {away[-1]:.3f} m before the surface and comes as near as {away.min():.3f} m")
+
+
+def _judge_perch(request: PerchPlanRequest, answer: PerchPlan, vehicle: Vehicle) -> None:
+    x = _judge_flat(request, answer, vehicle)
+    t: FlatTrajectory = answer.trajectory
     s3 = so3.quat_rotate(request.q_WS, np.array([0.0, 0.0, 1.0]))
     target = np.asarray(request.p_WS) + t.duration * np.asarray(request.target_velocity)
     away = float((x.p[-1] - target) @ s3)
@@ -136,7 +158,7 @@ class Planners:
         Raises:
             Nonsense: no answer in time, or one that makes no sense.
         """
-        flight = "surface" if task == "plan_perch" else "line"
+        flight = "line" if task == "plan_powerline" else "surface"
         if task not in self._of:
             one = component(flight, TASKS[task])
             runner = IsolatedRunner(one.preload())
@@ -315,7 +337,7 @@ def ask(planners: Planners | None, task: str, seed: int, ways: list[Way] | None 
     """
     rng = random.Random(seed)
     try:
-        if task in ("plan_perch", "plan_powerline"):
+        if task.startswith("plan"):
             return planners.ask(task, drawn(task, rng) if ways is None else ways)
         return ask_mission(rng) if task in ("goal", "depart") else ask_controller(task, rng)
     except Nonsense:

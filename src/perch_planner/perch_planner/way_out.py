@@ -24,7 +24,7 @@ from perch_planner.search import Outcome, Search
 
 DURATIONS = (1.2, 0.8, 1.8)  # [s]
 TURN = 0.3                   # of the first piece, where the vehicle turns back [s]
-AWAY = 0.5                   # least distance of the hover from the surface's plane [m]
+AWAY = 0.5                   # least distance of the hover from the surface's plane when it is reached [m]
 _CODES = {"body_rate": refusals.BODY_RATE, "thrust": refusals.THRUST_FLOOR, "rotor_thrust": refusals.THRUST_FLOOR}
 
 
@@ -46,7 +46,8 @@ def hover_place(problem: PerchProblem, limits: Limits, duration: float) -> np.nd
     """
     start, surface = problem.start, problem.surface
     place = start.p + duration * (start.v / 2.0 + duration * (start.a / 10.0 + duration * start.j / 120.0))
-    place = place + max(AWAY - float((place - surface.p_WS) @ surface.normal), 0.0) * surface.normal
+    away = float((place - surface.p_WS - duration * problem.target_velocity) @ surface.normal)
+    place = place + max(AWAY - away, 0.0) * surface.normal
     place[2] = min(max(place[2], limits.height[0] + limits.extension), limits.height[1])
     return place
 
