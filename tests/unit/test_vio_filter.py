@@ -270,7 +270,7 @@ def test_a_camera_sees_no_scale_of_its_path():
 
     def bearings(scale):
         out = []
-        for c, k in zip(s.clones, s.clone_at(np.arange(len(s.clones)))):
+        for c, k in zip(s.clones, map(s.clone_at, range(len(s.clones)))):
             X_C = ((X + scale * N[s.landmark_start :].reshape(-1, 3) - c.p_WB - scale * N[k + 3 : k + 6]) @ c.R_WB - s.p_BC) @ s.R_BC
             out.append(X_C / np.linalg.norm(X_C, axis=1, keepdims=True))
         return np.array(out)

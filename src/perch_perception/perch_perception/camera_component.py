@@ -28,11 +28,16 @@ FUTURE = 0.5        # an image stamped this much ahead of the odometry cannot be
 class CameraConfig(Protocol):
     """What the parameters of a camera's component hold."""
 
-    vehicle: str
-    sensors: str
-    camera: str
-    images: str
-    extrinsics: str
+    @property
+    def vehicle(self) -> str: ...
+    @property
+    def sensors(self) -> str: ...
+    @property
+    def camera(self) -> str: ...
+    @property
+    def images(self) -> str: ...
+    @property
+    def extrinsics(self) -> str: ...
 
 
 def images_parameter() -> str:
@@ -102,13 +107,13 @@ class CameraComponent(Component[C], ABC):
         if self.config.sensors:
             model = model._replace(camera=self.mounted.nominal.camera)
         if self.mounted.take_model(model):
-            self.use_camera(self.mounted.mount)
+            self.use_camera(self.mounted.known)
         self.advance()
 
     def on_transform(self, transform: Transform) -> None:
         """Where a frame, perhaps the camera's, is in another."""
         if self.mounted.take_transform(transform):
-            self.use_camera(self.mounted.mount)
+            self.use_camera(self.mounted.known)
         self.advance()
 
     def on_image(self, image: CameraImage) -> None:

@@ -44,9 +44,10 @@ class ImuIntake:
         if self._R_BI is not None:
             sample = _turned(sample, self._R_BI)
         elif sample.frame not in AXES_OF_B:
-            sample = self._turned(sample)
-            if sample is None:
+            R_BI = self._axes(sample.frame)
+            if R_BI is None:
                 return None
+            sample = _turned(sample, R_BI)
         verdict = self._guard.judge(sample.stamp)
         if verdict is StampVerdict.GOOD:
             return sample
@@ -57,16 +58,16 @@ class ImuIntake:
         self.restarted = True
         return sample
 
-    def _turned(self, sample: ImuSample) -> ImuSample | None:
-        R_BI = self._turns.get(sample.frame)
-        if R_BI is None:
-            place = self._transforms.pose(sample.frame)
+    def _axes(self, frame: str) -> np.ndarray | None:
+        """R_BI of a frame, shape (3, 3); None where it is not known."""
+        if frame not in self._turns:
+            place = self._transforms.pose(frame)
             if place is None:
-                self._warn(f"imu/data_raw: frame {sample.frame!r} is not imu_link: samples are not used until /tf_static says "
+                self._warn(f"imu/data_raw: frame {frame!r} is not imu_link: samples are not used until /tf_static says "
                            f"where it is in {BASE}", 1.0)
                 return None
-            self._turns[sample.frame] = R_BI = place[1]
-        return _turned(sample, R_BI)
+            self._turns[frame] = place[1]
+        return self._turns[frame]
 
 
 def _turned(sample: ImuSample, R_BI: np.ndarray) -> ImuSample:

@@ -27,13 +27,20 @@ class MountedCamera:
     """
 
     def __init__(self, nominal: CameraMount, extrinsics: str, warn: Callable[[str, float], None]) -> None:
-        self.nominal, self.mount = nominal, None
+        self.nominal = nominal
+        self.mount: CameraMount | None = None
         self._by_transforms, self._warn = extrinsics == "tf", warn
         self._transforms = StaticTransforms()
         self._camera: Camera | None = None
         self._frame, self._topic = "", f"camera_{nominal.name}/camera_info"
         self._other: Camera | None = None
         self._others = 0
+
+    @property
+    def known(self) -> CameraMount:
+        """`mount` where it is known: no image is used before."""
+        assert self.mount is not None
+        return self.mount
 
     @property
     def missing(self) -> str:
@@ -75,14 +82,15 @@ class MountedCamera:
         return True
 
     def _place(self) -> bool:
-        mount = self._mount()
-        changed = mount is not None and (self.mount is None or mount.camera != self.mount.camera or not (
-            np.array_equal(mount.p_BC, self.mount.p_BC) and np.array_equal(mount.R_BC, self.mount.R_BC)))
+        mount, last = self._mount(), self.mount
+        changed = mount is not None and (last is None or mount.camera != last.camera or not (
+            np.array_equal(mount.p_BC, last.p_BC) and np.array_equal(mount.R_BC, last.R_BC)))
         if changed:
             self.mount = mount
         return changed
 
     def _mount(self) -> CameraMount | None:
+        assert self._camera is not None  # nothing is placed before its intrinsics have come
         if not self._by_transforms:
             return self.nominal if self._camera is self.nominal.camera else replace(self.nominal, camera=self._camera)
         place = self._transforms.pose(self._frame)

@@ -52,7 +52,8 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
         self._forget()
 
     def _forget(self) -> None:
-        self._mapper, self._used, self._backdrop = LineMapper(self.config.mapper), -np.inf, None
+        self._mapper, self._used = LineMapper(self.config.mapper), -np.inf
+        self._backdrop: Backdrop | None = None
         if self.mounted.mount is not None:
             self.use_camera(self.mounted.mount)
 
@@ -74,7 +75,7 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
         if exposed - self._used < 1.0 / self.config.rate - 1e-3:
             return
         self._used = exposed
-        mount, problem = self.mounted.mount, ""
+        mount, problem = self.mounted.known, ""
         try:
             body = mapping_pose(self.bodies, exposed, self.config.max_pose_sigma)
             pixels = self._pixels(image, mount.camera)

@@ -19,7 +19,7 @@ from perch_perception.images import ImageError, check_image, mono_image
 from perch_perception.pose_buffer import BodyState, StampError
 from perch_perception.sensor_file import sensors_parameter, tag_sigmas
 from perch_perception.tags import (
-    BoardLocalizer, CalibrationSigma, FusedTarget, Localization, LocalizerConfig, MapPose, fuse, start_fusion, to_map)
+    BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, LocalizerConfig, MapPose, fuse, start_fusion, to_map)
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
@@ -77,7 +77,8 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         super().__init__(replace(config, calibration=tag_sigmas(config.sensors, config.camera, config.calibration)))
         self._board = load_board(config.board)
         self._given, self._localizer = localizer, localizer
-        self._target: FusedTarget | MapPose | None = None
+        self._averaged: MapPose | None = None  # by the first complete image
+        self._fused: FusedTarget | None = None
         self._counts = {"images": 0, "found": 0, "complete": 0}
         self._diagnosed = -np.inf
 
@@ -90,7 +91,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
     def restart(self) -> None:
         """Forget the target, too."""
         super().restart()
-        self._target = None
+        self._averaged = self._fused = None
         if self.mounted.mount is not None:
             self.use_camera(self.mounted.mount)
 
@@ -101,10 +102,15 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
             body = self.bodies.at(exposed)
         except StampError as error:
             problem = str(error)
-        camera = self.mounted.mount.camera
+        camera, localizer = self.mounted.known.camera, self._localizer
+        assert localizer is not None  # it comes with the camera
+
+        def pixels(region: Region | None = None) -> np.ndarray:
+            return mono_image(image, camera, region)
+
         try:
             check_image(image, camera)
-            result = self._localizer.process(lambda region=None: mono_image(image, camera, region), exposed, body)
+            result = localizer.process(pixels, exposed, body)
         except ImageError as error:
             result = Localization(None, message=str(error))
             self.warn(f"{self._topic}: {error}", 1.0)
@@ -127,39 +133,39 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
                                          pose_camera=_pose(stamp, shown.p_CS, shown.R_CS, shown.covariance))
             if body is not None:
                 self._counts["found"] += 1
-                sighting = self._update(result, body, sighting)
+                sighting = self._update(result.board, result.average, body, sighting)
         self.sighting(sighting)
         if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD or exposed < self._diagnosed:
             self._diagnosed = exposed
             self.diagnostics(Diagnostics(stamp, {**self._counts, "dropped": self.dropped, "mode": self.config.mode},
                                          1 if message else 0, message or "ok"))
 
-    def _update(self, result: Localization, body: BodyState, sighting: TargetSighting) -> TargetSighting:
+    def _update(self, board: BoardPose, average: BoardPose | None, body: BodyState, sighting: TargetSighting) -> TargetSighting:
         """Bring the target up to date by the mode, and tell where it is good enough."""
-        measured = to_map(result.average or result.board, body, self.mounted.mount, self.config.calibration)
+        measured = to_map(average or board, body, self.mounted.known, self.config.calibration)
+        target: FusedTarget | MapPose = measured
         fresh, frames, method = True, 1, self.config.mode
         if method == "fused":
             self._fuse(measured)
-            frames = self._target.frames if self._target is not None else 1
+            if self._fused is not None:
+                target, frames = self._fused, self._fused.frames
         elif method == "average":
-            fresh = self._target is None and result.average is not None  # the first complete image, once
+            fresh = self._averaged is None and average is not None  # the first complete image, once
             if fresh:
-                self._target = measured
-            elif self._target is None:
+                self._averaged = measured
+            elif self._averaged is None:
                 method = "joint"  # not all tags yet: this is no average
-        else:
-            self._target = measured
-        target = self._target if self._target is not None else measured
+            target = self._averaged or measured
         pose = _pose(sighting.stamp, target.p_WS, target.R_WS, target.covariance)
         if fresh and self._good(target.covariance):
             self.pose(pose)
         return sighting._replace(found=True, pose=pose, frames_fused=frames, method=method)
 
     def _fuse(self, measured: MapPose) -> None:
-        if self._target is not None:
-            self._target = fuse(self._target, measured)
+        if self._fused is not None:
+            self._fused = fuse(self._fused, measured)
         elif self._good(measured.covariance):
-            self._target = start_fusion(measured)
+            self._fused = start_fusion(measured)
 
     def _good(self, covariance: np.ndarray) -> bool:
         """Whether the worst axes of position and attitude are known within the limits."""

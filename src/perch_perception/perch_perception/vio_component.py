@@ -101,12 +101,12 @@ class VioComponent(CameraComponent[VioComponentConfig]):
 
     def use(self, image: CameraImage) -> None:
         """Use a frame, and tell."""
+        pixels: np.ndarray | None = None
         try:
-            pixels = mono_image(image, self.mounted.mount.camera)
-        except ImageError as error:
-            pixels, result = None, VioResult(FrameOutcome.BAD_IMAGE, message=str(error))
-        else:
+            pixels = mono_image(image, self.mounted.known.camera)
             result = self._vio.add_image(image.stamp, pixels)
+        except ImageError as error:
+            result = VioResult(FrameOutcome.BAD_IMAGE, message=str(error))
         self.result = result
         self._counts[result.outcome] += 1
         if result.estimate is not None:

@@ -32,9 +32,10 @@ class AslRecording(Recording):
             RecordingError: a file is missing or is none of its format.
             ConfigError: a `sensor.yaml` cannot be used.
         """
-        self._root = root_of(path)
-        if self._root is None:
+        root = root_of(path)
+        if root is None:
             raise RecordingError(f"{path}: no mav0/cam*/data.csv")
+        self._root = root
         folders = {file.parent.name: file.parent for file in sorted(self._root.glob("cam*/data.csv"))}
         if sensors is None and all((folder / "sensor.yaml").is_file() for folder in folders.values()):
             sensors = from_asl(self._root)
@@ -52,7 +53,9 @@ class AslRecording(Recording):
             raise RecordingError(f"{self._root}: no image is named in cam*/data.csv")
         self.images = {name: sum(row[1] == name for row in self._frames) for name in folders}
         imu = self._root / "imu0" / "data.csv"
-        self._stamps, self._imu = table(imu, 7) if imu.is_file() else (np.empty(0, np.int64), np.empty((0, 6)))
+        self._stamps, self._imu = np.empty(0, np.int64), np.empty((0, 6))
+        if imu.is_file():
+            self._stamps, self._imu = table(imu, 7)
         self.samples = int((self._stamps <= self._frames[-1][0] + AFTER).sum())
 
     @property

@@ -143,7 +143,7 @@ def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.
 def _imu(source: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
     if not isinstance(c, dict):
         raise ConfigError(source, "", "is no mapping")
-    out = {ours: _number(source, theirs, _needed(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
+    out: dict[str, Any] = {ours: _number(source, theirs, _needed(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
     out["rate"] = _number(source, "update_rate", c.get("update_rate", c.get("rate_hz")))
     out["orientation"] = so3.quat_from_matrix(R_BI).tolist()
     out["topic"] = str(c.get("rostopic", ""))

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from perch_core.sensors import Sensors
+from perch_core.values import CameraImage
 from perch_eval.recordings.findings import Report, check_rhythm
-from perch_eval.recordings.recording import Event
 
 LOOKED_AT = 60  # images of each camera whose pixels are looked at
 
@@ -21,16 +21,15 @@ class Looker:
         self.looks: list[tuple[float, ...]] = []
         self._every = max(1, total // LOOKED_AT)
 
-    def take(self, event: Event) -> None:
-        """An image."""
-        image = event.value
+    def take(self, image: CameraImage, arrived: int) -> None:
+        """An image, and when it was recorded [ns]."""
         if len(self.stamps) % self._every == 0:
             pixels = image.pixels()
             if pixels is not None:
                 self.sizes.add((pixels.shape[1], pixels.shape[0]))
                 self.looks.append(look_at(pixels))
         self.stamps.append(image.stamp)
-        self.delays.append(event.arrived - image.stamp)
+        self.delays.append(arrived - image.stamp)
 
 
 def look_at(pixels: np.ndarray) -> tuple[float, ...]:

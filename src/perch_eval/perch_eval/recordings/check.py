@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from perch_core.values import ImuSample
 from perch_eval.recordings.camera_check import Looker, check_camera
 from perch_eval.recordings.clocks import check_clocks
 from perch_eval.recordings.findings import Report
 from perch_eval.recordings.imu_check import check_imu
-from perch_eval.recordings.recording import IMU, Event, Recording
+from perch_eval.recordings.recording import Event, Recording
 
 DAY = 86_400_000_000_000  # [ns]
 
@@ -26,11 +27,11 @@ def check(recording: Recording, watched: Callable[[Iterator[Event]], Iterator[Ev
     stamps, samples = [], []
     lookers = {name: Looker(n) for name, n in recording.images.items()}
     for event in watched(recording.events()):
-        if event.source == IMU:
+        if isinstance(event.value, ImuSample):
             stamps.append(event.value.stamp)
             samples.append((*event.value.w_B, *event.value.f_B))
         else:
-            lookers[event.source].take(event)
+            lookers[event.source].take(event.value, event.arrived)
     if recording.damage:
         report.say("recording", f"cannot be read to its end: {recording.damage}", warning=True)
     if not stamps:
@@ -51,5 +52,5 @@ def check(recording: Recording, watched: Callable[[Iterator[Event]], Iterator[Ev
     if sensors is None:
         report.say("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
     elif len(times) > 10 and sensors.imu is not None:
-        check_clocks(report, recording, times, imu, sensors)
+        check_clocks(report, recording, times, imu, sensors, sensors.imu.R_BI)
     return report

@@ -8,6 +8,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.camera import Camera
 from perch_core.sensors import Sensors
+from perch_core.values import CameraImage
 from perch_eval.recordings.findings import Report
 from perch_eval.recordings.recording import Recording
 from perch_perception.images import ImageError, image_array
@@ -16,32 +17,33 @@ CORRELATED = 5.0  # frames over which errors of an image's turn go together
 SPAN, REACH = 8.0, 0.1  # of the stretch that is looked at, and of the offsets tried [s]
 
 
-def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: np.ndarray, sensors: Sensors) -> None:
+def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: np.ndarray, sensors: Sensors, R_BI: np.ndarray) -> None:
     """The time offset between each camera and the IMU, by which the turns that both see fit best."""
     begin = _liveliest(stamps, imu[:, :3])
     end = begin + round(SPAN * 1e9)
     turns: dict[str, list[tuple[float, ...]]] = {name: [] for name in recording.images if name in sensors.cameras}
     before: dict[str, tuple[int, np.ndarray]] = {}
     for event in recording.events():
-        if event.source not in turns or not begin <= event.value.stamp <= end:
+        image = event.value
+        if event.source not in turns or not isinstance(image, CameraImage) or not begin <= image.stamp <= end:
             continue
         camera = sensors.cameras[event.source].camera
         try:
-            pixels = image_array(event.value, camera)
+            pixels = image_array(image, camera)
         except ImageError:
             continue
         grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         if event.source in before:
             stamp, last = before[event.source]
             turn = image_turn(last, grey, camera)
-            if np.isfinite(turn).all() and event.value.stamp > stamp:
-                turns[event.source].append((1e-9 * (stamp - stamps[0]), 1e-9 * (event.value.stamp - stamps[0]), *turn))
-        before[event.source] = event.value.stamp, grey
+            if np.isfinite(turn).all() and image.stamp > stamp:
+                turns[event.source].append((1e-9 * (stamp - stamps[0]), 1e-9 * (image.stamp - stamps[0]), *turn))
+        before[event.source] = image.stamp, grey
     for name, rows in turns.items():
         if len(rows) < 20:
             continue
         told = sensors.cameras[name].stamp_offset
-        R_CI = sensors.mounts[name].R_BC.T @ sensors.imu.R_BI
+        R_CI = sensors.mounts[name].R_BC.T @ R_BI
         offset, sigma = clock_offset(np.array(rows), 1e-9 * (stamps - stamps[0]), imu[:, :3] @ R_CI.T)
         if sigma > 0.01:
             report.say(f"camera {name} clock", f"turns are too slow to compare it with the IMU's ({1e3 * sigma:.0f} ms, 1 sigma)")
@@ -70,7 +72,7 @@ def image_turn(last: np.ndarray, now: np.ndarray, camera: Camera) -> np.ndarray:
     corners = cv2.goodFeaturesToTrack(last, 150, 0.01, 15)
     if corners is None or len(corners) < 15:
         return np.full(3, np.nan)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(last, now, corners, None, winSize=(21, 21), maxLevel=4)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(last, now, corners, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
     found = found.ravel() == 1
     a, b = camera.unproject(corners[found, 0].astype(float)), camera.unproject(moved[found, 0].astype(float))
     good = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)

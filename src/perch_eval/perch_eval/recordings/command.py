@@ -15,6 +15,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
+from perch_core.values import CameraImage
 from perch_eval.arguments import exit_code, output_folder
 from perch_eval.node_launch import parse_overrides
 from perch_eval.page import finite
@@ -272,7 +273,10 @@ def _write(folder: Path, title: str, content: dict[str, Any], rows: list[tuple[s
 def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
     board, gallery, problems, seen = load_board(args.board), Gallery(24), [], {}
     for event in Reading(recording).read(recording.events()):
-        image, name = event.value, getattr(event.value, "path", Path(str(event.value.stamp))).name
+        image = event.value
+        if not isinstance(image, CameraImage):
+            continue
+        name = getattr(image, "path", Path(str(image.stamp))).name
         sensor = recording.sensors.cameras.get(event.source) if recording.sensors else None
         mount = sensor.mount(event.source) if sensor else guessed_mount(event.source, image.width, image.height)
         wires = LineDetectionConfig(appearance="red" if sensor and sensor.colour else "plain")

@@ -98,18 +98,14 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
         P = covariances[kept] + 1e-12 * np.eye(3)
         nees[1:] = np.einsum("ni,ni->n", error[1:], np.linalg.solve(P[1:], error[1:, :, None])[..., 0])
     delta = max(0.1, round(0.1 * true.length, 1))
-    return Evaluation(1e-9 * float(true.stamps[-1] - true.stamps[0]),
-                      true.length,
-                      *_by_evo(estimate, true, delta),
-                      truth_W=truth_W,
-                      stamps=true.stamps,
-                      error=error,
-                      turn=turn,
-                      nees=nees)
+    ate, ate_deg, rpe, rpe_deg, scale = _by_evo(estimate, true, delta)
+    return Evaluation(duration=1e-9 * float(true.stamps[-1] - true.stamps[0]), path=true.length, ate=ate, ate_deg=ate_deg, rpe=rpe,
+                      rpe_deg=rpe_deg, rpe_delta=delta, scale=scale, stamps=true.stamps, error=error, turn=turn, nees=nees,
+                      truth_W=truth_W)
 
 
-def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float, ...]:
-    """ATE [m], ATE [deg], RPE [m], RPE [deg], its delta [m], scale; nan where the motion is too short."""
+def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float, float, float, float, float]:
+    """ATE [m], ATE [deg], RPE [m], RPE [deg], scale; nan where the motion is too short."""
     from evo.core import metrics
     from evo.core.geometry import GeometryException
     from evo.core.metrics import MetricsException, PoseRelation, Unit
@@ -123,22 +119,22 @@ def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float
         return float(metric.get_statistic(metrics.StatisticsType.rmse))
 
     if true.length < LEAST_PATH:
-        return (np.nan, ) * 4 + (delta, np.nan)
+        return np.nan, np.nan, np.nan, np.nan, np.nan
     ours = of(estimate)
     try:
         scale = float(of(estimate).align(of(true), correct_scale=True)[2])
         ours.align(of(true))
-        ate = [rms(metrics.APE(relation), ours) for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)]
+        ate, ate_deg = (rms(metrics.APE(relation), ours)
+                        for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg))
     except GeometryException:  # along a line, or on the spot
-        ate, scale = [np.nan, np.nan], np.nan
+        ate, ate_deg, scale = np.nan, np.nan, np.nan
     try:
-        rpe = [
+        rpe, rpe_deg = (
             rms(metrics.RPE(relation, delta, Unit.meters, rel_delta_tol=0.2, all_pairs=True, pairs_from_reference=True), of(estimate))
-            for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)
-        ]
+            for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg))
     except MetricsException:
-        rpe = [np.nan, np.nan]
-    return *ate, *rpe, delta, 1.0 / scale if scale else np.nan
+        rpe, rpe_deg = np.nan, np.nan
+    return ate, ate_deg, rpe, rpe_deg, 1.0 / scale if scale else np.nan
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -13,13 +13,14 @@ from perch_core import config
 from perch_core.component import Component, LogLine
 from perch_core.sensors import Sensors
 from perch_core.tag_board import load_board
-from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, InertialState, OdometryState, PowerlineMap, TargetPose,
-                               TargetSighting)
+from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState, OdometryState, PowerlineMap,
+                               TargetPose, TargetSighting)
 from perch_eval.in_process.parameters import nested
 from perch_eval.node_launch import flattened, read_parameters
 from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_wires
 from perch_eval.recordings.gallery import Gallery, Shown
-from perch_eval.recordings.recording import IMU, Event
+from perch_eval.recordings.recording import Event
+from perch_perception.camera_component import CameraComponent
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.line_mapping import detect_lines
 from perch_perception.images import mono_image, rgb_image
@@ -91,11 +92,17 @@ class _Vio(VioComponent):
         begin = time.process_time()
         super().use(image)
         r = self.result
+        assert r is not None  # of this frame
         self.frames.append(
             Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, float(r.nis), r.nis_dimension, r.restarts,
                   time.process_time() - begin, r.message))
         text = f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used"
-        self.gallery.offer(lambda: Shown(image.stamp, text, drawn[-1].pixels()) if drawn else None)
+
+        def shown() -> Shown | None:
+            pixels = drawn[-1].pixels() if drawn else None
+            return None if pixels is None else Shown(image.stamp, text, pixels)
+
+        self.gallery.offer(shown)
 
 
 class _Target(TargetLocalizer):
@@ -116,7 +123,7 @@ class _Target(TargetLocalizer):
     def _drawn(self, image: CameraImage, seen: TargetSighting) -> Shown | None:
         if image.pixels() is None:
             return None
-        camera = self.mounted.mount.camera
+        camera = self.mounted.known.camera
         drawn = canvas(mono_image(image, camera))
         text = seen.message
         if seen.pose_camera is not None:
@@ -138,7 +145,7 @@ class _Wires(PowerlineMapper):
     def _drawn(self, image: CameraImage) -> Shown | None:
         if image.pixels() is None:
             return None
-        camera = self.mounted.mount.camera
+        camera = self.mounted.known.camera
         pixels = rgb_image(image, camera) if self.config.detection.appearance == "red" else mono_image(image, camera)
         wires = detect_lines(pixels, camera, self.config.detection)
         drawn = canvas(mono_image(image, camera))
@@ -195,16 +202,17 @@ class Perception:
 
     def take(self, event: Event) -> None:
         """Give the components what a sensor said."""
-        if event.source == IMU:
-            self.estimator.on_imu(event.value)
-            self.vio.on_imu(event.value)
+        value = event.value
+        if isinstance(value, ImuSample):
+            self.estimator.on_imu(value)
+            self.vio.on_imu(value)
             return
-        for camera, components in ((self._choice.down, (self.vio, )), (self._choice.front, (self.target, self.wires))):
-            if camera != event.source:
-                continue
-            for component in filter(None, components):
-                component.on_camera_info(CameraModel(event.value.stamp, event.value.frame, self._sensors.cameras[camera].camera))
-                component.on_image(event.value)
+        looking: list[tuple[str, CameraComponent[Any] | None]] = [
+            (self._choice.down, self.vio), (self._choice.front, self.target), (self._choice.front, self.wires)]
+        for camera, component in looking:
+            if component is not None and camera == event.source:
+                component.on_camera_info(CameraModel(value.stamp, value.frame, self._sensors.cameras[camera].camera))
+                component.on_image(value)
 
     def _make(self, node: str, cls: type[Component[Any]], given: Mapping[str, Any]) -> Any:
         """A component with the parameters of its node; None where it is left out."""

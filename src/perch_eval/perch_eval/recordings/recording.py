@@ -88,6 +88,7 @@ class _Picture(CameraImage):
     """An image on file, decoded when somebody looks at it."""
 
     __slots__ = ("path", )
+    path: Path
 
 
 def picture(path: Path, stamp: int, name: str, camera: CameraSensor | None) -> CameraImage:

@@ -37,24 +37,25 @@ class Track(Protocol):
 def score(track: Track, seen: LineObservation, settings: AssociationConfig) -> float:
     """Misfit of a sighting to a wire in units of the gate; inf where it cannot be the same."""
     if track.estimate is not None:
-        return _score_mapped(track, seen, settings)
+        return _score_mapped(track.estimate, track.extent, seen, settings)
     return _score_followed(track.last, seen) / np.radians(settings.followed_gate)
 
 
-def _score_mapped(track: Track, seen: LineObservation, settings: AssociationConfig) -> float:
-    curve = track.estimate.curve
+def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, seen: LineObservation,
+                  settings: AssociationConfig) -> float:
+    curve = estimate.curve
     centres = np.tile(seen.p_WC, (len(seen.rays_W), 1))
     against = curve.offsets(centres, seen.rays_W)
     if not np.all(against.ahead > 0):
         return np.inf
     s = against.s
-    if track.extent is not None:
-        low, high = track.extent
+    if extent is not None:
+        low, high = extent
         if s.max() < low - settings.reach or s.min() > high + settings.reach:
             return np.inf
     middle = float(s[len(s) // 2])
     distance = float(np.linalg.norm(curve.at(middle) - seen.p_WC))
-    unsure = np.sqrt(np.linalg.eigvalsh(track.estimate.point_covariance(middle))[-1]) / max(distance, 0.1)
+    unsure = np.sqrt(np.linalg.eigvalsh(estimate.point_covariance(middle))[-1]) / max(distance, 0.1)
     return float(np.sqrt(np.mean(against.angles**2))) / (np.radians(settings.mapped_gate) + 2.0 * float(unsure))
 
 
@@ -88,7 +89,7 @@ def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings
     scores = np.array([[score(track, one, settings) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
     for i, one in enumerate(seen):
         near = np.flatnonzero(scores[i] <= 1.0)
-        as_wide = [_as_wide(tracks[j], one, settings) for j in near]
+        as_wide = [_as_wide(tracks[j], one, settings) for j in near.tolist()]
         if len(near) > 1 and any(as_wide):
             scores[i, near[~np.array(as_wide)]] = np.inf
     answer: list[int | None] = [-1] * len(seen)

@@ -62,7 +62,7 @@ class Backdrop:
             curve: the wire, which says how far away it is.
         """
         now, before, camera = self._now, self._before, self._camera
-        if before is None:
+        if now is None or before is None:
             return None
         points_W = curve.at(curve.nearest(np.tile(seen.p_WC, (len(seen.rays_W), 1)), seen.rays_W))
         on = camera.project(seen.rays_W @ now.R_WC)[0]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from perch_core import so3
 
@@ -40,12 +41,12 @@ class WireCurve:
         side = side / np.linalg.norm(side)
         return np.stack([side, np.cross(self.direction, side), self.direction], axis=1)
 
-    def at(self, s: np.ndarray) -> np.ndarray:
+    def at(self, s: ArrayLike) -> np.ndarray:
         """Points at s [m], shapes (...) -> (..., 3)."""
-        s = np.asarray(s, float)[..., None]
-        return self.point + s * self.direction + 0.5 * self.curvature * s * s * self.axes[:, 1]
+        along = np.asarray(s, float)[..., None]
+        return self.point + along * self.direction + 0.5 * self.curvature * along * along * self.axes[:, 1]
 
-    def tangent(self, s: np.ndarray) -> np.ndarray:
+    def tangent(self, s: ArrayLike) -> np.ndarray:
         """Tangents (not normalised) at s, shapes (...) -> (..., 3)."""
         return self.direction + self.curvature * np.asarray(s, float)[..., None] * self.axes[:, 1]
 

@@ -82,8 +82,8 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
     if settings.appearance == "plain":
         return _plain(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), camera, settings)
     strength = redness(image)
-    mask = (strength > settings.redness).astype(np.uint8)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    red = (strength > settings.redness).astype(np.uint8)
+    mask = cv2.morphologyEx(red, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     padded = np.pad(strength.astype(float), EDGE_REACH, constant_values=np.nan)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     sightings = []
@@ -249,7 +249,7 @@ def _width(edges: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> 
         off = np.abs(rays @ normal)
         rays = rays[off <= 3.0 * np.median(off)]  # where another wire crosses, the edge is that one's
         normals.append(np.linalg.eigh(rays.T @ rays)[1][:, 0])
-    between = float(np.linalg.norm(np.cross(*normals)))
+    between = float(np.linalg.norm(np.cross(normals[0], normals[1])))
     looks = float(np.arcsin(min(between, 1.0)) * camera.fx)
     width = looks + settings.width_loss - MEETING * np.exp((MEETING_AT - looks) / MEETING_OVER)
     return float(width / camera.fx) if width >= settings.min_width else 0.0

@@ -127,26 +127,36 @@ class LineMapper:
                 changed.add(owner)
         for index in sorted(changed):
             self._triangulate(self._tracks[index])
-        for one, owner in zip(seen, owners) if attached is not None else ():
-            if owner is not None and owner >= 0 and (track := self._tracks[owner]).estimate is not None:
-                verdict = attached(one, track.estimate.curve)
-                track.attached += 0 if verdict is None else 1 if verdict else -1
+        if attached is not None:
+            self._judge(seen, owners, attached)
         self._merge()
         self._supersede(time)
         self._tracks = [t for t in self._tracks
                         if t.estimate is not None or time - t.last.time <= self.settings.forget_after]
         return self.map(time)
 
+    def _judge(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
+               attached: Callable[[LineObservation, WireCurve], bool | None]) -> None:
+        """Count for each wire that was seen whether it is attached to what is beside it."""
+        for one, owner in zip(seen, owners):
+            if owner is None or owner < 0:
+                continue
+            track = self._tracks[owner]
+            if track.estimate is not None:
+                verdict = attached(one, track.estimate.curve)
+                track.attached += 0 if verdict is None else 1 if verdict else -1
+
     def map(self, time: float) -> LineMap:
         """The present map."""
-        lines, missing = [], []
+        lines: list[MappedLine] = []
+        missing: list[str] = []
         for track in self._tracks:
             if track.count < MIN_OBSERVATIONS or track.attached >= CERTAIN:
                 continue
             if track.estimate is None:
                 missing.append(f"line {track.id}: {track.refusal}")
             else:
-                lines += self._segments(track, missing)
+                lines += self._segments(track, track.estimate, missing)
         return LineMap(time, tuple(sorted(lines, key=lambda line: line.segment.id)), bool(missing), "; ".join(missing))
 
     def _extend(self, track: _Track, one: LineObservation) -> bool:
@@ -170,12 +180,12 @@ class LineMapper:
             if track.estimate is None:
                 track.refusal = str(refusal)
             return
-        track.extent = self._extent(track)
+        track.extent = self._extent(track.observations, track.estimate)
 
-    def _extent(self, track: _Track) -> tuple[float, float] | None:
+    def _extent(self, observations: Sequence[LineObservation], estimate: WireEstimate) -> tuple[float, float] | None:
         """Range of s that was seen at least twice."""
-        curve = track.estimate.curve
-        used = [one for one, good in zip(track.observations, track.estimate.used) if good]
+        curve = estimate.curve
+        used = [one for one, good in zip(observations, estimate.used) if good]
         centres = np.repeat([one.p_WC for one in used], 2, axis=0)
         rays = np.concatenate([one.ends_W for one in used])
         against = curve.offsets(centres, rays)
@@ -212,9 +222,8 @@ class LineMapper:
         self._tracks = [t for t in self._tracks if time - t.last.time <= settings.stale_after
                         or not any(_beside(t, other, settings.superseded_within) for other in fresh)]
 
-    def _segments(self, track: _Track, missing: list[str]) -> list[MappedLine]:
+    def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedLine]:
         """The wire as chords that stay within `straightness`; none where it is not known well enough."""
-        estimate = track.estimate
         if track.extent is None:
             missing.append(f"line {track.id}: its ends were not seen yet")
             return []
@@ -242,10 +251,12 @@ class LineMapper:
         The sightings' part has the camera's mount in it, which the fit estimates. The odometry's position is left out: its drift
         moves vehicle and wires together.
         """
-        lever = so3.hat(estimate.curve.at(np.array(s)) - self._body.p_WB)
+        assert self._body is not None  # it was seen from somewhere
+        lever = so3.hat(estimate.curve.at(s) - self._body.p_WB)
         return estimate.point_covariance(s) + lever @ self._body.covariance[3:, 3:] @ lever.T
 
     def _direction_sigma(self, estimate: WireEstimate) -> float:
+        assert self._body is not None
         attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1]
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
 
@@ -254,7 +265,7 @@ def _chord(curve: WireCurve, a: float, b: float, radius: float, id: int, offset:
     """The straight piece nearest to the wire between a and b: the chord, moved by a third of the sag's two thirds, and by `offset` (3,) [m]."""
     lift = -curve.curvature * (b - a) ** 2 / 12.0  # mean of the parabola below its chord
     shift = lift * curve.axes[:, 1] + offset
-    return Segment.between(curve.at(np.array(a)) + shift, curve.at(np.array(b)) + shift, radius, id)
+    return Segment.between(curve.at(a) + shift, curve.at(b) + shift, radius, id)
 
 
 def _thinned(observations: list[LineObservation]) -> list[LineObservation]:

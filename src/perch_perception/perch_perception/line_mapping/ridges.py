@@ -42,30 +42,32 @@ class Ridges:
 
 def ridges(grey: np.ndarray) -> Ridges:
     """Ridge points of an image, uint8 (height, width)."""
-    found, level_image = [], grey.astype(np.float32)
+    found, level_image = [], np.asarray(grey, np.float32)
     for level in range(LEVELS):
         found.append(_of_level(level_image, level))
-        level_image = cv2.resize(level_image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    pixels, tangents, bend, step, height, level = (np.concatenate(column) for column in zip(*found))
+        level_image = np.asarray(cv2.resize(level_image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    columns = [np.concatenate(column) for column in zip(*found)]
+    bend = columns[2]
     signs = (np.flatnonzero(bend < 0.0), np.flatnonzero(bend >= 0.0))
     keep = np.concatenate([sign[np.argsort(-np.abs(bend[sign]), kind="stable")[:MOST]] for sign in signs])
-    return Ridges(*(column[keep] for column in (pixels, tangents, bend, step, height, level)))
+    return Ridges(*(column[keep] for column in columns))
 
 
 def _of_level(image: np.ndarray, level: int) -> tuple[np.ndarray, ...]:
     """The columns of `Ridges` from one level of the pyramid, pixels in those of the full image."""
-    smooth = cv2.GaussianBlur(image, (0, 0), BLUR)
-    slope, bend, one = np.float32([-0.5, 0.0, 0.5]), np.float32([1.0, -2.0, 1.0]), np.float32([1.0])
-    xx, yy, xy = (cv2.sepFilter2D(smooth, -1, a, b) for a, b in ((bend, one), (one, bend), (slope, slope)))
+    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR))
+    slope, bend, one = (np.array(kernel, np.float32) for kernel in ([-0.5, 0.0, 0.5], [1.0, -2.0, 1.0], [1.0]))
+    xx, yy, xy = (np.asarray(cv2.sepFilter2D(smooth, -1, a, b)) for a, b in ((bend, one), (one, bend), (slope, slope)))
     mean, spread = 0.5 * (xx + yy), np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     across = np.abs(mean) + spread
     rows, cols = np.nonzero((across > MIN_BEND) & (np.abs(np.abs(mean) - spread) < ROUNDISH * across))
-    xx, yy, xy, mean, spread = (part[rows, cols] for part in (xx, yy, xy, mean, spread))
-    x, y = (cv2.sepFilter2D(smooth, -1, a, b)[rows, cols] for a, b in ((slope, one), (one, slope)))
+    xx, yy, xy = (part[rows, cols] for part in (xx, yy, xy))
+    mean, spread = mean[rows, cols], spread[rows, cols]
+    by_x, by_y = (np.asarray(cv2.sepFilter2D(smooth, -1, a, b))[rows, cols] for a, b in ((slope, one), (one, slope)))
     curved = mean + np.copysign(spread, mean)
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy) + np.where(mean < 0.0, 0.5 * np.pi, 0.0)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    shift = -(x * normal[:, 0] + y * normal[:, 1]) / curved
+    shift = -(by_x * normal[:, 0] + by_y * normal[:, 1]) / curved
     on = (np.abs(shift[:, None] * normal) <= 0.6).all(axis=1)
     rows, cols, normal = rows[on], cols[on], normal[on]
     right, left = (smooth[np.clip(np.rint(rows + side * normal[:, 1]).astype(int), 0, smooth.shape[0] - 1),

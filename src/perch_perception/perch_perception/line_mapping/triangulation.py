@@ -92,7 +92,7 @@ class WireEstimate:
     def width_from(self, p_WC: np.ndarray) -> float:
         """How wide it looks from a place (3,) [rad]; nan where its radius is not known."""
         to = self.curve.point - p_WC
-        distance = np.linalg.norm(to - (to @ self.curve.direction) * self.curve.direction)
+        distance = float(np.linalg.norm(to - (to @ self.curve.direction) * self.curve.direction))
         return float(2.0 * np.arcsin(min(self.radius / max(distance, 1e-3), 1.0)))
 
     def point_covariance(self, s: float) -> np.ndarray:
@@ -161,9 +161,9 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         misfit = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
         used = misfit < 3.0 * max(1.0, float(np.median(misfit)))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
-        by_rays = _normal_equations(*_whitened(curve, mount, observations, centres, rays, settings, rigid), weight)
+        by_rays = _normal_equations(_whitened(curve, mount, observations, centres, rays, settings, rigid), weight)
         apart = apart if known > 0.0 else apart + WIDTH_GATE**2
-        by_widths = _normal_equations(*_widths(curve, size, observations, settings, apart), weight)
+        by_widths = _normal_equations(_widths(curve, size, observations, settings, apart), weight)
         information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount, size)
         try:
             step = -np.linalg.solve(information, gradient)
@@ -193,8 +193,9 @@ def _drifted(observations: Sequence[LineObservation], settings: TriangulationCon
     return settings.pose_drift**2 * waited + settings.pose_drift_moved**2 * moved
 
 
-def _normal_equations(residual, jacobian, weight):
-    """J' w J (n, 9, 9) and J' w r (n, 9) of every sighting."""
+def _normal_equations(linear: tuple[np.ndarray, np.ndarray], weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """J' w J (n, 9, 9) and J' w r (n, 9) of every sighting, from its residuals r (n, k) and Jacobian J (n, k, 9)."""
+    residual, jacobian = linear
     return np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian), np.einsum("n,nki,nk->ni", weight, jacobian, residual)
 
 

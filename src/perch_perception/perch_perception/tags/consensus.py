@@ -40,7 +40,7 @@ def consistent(camera: Camera, corners_S: np.ndarray, numbers: np.ndarray, corne
         pixels, valid = camera.project(corners_S @ R.T + p)
         side = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
         away = np.linalg.norm(corners - pixels[numbers], axis=2).mean(axis=1) / side[numbers]
-        near = np.flatnonzero(valid.all(axis=1)[numbers] & (away < AGREES))
+        near = np.flatnonzero(np.all(valid, axis=1)[numbers] & (away < AGREES))
         first = near[np.argsort(away[near], kind="stable")]
         chosen = np.sort(first[np.unique(numbers[first], return_index=True)[1]])
         choices.append((len(chosen), -float(away[chosen].mean()) if len(chosen) else -np.inf, chosen))

@@ -117,14 +117,15 @@ class BoardLocalizer:
         Returns:
             The sighting; `board` is None where there is none, and `message` says why.
         """
-        if self._last is not None and time - self._last_time <= self.settings.lost_after:
-            p_CS, R_CS = self._predict(body)
+        last = self._last
+        if last is not None and time - self._last_time <= self.settings.lost_after:
+            p_CS, R_CS = self._predict(last, body)
             view = self._aim(p_CS, self._radius)
             part = _Part.of(image, view.region(self.mount.camera, AROUND_VIEW))
-            result = self._follow(part, time, body, p_CS, R_CS)
-            if result is None:
+            followed = self._follow(part, time, body, p_CS, R_CS) if last.branch_gap >= CLEAR else None
+            if followed is None:
                 self._followed = 0
-                result = self._attempt(part, self._look(part, view), (p_CS, R_CS), False)
+            result = followed or self._attempt(part, self._look(part, view), (p_CS, R_CS), False)
         elif time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
             return Localization(None, message="waiting for the next search")
         else:
@@ -148,7 +149,7 @@ class BoardLocalizer:
                 R_CS: np.ndarray) -> Localization | None:
         """Measure the corners where they are expected; None where that is not safe, or where one is not found."""
         if (self._followed >= self.settings.follow_images or body is None or self._last_body is None
-                or time - self._last_time > FOLLOW_GAP or self._last.branch_gap < CLEAR):
+                or time - self._last_time > FOLLOW_GAP):
             return None
         pixels, valid = self.mount.camera.project(self.board.corners_S @ R_CS.T + p_CS)
         inside = np.all(valid & self.mount.camera.contains(pixels, margin=EXPECTED_MARGIN), axis=1)
@@ -201,9 +202,9 @@ class BoardLocalizer:
         share = min(self.settings.view_margin * radius / max(distance, 1e-3), 0.95)
         return VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
 
-    def _predict(self, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:
+    def _predict(self, last: BoardPose, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:
         """Where the board should be now, p_CS and R_CS: it stays in the map while the vehicle moves."""
-        p, R = self._last.p_CS, self._last.R_CS
+        p, R = last.p_CS, last.R_CS
         if body is None or self._last_body is None:
             return p, R
         then, now = self._last_body, body

@@ -87,5 +87,5 @@ class VirtualView:
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1)
         pixels, valid = camera.project(self.rays(grid))
         coarse = np.where(valid[..., None], pixels, -1e4).astype(np.float32)
-        source = cv2.resize(coarse, (self.side, self.side), interpolation=cv2.INTER_LINEAR) - np.float32(origin)
-        return cv2.remap(image, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        source = np.asarray(cv2.resize(coarse, (self.side, self.side), interpolation=cv2.INTER_LINEAR)) - np.array(origin, np.float32)
+        return cv2.remap(image, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=0)  # type: ignore[call-overload]

@@ -68,7 +68,7 @@ class Estimator:
             if self._lag >= self.config.covariance_stride:
                 self._refresh()
                 self._rest()
-        if self._waiting and self._waiting[0].stamp <= self._imu.last.stamp:
+        if self._waiting and self._waiting[0].stamp <= self._imu.newest.stamp:
             self.add_vio(self._waiting.pop(0))
         return outcome
 
@@ -93,9 +93,9 @@ class Estimator:
     @property
     def estimate(self) -> Estimate | None:
         """State at the newest IMU stamp; None before VIO's first pose, or its first after a divergence."""
-        if self._base is None:
+        if self._live is None:
             return None
-        last, x = self._imu.last, self._x.copy()
+        last, x = self._imu.newest, self._x.copy()
         return Estimate(
             stamp=last.stamp, p_WB=x[at.POSITION], v_WB=x[at.VELOCITY], q_WB=x[at.QUATERNION],
             w_WB_B=np.array(last.w_B) - x[at.GYRO_BIAS], gyro_bias=x[at.GYRO_BIAS], accel_bias=x[at.ACCEL_BIAS],
@@ -111,8 +111,8 @@ class Estimator:
         """Health and figures for people and for the mission."""
         age, position, attitude = math.inf, math.inf, math.inf
         health = Health.DIVERGED if self._broken else Health.INITIALISING
-        if self._base is not None:
-            age = (self._imu.last.stamp - self._applied) * 1e-9
+        if self._live is not None:
+            age = (self._imu.newest.stamp - self._applied) * 1e-9
             diagonal = np.diag(self._live.P)
             position = float(np.sqrt(diagonal[at.D_POSITION].max()))
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
@@ -128,7 +128,7 @@ class Estimator:
         belief = start.from_pose(self.config, pose, row)
         prior = self._transform.predict(belief, row, 2_000_000)
         self._transform.correct(prior, self._innovate(prior, pose))
-        kernels.advance(belief.x.copy(), *map(float, row[0, 1:7]), 0.002)
+        kernels.advance(belief.x.copy(), 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 0.002)
 
     def _timing(self, pose: VioPose) -> VioOutcome | None:
         """Why the stamp cannot be applied now, or None."""
@@ -153,7 +153,7 @@ class Estimator:
 
     def _begin(self, pose: VioPose) -> VioOutcome:
         steps = window(self.config.rest, self._imu, pose.stamp)
-        self._settle(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose))
+        self._settle(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose, pose.inertial))
         self._broken = False
         return VioOutcome.STARTED
 
@@ -168,7 +168,7 @@ class Estimator:
                 return VioOutcome.GATED
             prior, outcome = self._jumped(prior, innovation), VioOutcome.JUMPED
             innovation = self._innovate(prior, pose)
-        self._settle(start.from_state(pose) if pose.inertial is not None else self._transform.correct(prior, innovation))
+        self._settle(self._transform.correct(prior, innovation) if pose.inertial is None else start.from_state(pose, pose.inertial))
         return outcome
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
@@ -179,6 +179,7 @@ class Estimator:
 
     def _jumped(self, prior: Belief, innovation: Innovation) -> Belief:
         """Belief that may be off by the whole disagreement: position, attitude, and the velocity that would have built it up."""
+        assert self._base is not None
         elapsed = max((prior.stamp - self._base.stamp) * 1e-9, 0.1)
         p, theta = (innovation.residual[:3] ** 2).sum(), (innovation.residual[3:6] ** 2).sum()
         extra = np.repeat([p, p / elapsed**2, theta, 0.0, 0.0], 3)
@@ -187,7 +188,7 @@ class Estimator:
     def _settle(self, belief: Belief) -> None:
         """Make a belief the new base, and bring the live state from there up to now."""
         self._base, self._refused_in_row, self._anchors = belief, 0, [belief]
-        now = self._imu.last.stamp
+        now = self._imu.newest.stamp
         self._live = self._transform.predict(belief, self._imu.run(belief.stamp, now), now)
         self._x, self._lag = self._live.x.copy(), 0
 
@@ -196,8 +197,8 @@ class Estimator:
 
         VIO that speaks knows of the rest itself, or measures the pose in it.
         """
-        now, config = self._imu.last.stamp, self.config
-        if self._base is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
+        now, config = self._imu.newest.stamp, self.config
+        if self._base is None or self._live is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
             return
         if not still(config.rest, window(config.rest, self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
             self._resting = False
@@ -206,9 +207,10 @@ class Estimator:
         try:
             if not self._resting:
                 begin = max(belief.stamp, 2 * middle - now)
-                belief = stopped(self._transform.predict(belief, self._imu.run(belief.stamp, begin), begin), config)
-                if belief is None:
+                halted = stopped(self._transform.predict(belief, self._imu.run(belief.stamp, begin), begin), config)
+                if halted is None:
                     return
+                belief = halted
             self._resting = True
             self._settle(rested(belief, self._imu.run(belief.stamp, middle), middle, config))
         except CovarianceError as error:
@@ -216,9 +218,10 @@ class Estimator:
 
     def _refresh(self) -> None:
         """Bring the published covariance up to now, and keep a belief from which the kept IMU steps can be replayed."""
-        now = self._imu.last.stamp
+        live, now = self._live, self._imu.newest.stamp
+        assert live is not None  # there is a base
         try:
-            self._live = self._transform.predict(self._live, self._imu.run(self._live.stamp, now), now)
+            self._live = live = self._transform.predict(live, self._imu.run(live.stamp, now), now)
         except CovarianceError as error:
             self._break(str(error))
             return
@@ -228,7 +231,7 @@ class Estimator:
             return
         half = round(0.5e9 * self.config.history)
         if now - self._anchors[-1].stamp >= half:
-            self._anchors = [a for a in self._anchors if a.stamp >= now - 2 * half] + [self._live]
+            self._anchors = [a for a in self._anchors if a.stamp >= now - 2 * half] + [live]
 
     def _break(self, why: str) -> None:
         """Start again with the next VIO pose."""

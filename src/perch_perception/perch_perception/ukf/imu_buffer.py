@@ -54,6 +54,12 @@ class ImuBuffer:
         self.last: ImuSample | None = None
 
     @property
+    def newest(self) -> ImuSample:
+        """`last` where there is one."""
+        assert self.last is not None
+        return self.last
+
+    @property
     def oldest(self) -> int:
         """Earliest stamp from which replay is possible [ns]."""
         if not self._rows:

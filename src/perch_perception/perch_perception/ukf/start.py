@@ -7,7 +7,7 @@ import numpy as np
 from perch_core import so3
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig, VioNoise
-from perch_perception.ukf.measurement import VioPose
+from perch_perception.ukf.measurement import Inertial, VioPose
 from perch_perception.ukf.rest import rested
 from perch_perception.ukf.stillness import still
 from perch_perception.ukf.unscented import Belief
@@ -21,7 +21,7 @@ def white(noise: VioNoise) -> np.ndarray:
     return np.diag(np.repeat([noise.position**2, noise.attitude**2], 3))
 
 
-def from_state(pose: VioPose) -> Belief:
+def from_state(pose: VioPose, known: Inertial) -> Belief:
     """VIO's whole state in the place of this filter's belief.
 
     VIO integrates the very IMU samples that this filter integrates, and sees images besides: its state at an exposure is this filter's
@@ -29,9 +29,10 @@ def from_state(pose: VioPose) -> Belief:
     """
     x = np.zeros(at.NOMINAL_SIZE)
     x[at.POSITION], x[at.QUATERNION] = pose.p_WB, pose.q_WB
+    assert pose.v_B is not None  # it comes with the rest
     x[at.VELOCITY] = so3.quat_to_matrix(pose.q_WB) @ pose.v_B
-    x[at.GYRO_BIAS], x[at.ACCEL_BIAS] = pose.inertial.gyro_bias, pose.inertial.accel_bias
-    return Belief(pose.stamp, x, pose.inertial.P + _REGULAR * np.eye(at.ERROR_SIZE))
+    x[at.GYRO_BIAS], x[at.ACCEL_BIAS] = known.gyro_bias, known.accel_bias
+    return Belief(pose.stamp, x, known.P + _REGULAR * np.eye(at.ERROR_SIZE))
 
 
 def from_pose(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:

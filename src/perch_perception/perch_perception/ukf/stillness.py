@@ -49,7 +49,7 @@ def still(config: RestConfig, steps: np.ndarray, biases: np.ndarray | None = Non
     """
     if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * config.window:
         return False
-    known = np.array([config.gyro_bias, config.accel_bias]) if biases is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
+    known = np.array([config.gyro_bias, config.accel_bias]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
     sigma = np.sqrt(np.median(steps[:, [GYRO_VARIANCE, ACCEL_VARIANCE]], axis=0))  # of a whole sample: the first and last are cut
     off = _beyond(steps, biases, known)
     if not seen and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > config.energy:

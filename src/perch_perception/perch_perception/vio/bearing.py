@@ -30,6 +30,10 @@ class Bearings:
     shape: np.ndarray
     noise: np.ndarray | None = None
 
+    def chosen(self, rows: np.ndarray) -> Bearings:
+        """Some of them, by index or mask."""
+        return Bearings(self.b_C[rows], self.shape[rows], None if self.noise is None else self.noise[rows])
+
 
 # columns of a residual's derivatives
 CAMERA_ROTATION, CAMERA_POSITION, TIME_OFFSET, LENS = slice(0, 3), slice(3, 6), 6, slice(7, 11)

@@ -42,11 +42,11 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
     if height < least_height or not len(ids):
         return 0
     rays = bearings.b_C @ (s.R_WB @ s.R_BC).T
-    spread, chosen = Spread({}, limits.landmarks), []
-    for k in np.flatnonzero(rays[:, 2] < -_STEEP):
+    spread, chosen = Spread({}, limits.landmarks), list[int]()
+    for k in np.flatnonzero(rays[:, 2] < -_STEEP).tolist():
         if len(chosen) < limits.landmarks and spread.admits(bearings.b_C[k]):
             spread.add(int(ids[k]), bearings.b_C[k])
-            chosen.append(int(k))
+            chosen.append(k)
     if not chosen:
         return 0
     X = centre - height / rays[chosen, 2:3] * rays[chosen]

@@ -170,7 +170,8 @@ class MotionStart:
             gyro_bias: as a filter found it that was lost; None: there was none.
         """
         self._config, self._mount = config, mount
-        self._tracks, self._stamps, self._next = Tracks(), {}, 0
+        self._tracks, self._next = Tracks(), 0
+        self._stamps: dict[int, int] = {}
         self.gyro_bias = self._known_bias = np.zeros(3) if gyro_bias is None else gyro_bias
         self.gyro_sigma = config.imu.gyro_bias_init
 
@@ -212,10 +213,10 @@ class MotionStart:
         place = {f: k for k, f in enumerate(frames)}
         rays, seen = [], []
         for track in self._tracks.by_id.values():
-            there = [(place[f], b) for f, b in zip(track.frames, track.b_C) if f in place]
-            if len(there) >= _LEAST_FRAMES:
-                seen.append(np.array([k for k, _ in there]))
-                rays.append(np.array([b for _, b in there]) @ self._mount.R_BC.T)
+            sights = [(place[f], b) for f, b in zip(track.frames, track.b_C) if f in place]
+            if len(sights) >= _LEAST_FRAMES:
+                seen.append(np.array([k for k, _ in sights]))
+                rays.append(np.array([b for _, b in sights]) @ self._mount.R_BC.T)
         if len(rays) < _LEAST_FEATURES:
             return None
         sigma = self._config.start.motion_noise / self._mount.camera.fx

@@ -152,7 +152,7 @@ class Msckf:
 
     def _spend(self, spanning: dict[int, Track]) -> dict[int, Track]:
         """Use spanning tracks that found no place as landmarks as if they had ended here; they begin anew."""
-        spent = {}
+        spent: dict[int, Track] = {}
         for i in spanning:
             if i not in self.state.landmarks and len(spent) < self.config.filter.tracks_per_frame:
                 spent[i] = self.tracks.by_id[i]
@@ -269,8 +269,8 @@ class Msckf:
             A[:, :, :n] = now.J[rows, :, :n]
             A[:, :, n:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = now.J[rows, :, n : POINT.start]
             A[:, :, -4:-1], A[:, :, -1] = now.J[rows, :, POINT], now.r[rows]
-            A = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
-            out[number] = X_W, A[:, :-4], A[:, -4:-1], A[:, -1]
+            white = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
+            out[number] = X_W, white[:, :-4], white[:, -4:-1], white[:, -1]
         return out
 
     def _window_columns(self) -> np.ndarray:

@@ -109,6 +109,12 @@ class VisualInertialOdometry:
         exposed = stamp + round(self.time_offset * 1e9)
         return newest is not None and (exposed <= newest or exposed > newest + _FUTURE)
 
+    @property
+    def _running(self) -> Msckf:
+        """The filter, from a start on."""
+        assert self.filter is not None
+        return self.filter
+
     def add_imu(self, sample: ImuSample) -> ImuOutcome:
         """Keep a sample; bad ones are bridged or refused, see `ImuOutcome`."""
         return self._imu.add(sample)
@@ -170,7 +176,8 @@ class VisualInertialOdometry:
     def _try_start(self, exposed: int, features: Features) -> VioResult:
         """Start at rest or, when the vehicle moves, from the frames of the last half second and more."""
         steps = window(self.config.rest, self._imu, exposed)
-        if self._quiet() is not False and still(self.config.rest, steps, *(self._biases or (None, None)), seen=bool(self._quiet(_STANDS))):
+        biases, variance = self._biases or (None, None)
+        if self._quiet() is not False and still(self.config.rest, steps, biases, variance, bool(self._quiet(_STANDS))):
             self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known_with(steps[:, GYRO].mean(axis=0))))
             return self._hold(exposed, features)
         self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
@@ -202,11 +209,12 @@ class VisualInertialOdometry:
     def _step(self, exposed: int, features: Features) -> VioResult:
         if self._is_still(exposed):
             return self._hold(exposed, features)
-        if self._resting and self._told and self._floor is not None and not self.filter.state.landmarks:
-            self._stand_on(features)
+        filter = self._running
+        if self._resting and self._told and self._floor is not None and not filter.state.landmarks:
+            self._stand_on(self._floor, features)
         self._resting = False
-        self.filter.propagate(self._imu.run(self.filter.state.stamp, exposed), exposed)
-        report = self.filter.add_frame(self._frame, features.ids, self._observe(features))
+        filter.propagate(self._imu.run(filter.state.stamp, exposed), exposed)
+        report = filter.add_frame(self._frame, features.ids, self._observe(features))
         if report.used:
             self._sight, self._told = exposed, False
         return self._judge(exposed, features, report)
@@ -216,7 +224,7 @@ class VisualInertialOdometry:
 
         While vision says where the vehicle is, nobody asks: a very quiet hover looks like rest.
         """
-        state = self.filter.state
+        state = self._running.state
         if self._sight is not None and exposed - self._sight < round(1e9 * self.config.loss.dark_after):
             return False
         quiet = self._quiet()
@@ -245,37 +253,38 @@ class VisualInertialOdometry:
         A take-off is noticed some time after it began. The filter stays behind by `rest_lag`, so that what it was told
         remains true, and catches up with the IMU when the vehicle leaves.
         """
-        state = self.filter.state
+        filter, state = self._running, self._running.state
         until = max(state.stamp, exposed - round(self.config.start.rest_lag * 1e9))
         if not self._resting:
-            self.filter.propagate(self._imu.run(state.stamp, until), until)
-            rest.stop(self.filter)
+            filter.propagate(self._imu.run(state.stamp, until), until)
+            rest.stop(filter)
             self._resting, self._sight = True, None
             self._views.clear()
         steps = self._imu.run(state.stamp, until)
         if len(steps):
             shaken = max(1.0, energy(window(self.config.rest, self._imu, exposed)))
-            rest.hold(self.filter, steps, until, shaken)
+            rest.hold(filter, steps, until, shaken)
         self._informed = exposed
         self._views.append((exposed, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
             self._views.popleft()
         result = self._result(FrameOutcome.RESTING, features, FrameReport())
+        estimate = result.estimate
+        assert estimate is not None  # RESTING comes with a pose
         # what is said of now, not of `until`: a take-off may just have begun
-        P = result.estimate.P.copy()
-        P[3:6, 3:6] += self.config.start.unnoticed_velocity**2 * np.eye(3)
-        return replace(result, blind_for=0.0, estimate=replace(result.estimate, stamp=exposed, w_WB_B=np.zeros(3), P=P))
+        estimate.P[3:6, 3:6] += self.config.start.unnoticed_velocity**2 * np.eye(3)
+        return replace(result, blind_for=0.0, estimate=replace(estimate, stamp=exposed, w_WB_B=np.zeros(3)))
 
-    def _stand_on(self, features: Features) -> None:
+    def _stand_on(self, floor: float, features: Features) -> None:
         """What was seen of the ground while the vehicle stood, and still is, becomes its first landmarks."""
         exposed, view = self._views[0]
-        if exposed > self.filter.state.stamp:
+        if exposed > self._running.state.stamp:
             return
         known = np.isin(view.ids, features.ids)
         known[len(view.ids) - view.new:] = False
         s = self.config.start
         seen = self._observe(view)
-        ground.take_in(self.filter, view.ids[known], Bearings(seen.b_C[known], seen.shape[known], seen.noise[known]), self._floor,
+        ground.take_in(self._running, view.ids[known], seen.chosen(known), floor,
                        s.ground_sigma, s.ground_least_height)
 
     def _observe(self, features: Features) -> Bearings:
@@ -285,7 +294,7 @@ class VisualInertialOdometry:
 
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
         """Whether the filter still sees, or has to start again."""
-        loss, s = self.config.loss, self.filter.state
+        loss, s = self.config.loss, self._running.state
         if report.used:
             self._informed = exposed
         self._fates.append((report.used, report.refused))
@@ -320,26 +329,27 @@ class VisualInertialOdometry:
 
     def _forget_state(self) -> None:
         self._know()
-        speed, most = float(np.linalg.norm(self.filter.state.v_WB)), self.config.loss.speed
-        self._lost = self.filter.state.stamp, speed if speed < most else most
+        s = self._running.state
+        speed, most = float(np.linalg.norm(s.v_WB)), self.config.loss.speed
+        self._lost = s.stamp, speed if speed < most else most
         self._await()
         self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
 
     def _know(self) -> None:
         """Keep what a new start needs."""
-        s = self.filter.state
+        s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
             self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), self._estimate().pose_covariance[rows])
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
-        s = self.filter.state
+        s = self._running.state
         return VioResult(outcome, self._estimate() if outcome.has_pose else None, len(features.ids), report.used, report.refused,
                          report.nis, report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
 
     def _estimate(self) -> VioPoseEstimate:
-        s = self.filter.state
+        s = self._running.state
         return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), s.w_WB_B.copy(), s.gyro_bias.copy(),
                                s.accel_bias.copy(), s.P[np.ix_(_INERTIAL, _INERTIAL)])
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from perch_core import so3
@@ -143,7 +144,8 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
     variance = (config.filter.pixel_noise / mount.camera.fx) ** 2
     used = np.ones(len(sights), bool)
     while True:
-        end = _descend(s, lambda at_, used=used: _linearised(at_, steps, sights, used, sliding, variance, sigma), sigma, used)
+        linearised = partial(_linearised, steps=steps, sights=sights, used=used, sliding=sliding, variance=variance, sigma=sigma)
+        end = _descend(s, linearised, sigma, used)
         if end is None:
             return None
         s, here = end

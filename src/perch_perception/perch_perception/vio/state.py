@@ -84,8 +84,8 @@ class State:
         """Index of the first landmark in the error."""
         return CORE_SIZE + CLONE_SIZE * len(self.clones)
 
-    def clone_at(self, j: int | np.ndarray) -> int | np.ndarray:
-        """Index of clone j, or of several, in the error."""
+    def clone_at(self, j: int) -> int:
+        """Index of clone j in the error."""
         return CORE_SIZE + CLONE_SIZE * j
 
     def inject(self, dx: np.ndarray) -> None:
@@ -115,7 +115,7 @@ class State:
     def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Move all estimates; returns what carries errors along, rows (size, n) to rows."""
         start, marks = self.landmark_start, list(self.landmarks.values())
-        where = np.concatenate([[0], self.clone_at(np.arange(len(self.clones)))])[:, None] + np.arange(CLONE_SIZE)
+        where = np.array([0, *map(self.clone_at, range(len(self.clones)))])[:, None] + np.arange(CLONE_SIZE)
         R, steps = np.array([self.R_WB, *(c.R_WB for c in self.clones)]), dx[where]
         E, E_BC = so3.exp(steps[:, :3]), so3.exp(dx[CAMERA_ROTATION])
         poses = np.zeros((len(where), CLONE_SIZE, CLONE_SIZE))

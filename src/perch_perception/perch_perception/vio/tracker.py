@@ -76,7 +76,7 @@ class Tracker:
         self._origins: dict[int, np.ndarray] = {}  # pixels of features in the reference frame
         self._pixels, self._ids, self._next = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4])
+        rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4].astype(float))
         inside = np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(config.view_angle)
         mask = cv2.resize(inside.astype(np.uint8) * 255, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         border = 8  # a patch at the border has no gradient beyond it
@@ -99,7 +99,7 @@ class Tracker:
         if self.config.flatten > 0.0:
             image = flattened(image, self.config.flatten)
         if self._previous is not None and len(self._pixels):
-            self._follow(image, R_now_before, slack)
+            self._follow(self._previous, image, R_now_before, slack)
             self._return_to_reference(image)
             self._thin()
         self._previous = image
@@ -110,17 +110,17 @@ class Tracker:
         self.latest = Features(self._ids, self._pixels.astype(float), new, self._fit_sigma(image))
         return self.latest
 
-    def _follow(self, image: np.ndarray, R_now_before: np.ndarray, slack: float) -> None:
+    def _follow(self, previous: np.ndarray, image: np.ndarray, R_now_before: np.ndarray, slack: float) -> None:
         c, rays = self.config, observe(self.camera, self._pixels).b_C @ R_now_before.T
         guess, valid = self.camera.project(rays)
         # what has left the view would be searched for longest
         kept = valid & self.camera.contains(guess, -c.window)
         before, ids, rays, guess = self._pixels[kept], self._ids[kept], rays[kept], guess[kept].astype(np.float32)
-        after, found = self._search(self._previous, image, before, guess, c.levels)
+        after, found = self._search(previous, image, before, guess, c.levels)
         place = np.clip(np.nan_to_num(np.rint(after), nan=-1.0, posinf=-1, neginf=-1), 0,
                         [image.shape[1] - 1, image.shape[0] - 1]).astype(int)
         good = found & self.camera.contains(after) & (self._view[place[:, 1], place[:, 0]] > 0)
-        back, returned = self._search(image, self._previous, after[good], before[good], 0, _CHECK)
+        back, returned = self._search(image, previous, after[good], before[good], 0, _CHECK)
         good[good] = returned & (np.linalg.norm(back - before[good], axis=1) < c.back_check)
         good &= self._one_translation(rays, after, good, slack)
         self._pixels, self._ids = after[good], ids[good]
@@ -198,7 +198,7 @@ class Tracker:
         if not len(self._pixels):
             return np.zeros(0)
         # KLT has the matrix; from an image to itself there is nothing to search for
-        _, _, least = cv2.calcOpticalFlowPyrLK(
+        _, _, least = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
             image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(self.config.window,) * 2, maxLevel=0,
             flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
         information = _KLT_EIGENVALUE * self.config.window**2 * least.ravel().astype(float)
