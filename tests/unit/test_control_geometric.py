@@ -129,14 +129,13 @@ def test_singular_cases_stay_finite(a, h, b3):
 
 
 def test_feedback_never_turns_the_thrust_out_of_its_cone():
-    gains = GeometricGains(cone_deg=30.0)
-    controller = GeometricController(VEHICLE, gains)
+    controller = GeometricController(VEHICLE, GeometricGains())
     for seed in range(50):
         rng = np.random.default_rng(seed)
         state = tuple(float(v) for v in (*rng.normal(size=6) * 5, 0, 0, 0, 1, 0, 0, 0))
         out = controller.step(state, Setpoint((0.0, 0.0, 1.0)).packed, RotorEstimate((1260.0,) * 4, (1260.0,) * 4))
         tilt = np.degrees(np.arccos(Rotation.from_quat(out.q_C).as_matrix()[2, 2]))
-        assert tilt <= 30.0 + 1e-6
+        assert tilt <= GeometricGains.cone_deg + 1e-6
 
 
 def test_prediction_agrees_with_the_rigid_body_model():

@@ -77,7 +77,7 @@ class GeometricController(Law):
             time_to_contact: [s]; near zero position feedback gives way to attitude.
         """
         gains = self.gains
-        share = 1.0 if gains.contact_window <= 0.0 else min(max(time_to_contact / gains.contact_window, 0.0), 1.0)
+        share = min(max(time_to_contact / gains.contact_window, 0.0), 1.0)
         cone = self._narrow + share * (self._wide - self._narrow)
         out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, self._limits(cone),
                            gains.lead, self._vehicle)
