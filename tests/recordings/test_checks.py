@@ -150,6 +150,17 @@ def test_nees_is_three_for_errors_as_large_as_they_are_said_to_be():
     assert 2.6 < np.nanmean(e.nees) < 3.4  # 1197 degrees of freedom: 3 +- 0.12 (1 sigma)
 
 
+def test_a_path_too_straight_to_align_attitudes_by_says_nothing_of_them():
+    # the start of EuRoC's V1_01: a rise of 14 cm, 2 mm across; attitudes are exact, and evo's alignment alone turns them by degrees
+    n, rng = 600, np.random.default_rng(4)
+    p = np.stack([0.002 * rng.standard_normal(n), 0.002 * rng.standard_normal(n), np.linspace(0.0, 0.14, n)], axis=1)
+    truth = Trajectory(5_000_000 * np.arange(n), p, np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)))
+    e = evaluate(Trajectory(truth.stamps, p + 0.002 * rng.standard_normal((n, 3)), truth.q), truth)
+    assert e.ate < 0.004 and np.isnan(e.ate_deg) and e.figures()["attitude_rms_deg"] < 1e-5
+    wide = Trajectory(truth.stamps, p + 0.1 * np.stack([np.sin(0.02 * np.arange(n)), np.cos(0.03 * np.arange(n)), np.zeros(n)], axis=1), truth.q)
+    assert evaluate(Trajectory(truth.stamps, wide.p + 0.002 * rng.standard_normal((n, 3)), truth.q), wide).ate_deg < 0.5
+
+
 def test_trajectories_are_read_to_the_nanosecond(tmp_path):
     truth = circle(20)
     write_tum(tmp_path / "a.tum", truth)

@@ -183,7 +183,7 @@ def _figures(perception: Perception, truth: Trajectory | None) -> tuple[dict[str
             odometry = perception.odometry[::max(1, len(perception.odometry) // 5000)]
             against = evaluate(_trajectory([(o.stamp, o.p_WB, o.q_WB) for o in odometry]), truth)
             figures["estimator"] = against.figures()
-            rows += _evaluation_rows("estimator", against)[:1]
+            rows += _evaluation_rows("estimator", against)[:2]
         plots["The path"] = report.path_figure(vio, compared)
         if compared is not None:
             index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}
@@ -228,7 +228,8 @@ def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
     nees = (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (honest: 3)")
     if not np.isfinite(e.ate):  # it stands, or moves along a line
         return [start, nees]
-    return [(f"{name}: ATE (evo)", f"{100 * e.ate:.2f} cm, {e.ate_deg:.2f} deg rms over {e.duration:.1f} s and {e.path:.1f} m"), start,
+    attitude, why = (f", {e.ate_deg:.2f} deg", "") if np.isfinite(e.ate_deg) else ("", "; too straight a path to align attitudes by")
+    return [(f"{name}: ATE (evo)", f"{100 * e.ate:.2f} cm{attitude} rms over {e.duration:.1f} s and {e.path:.1f} m{why}"), start,
             (f"{name}: RPE (evo)", f"{100 * e.rpe:.2f} cm, {e.rpe_deg:.2f} deg rms over {e.rpe_delta:g} m"),
             (f"{name}: scale", f"{e.scale:.4f}"), nees]
 

@@ -12,6 +12,7 @@ from perch_eval.recordings.trajectory import Trajectory
 
 LEAST_POSES = 5
 LEAST_PATH = 0.1  # of a motion whose shape can be compared [m]
+MOST_OPEN = 0.2   # by which errors may turn a path's shape about itself: beyond, its alignment says nothing of the attitude [rad]
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Evaluation:
         duration: compared [s].
         path: length of the true path [m].
         ate: absolute trajectory error after the best rigid alignment, rms [m]; nan: the motion is too short to be aligned.
-        ate_deg: the same of the attitude [deg].
+        ate_deg: the same of the attitude [deg]; nan also where the path is so straight that its shape leaves its attitude open.
         rpe: error of the motion over `rpe_delta` of path, rms [m]; nan likewise.
         rpe_deg: of the attitude [deg].
         rpe_delta: [m].
@@ -124,8 +125,8 @@ def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float
     try:
         scale = float(of(estimate).align(of(true), correct_scale=True)[2])
         ours.align(of(true))
-        ate, ate_deg = (rms(metrics.APE(relation), ours)
-                        for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg))
+        ate = rms(metrics.APE(PoseRelation.translation_part), ours)
+        ate_deg = rms(metrics.APE(PoseRelation.rotation_angle_deg), ours) if ate < MOST_OPEN * _breadth(true.p) else np.nan
     except GeometryException:  # along a line, or on the spot
         ate, ate_deg, scale = np.nan, np.nan, np.nan
     try:
@@ -135,6 +136,15 @@ def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float
     except MetricsException:
         rpe, rpe_deg = np.nan, np.nan
     return ate, ate_deg, rpe, rpe_deg, 1.0 / scale if scale else np.nan
+
+
+def _breadth(p: np.ndarray) -> float:
+    """Rms distance of positions (n, 3) from the straight line that is nearest to them [m].
+
+    A turn about that line by delta moves them by delta times this, so errors of rms e leave it open by e / breadth.
+    """
+    spread = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
+    return float(np.hypot(spread[1], spread[2]) / np.sqrt(len(p)))
 
 
 def _span(trajectory: Trajectory) -> str:
