@@ -1,16 +1,25 @@
-"""What all tests share: checked message fields, reproducible examples, ROS domains of their own, and which of them are quick."""
+"""What all tests share: compiled Python, checked message fields, reproducible examples, ROS domains of their own, and which of them are quick."""
 
 from __future__ import annotations
 
 import os
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+UNIT = Path(__file__).parent / "unit"
+
+# The tests start some hundred Python processes. Where nobody keeps what Python compiles (PYTHONDONTWRITEBYTECODE; pip with --no-compile),
+# each of them would compile a thousand files again, three seconds of processor time: it is kept here, outside the sources.
+sys.pycache_prefix = os.environ.setdefault("PYTHONPYCACHEPREFIX", str(UNIT.parents[1] / ".perch" / "pycache"))
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # Before the first message class is imported: by default a wrong type becomes silent garbage on the wire.
 os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
@@ -24,7 +33,6 @@ settings.register_profile(
     "perch", deadline=None, derandomize=True, print_blob=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("perch")
 
-UNIT = Path(__file__).parent / "unit"
 TAKES_TIME = re.compile(
     r"^\s*(?:from|import) (?:closed_loop|oracles|perch_eval(?:\.| import )(?:control_flights|estimation_flight|in_process|program|ros|scripted_flight|stack)|"
     r"perch_core\.isolated|perch_sim\.(?:rendering|simulation)|psutil|rclpy|subprocess)\b", re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Runs the repository's scripts as a user does, in processes of their own or, where a process shows nothing more, in this one."""
+"""Runs the repository's scripts as a user does, in processes of their own or, where a process shows nothing more, forked or in this one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+from system import forks
+
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 600.0
 """Only ever waited for in full when a test fails [s]."""
@@ -22,6 +24,11 @@ def run_script(name: str, *arguments: str, **environment: str) -> subprocess.Com
     return subprocess.run(
         [sys.executable, str(ROOT / "scripts" / name), *arguments], env={**os.environ, **environment},
         capture_output=True, text=True, timeout=PATIENCE)
+
+
+def fork_script(name: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run `scripts/<name>` to its end in a process that is forked from one that has made its imports, for scripts that join the ROS graph."""
+    return forks.run(forks.SCRIPTS, [str(ROOT / "scripts" / name), *arguments], PATIENCE, {**os.environ, **environment})
 
 
 def call_script(name: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:

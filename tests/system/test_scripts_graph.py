@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 from perch_eval.domain import reserved_domain
-from system.scripts import PATIENCE, run_script, start_script
+from system.scripts import PATIENCE, fork_script, start_script
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def eventually(condition) -> None:
 @pytest.fixture
 def run(peer):
     """Runs a script in the domain of the node."""
-    return lambda *arguments: run_script(*arguments, "--spin-time", "30", **peer)
+    return lambda *arguments: fork_script(*arguments, "--spin-time", "30", **peer)
 
 
 def test_topics_are_listed_with_types(run):
@@ -65,7 +65,7 @@ def test_echo_of_a_field_that_does_not_exist(run):
 
 
 def test_a_topic_that_does_not_exist_is_the_caller_s_mistake(peer):
-    result = run_script("topic.py", "echo", "/nothing", "--spin-time", "0.1", **peer)
+    result = fork_script("topic.py", "echo", "/nothing", "--spin-time", "0.1", **peer)
     assert result.returncode == 2 and "topic /nothing does not exist in ROS domain" in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
@@ -101,7 +101,7 @@ def test_parameters(run):
 
 
 def test_a_node_that_does_not_exist(peer):
-    result = run_script("param.py", "get", "/ghost", "gain", "--spin-time", "1", **peer)
+    result = fork_script("param.py", "get", "/ghost", "gain", "--spin-time", "1", **peer)
     assert result.returncode == 2 and "node /ghost does not exist" in result.stderr
 
 
