@@ -1,12 +1,10 @@
-"""Starts executables of nodes as a user does, and plain scripts beside them."""
+"""Starts executables of nodes, each in a process of its own, and plain scripts beside them."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +16,7 @@ from rcl_interfaces.srv import ListParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from system import forks
 
 PLAIN = Path(__file__).parent / "plain"
 FREE = ("estimator", "vio", "target_localizer", "powerline_mapper", "controller", "perching_planner", "powerline_planner", "mission", "description")
@@ -29,13 +28,12 @@ class Running:
     """One executable. Its output goes into a file: nobody reads a pipe that a node may fill."""
 
     def __init__(self, name: str, folder: Path, namespace: str, parameters: Mapping[str, object]) -> None:
-        self.name = f"{namespace}/{name}"
+        self.name, self.domain = f"{namespace}/{name}", os.environ["ROS_DOMAIN_ID"]
         self._log = folder / f"{name}.log"
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
         with self._log.open("w") as file:
-            self.process = subprocess.Popen(
-                [executable(NODES[name].package, name), "--ros-args", "-r", f"__ns:={namespace or '/'}", *given],
-                env=dict(os.environ), stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
+            self.process = forks.Forked(
+                forks.NODES, [executable(NODES[name].package, name), "--ros-args", "-r", f"__ns:={namespace or '/'}", *given], file, file)
 
     @property
     def log(self) -> str:
@@ -101,6 +99,6 @@ def wait_for(running: Collection[Running]) -> None:
 
 def plain(script: str, *arguments: str) -> dict:
     """What a script of `plain/` prints; it may import nothing of perch but messages."""
-    done = subprocess.run([sys.executable, str(PLAIN / script), *arguments], env=dict(os.environ), capture_output=True, text=True, timeout=PATIENCE)
+    done = forks.run(forks.SCRIPTS, [str(PLAIN / script), *arguments], PATIENCE)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

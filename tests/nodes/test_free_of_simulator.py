@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from nodes.node_process import PLAIN, plain
 from perch_core.vehicle import load_vehicle
-from system.scripts import run_script
+from system.scripts import fork_script
 
 
 def test_the_plain_scripts_import_nothing_of_perch_but_messages():
@@ -38,11 +38,11 @@ def test_time_may_be_that_of_a_clock_topic(graph):
     names = [graph[name].name for name in ("estimator", "controller", "vio")]
     try:
         for name in names:
-            assert run_script("param.py", "set", name, "use_sim_time", "true", "--spin-time", "60").returncode == 0
+            assert fork_script("param.py", "set", name, "use_sim_time", "true", "--spin-time", "60").returncode == 0
         check_chain(plain("states.py", "200", "400", "clock"))
     finally:
         for name in names:
-            run_script("param.py", "set", name, "use_sim_time", "false")
+            fork_script("param.py", "set", name, "use_sim_time", "false")
 
 
 @pytest.mark.parametrize("kind", ["raw", "compressed"])

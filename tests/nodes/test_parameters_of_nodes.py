@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from system.scripts import run_script
+from system.scripts import fork_script
 
 
 def test_a_parameter_is_described_before_and_after_a_refusal_alike(graph):
     def param(*arguments):
-        return run_script("param.py", *arguments, "--spin-time", "60")
+        return fork_script("param.py", *arguments, "--spin-time", "60")
 
     name = "flight.odometry.timeout"
     described = param("describe", "/controller", name).stdout

@@ -1,11 +1,14 @@
-"""Every node's executable, alone, ends cleanly on SIGINT and on SIGTERM."""
+"""Every node's executable, alone, ends cleanly on SIGINT and on SIGTERM.
+
+One is started as a user does; the others are forked from a process that has their code, and run the same files.
+"""
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import psutil
@@ -19,9 +22,12 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
+from system import forks
 
 PATIENCE = 300.0
 """For nodes to come up, compiled functions included, and to end; only ever waited for in full when a test fails [s]."""
+
+AS_A_USER = "vehicle"
 
 
 class Watch:
@@ -34,7 +40,7 @@ class Watch:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
 
-    def wait_for(self, name: str, process: subprocess.Popen) -> None:
+    def wait_for(self, name: str, process: Executable) -> None:
         """Wait until a node answers."""
         client = AsyncParameterClient(self._node, name)
         end = time.monotonic() + PATIENCE
@@ -43,9 +49,9 @@ class Watch:
         self._until(future.done, process, end)
         assert future.result().result.names
 
-    def _until(self, done, process: subprocess.Popen, end: float) -> None:
+    def _until(self, done, process: Executable, end: float) -> None:
         while not done():
-            assert process.poll() is None, process.stderr.read()
+            assert process.process.poll() is None, process.said
             assert time.monotonic() < end, "the node does not answer"
             self._executor.spin_once(timeout_sec=0.02)
 
@@ -55,7 +61,22 @@ class Watch:
         self._context.try_shutdown()
 
 
-def start(node: str, folder: Path) -> subprocess.Popen:
+class Executable:
+    """One process of a node, whose output goes into a file."""
+
+    def __init__(self, command: Sequence[str], log: Path, forked: bool) -> None:
+        self._log = log
+        with log.open("w") as file:
+            self.process = (forks.Forked(forks.NODES, command, file, file) if forked else
+                            subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file))
+
+    @property
+    def said(self) -> str:
+        """All that it has written."""
+        return self._log.read_text()
+
+
+def start(node: str, folder: Path) -> Executable:
     """Start an executable with its parameter file, in a namespace where no other node is."""
     file = config.config_dir() / f"{node}.yaml"
     arguments = ["--ros-args", "-r", f"__ns:=/alone_{node}", *(["--params-file", str(file)] if file.exists() else [])]
@@ -63,8 +84,7 @@ def start(node: str, folder: Path) -> subprocess.Popen:
         arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
     if node == "viewer":
         arguments += ["-p", "port:=0"]
-    return subprocess.Popen([executable(NODES[node].package, node), *arguments], env=dict(os.environ), stdin=subprocess.DEVNULL,
-                            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=folder)
+    return Executable([executable(NODES[node].package, node), *arguments], folder / f"{node}.log", node != AS_A_USER)
 
 
 def works(process: psutil.Process) -> bool:
@@ -85,21 +105,21 @@ def test_every_executable_stops_cleanly(number, names, ros_domain, tmp_path, rec
         for node, process in processes.items():
             watch.wait_for(f"/alone_{node}/{node}", process)
         for node, process in processes.items():
-            children = psutil.Process(process.pid).children(recursive=True)
+            children = psutil.Process(process.process.pid).children(recursive=True)
             began = time.monotonic()
-            process.send_signal(number)
-            _, error = process.communicate(timeout=PATIENCE)
+            process.process.send_signal(number)
+            code = process.process.wait(PATIENCE)
             durations[node] = time.monotonic() - began
-            if process.returncode not in (0, -signal.SIGALRM) or "Traceback" in error:
-                problems.append(f"{node}: exit code {process.returncode}: {error}")
+            if code not in (0, -signal.SIGALRM) or "Traceback" in process.said:
+                problems.append(f"{node}: exit code {code}: {process.said}")
             while any(map(works, children)) and time.monotonic() - began < PATIENCE:
                 time.sleep(0.02)
             problems += [f"{node} leaves {child}" for child in children if works(child)]
     finally:
         watch.close()
         for process in processes.values():
-            process.kill()
-            process.wait()
+            process.process.kill()
+            process.process.wait(PATIENCE)
     record_property("stopped_after_s", durations)
     with capsys.disabled():
         print(f"\n{number.name}: " + ", ".join(f"{node} {1e3 * s:.0f} ms" for node, s in durations.items()))
