@@ -10,15 +10,17 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import TimeoutExpired
 
 from nav_msgs.msg import Odometry
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_eval.nodes import ALL_NODES, programs
-from perch_eval.program import RunningProgram
+from perch_eval.program import Program
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_msgs.msg import ControllerStatus
 from perch_sim.scenario import Scenario, load_scenario
+from system.forks import NODES, Forked
 from system.scripts import PATIENCE
 
 SHORT = """
@@ -30,6 +32,41 @@ parameters: {vehicle: {cameras: front, start_timeout: 300.0, lockstep_timeout: 3
 """A perch whose VIO is a model, and whose front camera alone takes images; on a busy machine nodes may take their time to start."""
 BLIND = SHORT.replace("cameras: front", "cameras: none")
 """The same without images: it climbs, looks for a target and finds none."""
+
+
+class Running:
+    """A program of nodes, forked from a process that has their code; what an executable is by itself is shown in `test_flight_surface.py`."""
+
+    def __init__(self, program: Program, hear: Callable[[str], None]) -> None:
+        """
+        Args:
+            program: what runs.
+            hear: receives each line that it writes, from a thread of its own.
+        """
+        reads, writes = os.pipe()
+        with os.fdopen(writes, "w") as output:
+            self._process = Forked(NODES, program.command, output, output)
+        self._reader = threading.Thread(target=self._read, args=(reads, hear), daemon=True)
+        self._reader.start()
+
+    @staticmethod
+    def _read(file: int, hear: Callable[[str], None]) -> None:
+        with os.fdopen(file, errors="replace") as lines:
+            for line in lines:
+                hear(line.rstrip())
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def end(self, patience: float) -> None:
+        """Wait for its end; kill it where that does not come in time [s]."""
+        try:
+            self._process.wait(patience)
+        except TimeoutExpired:
+            self.signal(signal.SIGKILL)
+            self._process.wait(PATIENCE)
+        self._reader.join(PATIENCE)
 
 
 class Rig:
@@ -52,11 +89,11 @@ class Rig:
         source = folder / "short.yaml"
         source.write_text(scenario)
         self.scenario = load_scenario(source)
-        self._folder, self._lines, self._came = folder, [], threading.Condition()
+        self._lines, self._came = [], threading.Lock()
         started = programs(self.scenario, 1, scenario_source=str(source), composed=[n for n in ALL_NODES if n not in alone], lockstep=lockstep,
                            hold_for_goal=lockstep, folder=folder)
         self._programs = {program.name: program for program in started}
-        self._running: dict[str, RunningProgram] = {}
+        self._running: dict[str, Running] = {}
         self.pilot = MissionClient()
         self.truth, self.controller, self._cues = None, -1, []
         node = self.pilot.node
@@ -71,8 +108,7 @@ class Rig:
 
     def start(self, name: str) -> None:
         """Start a program, for the first time or again."""
-        log = self._folder / f"{name}.{time.monotonic_ns()}.log"
-        self._running[name] = RunningProgram(self._programs[name], log, {**os.environ, "PYTHONUNBUFFERED": "1"}, self._write)
+        self._running[name] = Running(self._programs[name], lambda line: self._write(name, line))
 
     def start_all(self) -> None:
         """Start all programs, and wait until their nodes are in the graph."""
@@ -93,7 +129,7 @@ class Rig:
     def kill(self, name: str) -> None:
         """Kill a program, and wait for its end."""
         self._running[name].signal(signal.SIGKILL)
-        self._running[name].ending()
+        self._running[name].end(PATIENCE)
 
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to a program."""
@@ -162,9 +198,7 @@ class Rig:
             running.signal(signal.SIGCONT)
             running.signal(signal.SIGINT)
         for running in self._running.values():
-            if not running.wait(10.0):
-                running.signal(signal.SIGKILL)
-                running.ending()
+            running.end(10.0)
         self.pilot.close()
 
 
