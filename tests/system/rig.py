@@ -7,7 +7,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import TimeoutExpired
@@ -15,8 +15,9 @@ from subprocess import TimeoutExpired
 from nav_msgs.msg import Odometry
 from perch_core.errors import PerchError
 from perch_core.ros import topics
-from perch_eval.nodes import ALL_NODES, programs
-from perch_eval.program import Program
+from perch_eval import modelled_sight_node
+from perch_eval.modelled_sight_node import blind_launches
+from perch_eval.nodes import ALL_NODES, node_programs
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_msgs.msg import ControllerStatus
 from perch_sim.scenario import Scenario, load_scenario
@@ -27,25 +28,25 @@ SHORT = """
 extends: surface_90
 name: short
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
-parameters: {vehicle: {cameras: front, start_timeout: 300.0, lockstep_timeout: 300.0}}
+parameters: {vehicle: {start_timeout: 300.0, lockstep_timeout: 300.0}}
 """
-"""A perch whose VIO is a model, and whose front camera alone takes images; on a busy machine nodes may take their time to start."""
-BLIND = SHORT.replace("cameras: front", "cameras: none")
-"""The same without images: it climbs, looks for a target and finds none."""
+"""A perch without images: VIO and sightings are made from the truth. On a busy machine nodes may take their time to start."""
+BLIND = SHORT.replace("target_localizer, ", "")
+"""The same with nobody to see: it climbs, looks for a target and finds none."""
 
 
 class Running:
     """A program of nodes, forked from a process that has their code; what an executable is by itself is shown in `test_flight_surface.py`."""
 
-    def __init__(self, program: Program, hear: Callable[[str], None]) -> None:
+    def __init__(self, command: Sequence[str], hear: Callable[[str], None]) -> None:
         """
         Args:
-            program: what runs.
+            command: a Python script and its arguments.
             hear: receives each line that it writes, from a thread of its own.
         """
         reads, writes = os.pipe()
         with os.fdopen(writes, "w") as output:
-            self._process = Forked(NODES, program.command, output, output)
+            self._process = Forked(NODES, command, output, output)
         self._reader = threading.Thread(target=self._read, args=(reads, hear), daemon=True)
         self._reader.start()
 
@@ -90,8 +91,9 @@ class Rig:
         source.write_text(scenario)
         self.scenario = load_scenario(source)
         self._lines, self._came = [], threading.Lock()
-        started = programs(self.scenario, 1, scenario_source=str(source), composed=[n for n in ALL_NODES if n not in alone], lockstep=lockstep,
-                           hold_for_goal=lockstep, folder=folder)
+        launches = blind_launches(self.scenario, 1, str(source), lockstep, overrides={"mission": {"lockstep_hold": "perch"}} if lockstep else {})
+        together = [name for name in ALL_NODES if name not in (*alone, *modelled_sight_node.NODES)]
+        started = node_programs(launches, folder, composed=together)
         self._programs = {program.name: program for program in started}
         self._running: dict[str, Running] = {}
         self.pilot = MissionClient()
@@ -108,7 +110,10 @@ class Rig:
 
     def start(self, name: str) -> None:
         """Start a program, for the first time or again."""
-        self._running[name] = Running(self._programs[name], lambda line: self._write(name, line))
+        arguments = self._programs[name].command
+        if name in modelled_sight_node.NODES:
+            arguments = (modelled_sight_node.__file__, name, *arguments[1:])
+        self._running[name] = Running(arguments, lambda line: self._write(name, line))
 
     def start_all(self) -> None:
         """Start all programs, and wait until their nodes are in the graph."""
