@@ -155,6 +155,25 @@ def test_a_lens_known_to_its_sigmas_makes_a_pose_as_sure_as_it_is():
     assert np.linalg.norm(considered) < np.linalg.norm(ignored)
 
 
+def printed(rng, sigma):
+    """Corners of a board whose tags are each shifted in its plane."""
+    return CORNERS + np.concatenate([rng.normal(0.0, sigma, (4, 1, 2)), np.zeros((4, 1, 1))], axis=2)
+
+
+def test_a_board_glued_to_its_sigma_makes_a_pose_as_sure_as_it_is():
+    rng, print_sigma, nees = np.random.default_rng(8), 2e-4, {0.0: [], 2e-4: []}
+    for _ in range(60):
+        p, R = view_of_pad(rng, 1.0, 90.0)
+        pixels = CAMERA.project(printed(rng, print_sigma) @ R.T + p)[0]
+        rays = CAMERA.unproject(pixels + rng.normal(0.0, 0.03, pixels.shape))
+        for told, values in nees.items():
+            pose = solve(rays, 0.03, start=(p, R), print_sigma=told)
+            e = errors(p, R, pose)
+            values.append(e @ np.linalg.solve(pose.covariance, e))
+    assert 4.9 < np.mean(nees[print_sigma]) < 7.1  # 6 +- 0.45 (1 sigma)
+    assert np.mean(nees[0.0]) > 8.0
+
+
 def test_the_papers_average_has_no_flips_but_the_joint_solution_is_better():
     """[M:sec. IV-B] at 3 m: single tags flip, their average with branches resolved does not."""
     rng = np.random.default_rng(6)

@@ -39,6 +39,7 @@ class LocalizerConfig:
     view_margin: float = config.quantity(1.2, low=1.0, high=3.0, doc="what is looked at around the pad, in pad sizes")
 
 
+PRINT_SIGMA = 0.0002  # of a tag's place on the board, per axis: what plotters and careful gluing keep [m]
 FOLLOW_GAP = 0.1      # time since the last sighting over which corners are expected well enough [s]
 FOLLOW_TAGS = 3       # so many tags must be expected: their agreement shows that nothing else was measured
 EXPECTED_MARGIN = 6.0  # an expected corner this near to the border may be outside [px]
@@ -234,7 +235,8 @@ class BoardLocalizer:
             if start is not None:  # these are not detected, only expected
                 raise LocalizationRefusal(notes[-1])
         corners_S, rays, sigma = self.board.corners_S[[self.board.ids.index(i) for i in ids]], refined.rays_C, refined.sigma
-        pose = solve_board(camera, corners_S, rays, sigma, ids, None if expected is None else expected[1], start, self._lens_sigma)
+        pose = solve_board(camera, corners_S, rays, sigma, ids, None if expected is None else expected[1], start, self._lens_sigma,
+                           PRINT_SIGMA)
         distance = float(np.linalg.norm(pose.p_CS))
         if not self.settings.min_range <= distance <= self.settings.max_range:
             raise LocalizationRefusal(

@@ -8,6 +8,9 @@ considered. With the corners' derivative G by k, whitened and in k's sigmas, the
 
     W = (I + G G^T)^-1 = I - G (I + G^T G)^-1 G^T,   A = (J^T W J)^-1 J^T W,   cov = A A^T (noise) + A G G^T A^T (lens).
 
+Tags are printed or glued as a whole, each a little beside its place: their shifts in the board's plane, of one sigma in both directions,
+are columns of G like the lens's, but for by_intrinsics; what they do to the pose is part of its noise.
+
 What no pose and no lens explains is noise: prints and paper put corners elsewhere, too, and the corners' sigmas grow by it. Otherwise
 the lens, which has one sigma whatever the number of corners, is bent to fit what is not its own.
 
@@ -74,7 +77,7 @@ class BoardPose:
 
 def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
                 prior_R_CS: np.ndarray | None = None, start: tuple[np.ndarray, np.ndarray] | None = None,
-                lens_sigma: np.ndarray = EXACT_LENS) -> BoardPose:
+                lens_sigma: np.ndarray = EXACT_LENS, print_sigma: float = 0.0) -> BoardPose:
     """Joint pose over all corners; a tag that contradicts the others is left out.
 
     Args:
@@ -86,12 +89,13 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         prior_R_CS: predicted attitude; only helps to choose between two minima.
         start: predicted (p_CS, R_CS) of a board whose pose was unique: spares looking for a second minimum.
         lens_sigma: 1-sigma of the lens's fx, fy (relative), cx, cy [px], shape (4,).
+        print_sigma: 1-sigma of a tag's place on the board, in each direction of its plane [m].
 
     Raises:
         LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
     """
     keep, dropped = np.arange(len(ids)), list[int]()
-    best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start)
+    best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start)
     # of two tags that disagree, either may be wrong
     while best.misfit > _limit(_freedom(len(keep))) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
         expected, seen = camera.project(corners_S[keep] @ best.R_CS.T + best.p_CS)[0], camera.project(rays_C[keep])[0]
@@ -100,7 +104,8 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         for out in np.argsort(-np.nan_to_num(off, nan=np.inf).max(axis=1))[:SUSPECTS]:
             rest = np.delete(keep, out)
             some = tuple(ids[k] for k in rest)
-            trials.append((_solve(camera, corners_S[rest], rays_C[rest], sigma[rest], some, lens_sigma, prior_R_CS), keep[out], rest))
+            trial = _solve(camera, corners_S[rest], rays_C[rest], sigma[rest], some, lens_sigma, print_sigma, prior_R_CS, start)
+            trials.append((trial, keep[out], rest))
         trial, out, rest = min(trials, key=lambda trial: trial[0].misfit)
         explained = best.misfit * _freedom(len(keep)) - trial.misfit * _freedom(len(rest))
         if explained / 8.0 < OUTLIER * max(trial.misfit, 1.0):
@@ -113,7 +118,8 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
     if best.unexplained > 1.0:
         noise = sigma[keep] * np.sqrt(best.unexplained)
-        best = replace(_solve(camera, corners_S[keep], rays_C[keep], noise, best.ids, lens_sigma, prior_R_CS, start), misfit=best.misfit)
+        again = _solve(camera, corners_S[keep], rays_C[keep], noise, best.ids, lens_sigma, print_sigma, prior_R_CS, start)
+        best = replace(again, misfit=best.misfit)
     return replace(best, dropped=tuple(sorted(dropped)))
 
 
@@ -127,13 +133,13 @@ def _limit(freedom: int) -> float:
     return float(chi2_quantile(CONSISTENT, freedom)) / freedom
 
 
-def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, prior_R_CS, start=None) -> BoardPose:
+def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start=None) -> BoardPose:
     """Best of the two IPPE branches, or of the start alone, after refinement."""
     points, rays = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3)
     pixels, seen = camera.project(rays)
     if not np.all(seen):
         raise LocalizationRefusal("a corner lies beyond the lens's field of view")
-    corners = _Corners(camera, points, sigma.reshape(-1), pixels, lens_sigma)
+    corners = _Corners(camera, points, sigma.reshape(-1), pixels, lens_sigma, print_sigma)
     branches = []
     for p, R in [start] if start is not None else planar_branches(points, rays):
         corners.start(p, R)
@@ -213,15 +219,20 @@ class _Corners:
         noise: 1-sigma of each [px], shape (m,).
         pixels: where they were measured, shape (m, 2).
         lens_sigma: 1-sigma of fx, fy (relative), cx, cy [px], shape (4,).
+        print_sigma: 1-sigma of the place of four corners together [m].
     """
 
-    def __init__(self, camera: Camera, points_S: np.ndarray, noise: np.ndarray, pixels: np.ndarray, lens_sigma: np.ndarray) -> None:
+    def __init__(self, camera: Camera, points_S: np.ndarray, noise: np.ndarray, pixels: np.ndarray, lens_sigma: np.ndarray,
+                 print_sigma: float = 0.0) -> None:
         self._camera, self._points, self._noise, self._pixels, self._lens_sigma = camera, points_S, noise, pixels, lens_sigma
+        self._print_sigma = print_sigma
+        self._by_print = np.zeros((2 * len(points_S), 0))  # by the tags' shifts, in their sigmas
         self._consider(pixels)
 
     def start(self, p: np.ndarray, R: np.ndarray) -> None:
         """Take the lens's derivatives at a pose: at the measured pixels their noise would correlate with the residuals', as a longer lens."""
         pixels, seen = self._camera.project(self._points @ R.T + p)
+        self._by_print = self._printed(p, R)
         self._consider(np.where(seen[:, None], pixels, self._pixels))
 
     def _consider(self, pixels: np.ndarray) -> None:
@@ -229,8 +240,19 @@ class _Corners:
         by_lens[:, 0, 0], by_lens[:, 1, 1] = pixels[:, 0] - self._camera.cx, pixels[:, 1] - self._camera.cy
         by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
         self._by_lens = (by_lens / self._noise[:, None, None]).reshape(-1, 4)
-        self._G = self._by_lens * self._lens_sigma
-        self._back = np.linalg.solve(np.eye(4) + self._G.T @ self._G, self._G.T)
+        self._G = np.concatenate([self._by_lens * self._lens_sigma, self._by_print], axis=1)
+        self._back = np.linalg.solve(np.eye(self._G.shape[1]) + self._G.T @ self._G, self._G.T)
+
+    def _printed(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
+        """Derivative of the whitened pixels by the shift of each tag in its plane, in sigmas, shape (2m, m / 2); (2m, 0) where it has none."""
+        m = len(self._points)
+        if self._print_sigma == 0.0:
+            return np.zeros((2 * m, 0))
+        by_shift = self._camera.project_jacobian(self._points @ R.T + p) @ (self._print_sigma * R[:, :2]) / self._noise[:, None, None]
+        out = np.zeros((m // 4, 8, m // 4, 2))
+        tags = np.arange(m // 4)
+        out[tags, :, tags] = np.nan_to_num(by_shift).reshape(m // 4, 8, 2)
+        return out.reshape(2 * m, m // 2)
 
     def linearise(self, p: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
         """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
@@ -242,15 +264,17 @@ class _Corners:
         return float(residual @ weighed), jacobian.T @ weighed, jacobian.T @ self._weighed(jacobian)
 
     def errors(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """At the minimum: covariance of (dp, dtheta) from the noise, (6, 6), and their derivative by the true lens, (6, 4).
+        """At the minimum: covariance of (dp, dtheta) from noise and print, (6, 6), and their derivative by the true lens, (6, 4).
 
         Pixels that a longer lens makes larger bring the solution nearer than the truth, which is ahead: -A dr/dk.
         """
         jacobian, projected = self._jacobian(p, R)
+        self._by_print = self._printed(p, R)
         self._consider(projected)
         weighed = self._weighed(jacobian)
         A = np.linalg.solve(jacobian.T @ weighed, weighed.T)
-        return A @ A.T, -A @ self._by_lens
+        by_print = A @ self._by_print
+        return A @ A.T + by_print @ by_print.T, -A @ self._by_lens
 
     def unexplained(self, p: np.ndarray, R: np.ndarray) -> float:
         """Mean square of the whitened residuals that no pose and no lens explains, of corners or of whole tags; 1 where it may be chance.
@@ -261,7 +285,10 @@ class _Corners:
         jacobian, projected = self._jacobian(p, R)
         residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
         explaining = np.concatenate([jacobian, self._by_lens], axis=1)
-        explaining /= np.linalg.norm(explaining, axis=0)
+        if self._by_print.size:  # by what print leaves open, residuals are correlated
+            root = np.linalg.cholesky(np.eye(len(residual)) + self._by_print @ self._by_print.T)
+            residual, explaining = np.linalg.solve(root, residual), np.linalg.solve(root, explaining)
+        explaining = explaining / np.linalg.norm(explaining, axis=0)
         rest = residual - explaining @ np.linalg.lstsq(explaining, residual, rcond=1e-6)[0]
         of_tags = 2.0 * rest.reshape(-1, 4, 2).mean(axis=1).ravel()
         means = [(float(part @ part) / (len(part) - 8), len(part) - 8) for part in (rest, of_tags) if len(part) > 8]
