@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections import Counter
 from contextlib import nullcontext
@@ -137,6 +139,17 @@ def test_processes_of_a_fork_server_are_their_own_and_end_with_it(tmp_path, monk
     os.killpg(pids[0], signal.SIGKILL), server.close()
     until(lambda: not alive(pids[1]))
     os.killpg(pids[1], signal.SIGKILL)
+
+
+def test_processes_of_a_fork_server_end_with_a_caller_that_is_killed(tmp_path):
+    caller = subprocess.Popen([sys.executable, "-c", (
+        "import sys, time; from pathlib import Path; from perch_eval.fork_server import ForkServer\n"
+        f"print(ForkServer(()).start('signal:pause', [], Path({str(tmp_path / 'log')!r}), {{}}), flush=True); time.sleep(60)")],
+        stdout=subprocess.PIPE, text=True)
+    pid = int(caller.stdout.readline())
+    assert alive(pid)
+    caller.kill(), caller.wait()
+    until(lambda: not alive(pid))
 
 
 def until(done, patience=120.0):

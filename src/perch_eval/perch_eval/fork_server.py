@@ -30,7 +30,7 @@ class ForkServer:
             modules: what is loaded before anything is forked.
         """
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(list(modules))
+        self._context.set_forkserver_preload(["perch_eval.ended_with_caller", *modules])
         self._started: list[ForkServerProcess] = []
 
     def start(self, what: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str]) -> int:
