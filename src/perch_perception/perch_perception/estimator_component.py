@@ -16,6 +16,7 @@ from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
 from perch_perception.sensor_file import imu_axes, imu_noise
 from perch_perception.ukf import Estimate, Estimator, VioOutcome, VioPose
+from perch_perception.ukf.estimator import COVARIANCE_STRIDE
 from perch_perception.ukf.odometry import covariances, pose_of, state_of
 from perch_perception.world_frames import MAP, is_world
 
@@ -54,7 +55,7 @@ class StateEstimator(Component[EstimatorConfig]):
         self._unused: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, what it says)
         self._newest_state = _NEVER
         self._covariances = (np.zeros((6, 6)), np.zeros((6, 6)))
-        self._covariance_age = self.config.covariance_stride  # IMU samples since they were computed
+        self._covariance_age = COVARIANCE_STRIDE  # IMU samples since they were computed
         self._first: int | None = None  # stamp of the first IMU sample
         self._statuses = self._diagnoses = 0
 
@@ -121,12 +122,12 @@ class StateEstimator(Component[EstimatorConfig]):
             outcome = self._estimator.add_vio(pose)
             if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
                 self._newest_state = stamp
-            self._covariance_age = self.config.covariance_stride
+            self._covariance_age = COVARIANCE_STRIDE
             if not outcome.used and outcome not in (VioOutcome.WAITING, VioOutcome.NO_IMU):
                 self.warn(f"{'vio/odometry' if is_odometry else 'vio/state'}: at {stamp} ns {outcome.value}", 1.0)
 
     def _emit(self, stamp: int, e: Estimate) -> None:
-        if self._covariance_age >= self.config.covariance_stride:
+        if self._covariance_age >= COVARIANCE_STRIDE:
             self._covariances = covariances(so3.quat_to_matrix(e.q_WB), e.v_WB, e.P, self._estimator.gyro_sigma)
             self._covariance_age = 0
         self._covariance_age += 1

@@ -17,6 +17,7 @@ from perch_perception.line_mapping import Backdrop, LineDetectionConfig, LineMap
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.sensor_file import mount_rotation, sensors_parameter
 
+MOST_POSE_SIGMA = 2.0  # of odometry that maps [m]
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
 
@@ -30,8 +31,6 @@ class PowerlineMapperConfig:
     images: str = images_parameter()
     extrinsics: str = extrinsics_parameter()
     rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
-    max_pose_sigma: float = config.quantity(2.0, unit="m", above=0.0, high=10.0,
-                                            doc="odometry less certain than this maps nothing")
     detection: LineDetectionConfig = config.part(LineDetectionConfig)
     mapper: MapperConfig = config.part(MapperConfig)
 
@@ -77,7 +76,7 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
         self._used = exposed
         mount, problem = self.mounted.known, ""
         try:
-            body = mapping_pose(self.bodies, exposed, self.config.max_pose_sigma)
+            body = mapping_pose(self.bodies, exposed, MOST_POSE_SIGMA)
             pixels = self._pixels(image, mount.camera)
             sightings = detect_lines(pixels, mount.camera, self.config.detection)
             if self._backdrop is not None:

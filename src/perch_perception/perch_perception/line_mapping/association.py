@@ -13,13 +13,14 @@ from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import WireEstimate
 
 
+MAPPED_GATE = 1.2  # of a sighting to a triangulated wire [deg]
+FOLLOWED_GATE = 5.0  # to the last sighting of a wire that is not triangulated yet [deg]
+
+
 @dataclass(frozen=True)
 class AssociationConfig:
     """How near a sighting must be to what is expected."""
 
-    mapped_gate: float = config.quantity(1.2, unit="deg", above=0.0, high=20.0, doc="to a triangulated wire")
-    followed_gate: float = config.quantity(5.0, unit="deg", above=0.0, high=45.0,
-                                           doc="to the last sighting of a wire that is not triangulated yet")
     distinct: float = config.quantity(2.0, low=1.0, high=10.0, doc="the second-best wire must be so many times worse")
     width_ratio: float = config.quantity(1.4, low=1.0, high=10.0,
                                          doc="of wires in line, the sighting is of those that look as wide as it, up to this factor")
@@ -38,7 +39,7 @@ def score(track: Track, seen: LineObservation, settings: AssociationConfig) -> f
     """Misfit of a sighting to a wire in units of the gate; inf where it cannot be the same."""
     if track.estimate is not None:
         return _score_mapped(track.estimate, track.extent, seen, settings)
-    return _score_followed(track.last, seen) / np.radians(settings.followed_gate)
+    return _score_followed(track.last, seen) / np.radians(FOLLOWED_GATE)
 
 
 def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, seen: LineObservation,
@@ -56,7 +57,7 @@ def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, se
     middle = float(s[len(s) // 2])
     distance = float(np.linalg.norm(curve.at(middle) - seen.p_WC))
     unsure = np.sqrt(np.linalg.eigvalsh(estimate.point_covariance(middle))[-1]) / max(distance, 0.1)
-    return float(np.sqrt(np.mean(against.angles**2))) / (np.radians(settings.mapped_gate) + 2.0 * float(unsure))
+    return float(np.sqrt(np.mean(against.angles**2))) / (np.radians(MAPPED_GATE) + 2.0 * float(unsure))
 
 
 def _score_followed(last: LineObservation, seen: LineObservation) -> float:

@@ -19,6 +19,9 @@ from perch_perception.line_mapping.centring import centred
 from perch_perception.line_mapping.ridges import ridges
 from perch_perception.line_mapping.straight import wires
 
+PLAIN_LENGTH = 80.0  # plain arcs that are shorter are no wires [px]
+MOST_GAP = 25.0  # hole after which an arc is another one [px]
+LEAST_WIDTH = 4.0  # the thickness of a thinner wire cannot be told [px]
 SAMPLES = 7          # rays that stand for a sighting
 HYPOTHESES = 64      # arcs tried per blob and round
 MAX_BEND = 0.6       # second derivative of an arc: a wire bends no more [1/rad]
@@ -37,13 +40,10 @@ class LineDetectionConfig:
                                     doc="red: redder than everything else; plain: brighter or darker than what is behind it")
     redness: float = config.quantity(20.0, low=1.0, high=255.0, doc="least R - max(G, B) of a red wire [grey values]")
     min_length: float = config.quantity(30.0, unit="px", above=0.0, high=640.0, doc="shorter red arcs are not used")
-    plain_min_length: float = config.quantity(80.0, unit="px", above=0.0, high=640.0, doc="shorter arcs of plain wires are not used")
     tolerance: float = config.quantity(1.5, unit="px", above=0.0, high=20.0, doc="of ridge points from their arc")
-    max_gap: float = config.quantity(25.0, unit="px", above=0.0, high=200.0, doc="hole after which an arc is another one")
     sigma: float = config.quantity(0.2, unit="px", above=0.0, high=5.0, doc="error of an arc that averaging does not remove")
     width_loss: float = config.quantity(0.5, unit="px", low=0.0, high=5.0,
                                         doc="a wire wider than 6 px looks narrower by this: blurred, and darker at its rims")
-    min_width: float = config.quantity(4.0, unit="px", above=0.0, high=100.0, doc="the thickness of a thinner wire is not measured")
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _plain(grey: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> l
     """Wires that have no colour of their own; their widths are not measured."""
     found = ridges(grey)
     rays, edges = camera.unproject(found.pixels), np.full((len(found.pixels), 2, 2), np.nan)
-    arcs = wires(found, camera, settings.tolerance, settings.plain_min_length)
+    arcs = wires(found, camera, settings.tolerance, PLAIN_LENGTH)
     sightings = []
     for arc in arcs:
         one = _sighting(arc.points, found.pixels, edges, rays, arc.scatter / camera.fx, camera, settings)
@@ -219,7 +219,7 @@ def _powers(t: np.ndarray) -> np.ndarray:
 def _pieces(ordered: np.ndarray, pixels: np.ndarray, settings: LineDetectionConfig) -> list[np.ndarray]:
     """Indices of the points of each unbroken piece of an arc, in order along it."""
     steps = np.linalg.norm(np.diff(pixels[ordered], axis=0), axis=1)
-    pieces = np.split(ordered, np.nonzero(steps > settings.max_gap)[0] + 1)
+    pieces = np.split(ordered, np.nonzero(steps > MOST_GAP)[0] + 1)
     return [p for p in pieces if len(p) >= 2 * SAMPLES
             and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.min_length]
 
@@ -252,4 +252,4 @@ def _width(edges: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> 
     between = float(np.linalg.norm(np.cross(normals[0], normals[1])))
     looks = float(np.arcsin(min(between, 1.0)) * camera.fx)
     width = looks + settings.width_loss - MEETING * np.exp((MEETING_AT - looks) / MEETING_OVER)
-    return float(width / camera.fx) if width >= settings.min_width else 0.0
+    return float(width / camera.fx) if width >= LEAST_WIDTH else 0.0

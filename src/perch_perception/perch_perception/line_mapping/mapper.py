@@ -18,6 +18,10 @@ from perch_perception.line_mapping.triangulation import (
     DegenerateBaseline, TriangulationConfig, WireEstimate, triangulate)
 from perch_perception.pose_buffer import BodyState
 
+BASELINE = 0.03  # motion between the sightings kept [m]
+TURN = 3.0  # or rotation between them [deg]
+MOST_OBSERVATIONS = 40  # sightings kept per wire
+SUPERSEDED = 0.3  # a wire not seen for `stale_after` gives way to one that is seen this close to it [m]
 PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
 CERTAIN = 3           # so many more images that show a line to be attached to what is beside it than apart: no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
@@ -27,13 +31,9 @@ MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 class MapperConfig:
     """What is kept and published."""
 
-    min_baseline: float = config.quantity(0.03, unit="m", above=0.0, high=1.0, doc="motion between the sightings kept")
-    min_turn: float = config.quantity(3.0, unit="deg", above=0.0, high=90.0, doc="or rotation between them")
-    max_observations: int = config.quantity(40, low=5, high=500, doc="sightings kept per wire")
     forget_after: float = config.quantity(2.0, unit="s", above=0.0, high=60.0,
                                           doc="a wire that was never triangulated and is not seen is dropped")
-    stale_after: float = config.quantity(0.4, unit="s", above=0.0, high=60.0, doc="a wire not seen for so long gives way ...")
-    superseded_within: float = config.quantity(0.3, unit="m", low=0.0, high=5.0, doc="... to one that is seen this close to it")
+    stale_after: float = config.quantity(0.4, unit="s", above=0.0, high=60.0, doc="a wire not seen for so long gives way to one that is seen beside it")
     max_range: float = config.quantity(8.0, unit="m", above=0.0, high=100.0, doc="ends are not believed beyond this distance")
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     straightness: float = config.quantity(0.02, unit="m", above=0.0, high=1.0,
@@ -164,12 +164,12 @@ class LineMapper:
         before = track.observations[-1]
         track.last = one
         track.count += 1
-        moved = np.linalg.norm(one.p_WC - before.p_WC) >= self.settings.min_baseline
-        elsewhere = float(one.middle @ before.middle) < np.cos(np.radians(self.settings.min_turn))
+        moved = np.linalg.norm(one.p_WC - before.p_WC) >= BASELINE
+        elsewhere = float(one.middle @ before.middle) < np.cos(np.radians(TURN))
         if not moved and not elsewhere:
             return False
         track.observations.append(one)
-        if len(track.observations) > self.settings.max_observations:
+        if len(track.observations) > MOST_OBSERVATIONS:
             track.observations = _thinned(track.observations)
         return True
 
@@ -208,7 +208,7 @@ class LineMapper:
                 kept.append(track)
                 continue
             merged = sorted(twin.observations + track.observations, key=lambda one: one.time)
-            while len(merged) > self.settings.max_observations:
+            while len(merged) > MOST_OBSERVATIONS:
                 merged = _thinned(merged)
             twin.observations, twin.count, twin.attached = merged, twin.count + track.count, twin.attached + track.attached
             self._triangulate(twin)
@@ -220,7 +220,7 @@ class LineMapper:
         fresh = [t for t in self._tracks if t.estimate is not None and t.extent is not None and t.count >= MIN_OBSERVATIONS
                  and time - t.last.time <= settings.stale_after]
         self._tracks = [t for t in self._tracks if time - t.last.time <= settings.stale_after
-                        or not any(_beside(t, other, settings.superseded_within) for other in fresh)]
+                        or not any(_beside(t, other, SUPERSEDED) for other in fresh)]
 
     def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedLine]:
         """The wire as chords that stay within `straightness`; none where it is not known well enough."""

@@ -36,9 +36,9 @@ class LocalizerConfig:
     min_range: float = config.quantity(0.15, unit="m", above=0.0, high=10.0, doc="and so is a nearer one")
     follow_images: int = config.quantity(4, low=0, high=30, doc="images in a row in which the expected corners are "
                                          "measured without reading the tags' numbers")
-    view_margin: float = config.quantity(1.2, low=1.0, high=3.0, doc="what is looked at around the pad, in pad sizes")
 
 
+VIEW_MARGIN = 1.2  # what is looked at around the pad, in pad sizes
 PRINT_SIGMA = 0.0002  # of a tag's place on the board, per axis: what plotters and careful gluing keep [m]
 FOLLOW_GAP = 0.1      # time since the last sighting over which corners are expected well enough [s]
 FOLLOW_TAGS = 3       # so many tags must be expected: their agreement shows that nothing else was measured
@@ -200,7 +200,7 @@ class BoardLocalizer:
     def _aim(self, p_CS: np.ndarray, radius: float) -> VirtualView:
         """The view of a place where the board should be, `radius` [m] around p_CS."""
         distance = float(np.linalg.norm(p_CS))
-        share = min(self.settings.view_margin * radius / max(distance, 1e-3), 0.95)
+        share = min(VIEW_MARGIN * radius / max(distance, 1e-3), 0.95)
         return VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
 
     def _predict(self, last: BoardPose, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:

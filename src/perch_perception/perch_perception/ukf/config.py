@@ -29,8 +29,6 @@ class ImuFaults:
     """How unusable stretches of IMU data are bridged."""
 
     gap: float = quantity(3.0, unit="-", above=1.0, doc="longest step between samples that counts as complete, in periods of the IMU")
-    gap_accel: float = quantity(5.0, unit="m/s^2", above=0.0, doc="1 sigma of what a missing sample may have been")
-    gap_gyro: float = quantity(2.0, unit="rad/s", above=0.0, doc="1 sigma of what a missing sample may have been")
     saturation: float = quantity(1.0, unit="-", above=0.0, high=5.0, doc="1 sigma of a saturated sample, share of its range")
 
 
@@ -70,10 +68,8 @@ class UkfConfig:
     kappa: float = quantity(0.0, doc="secondary spread")
     gate_probability: float = quantity(0.999, above=0.0, high=0.999999, doc="chi2 gate of the innovation")
     gate_patience: int = quantity(15, low=1, doc="rejections in a row after which VIO is believed to have jumped")
-    use_velocity: bool = quantity(True, doc="odometry: use its velocity as well, where it comes with a covariance")
     history: float = quantity(0.5, unit="s", above=0.0, high=5.0, doc="IMU kept for replay: oldest usable VIO stamp")
     future: float = quantity(0.05, unit="s", low=0.0, high=0.5, doc="VIO stamps this far ahead wait for the IMU; later ones are refused")
     coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose")
     diverged_position: float = quantity(2.0, unit="m", above=0.0, doc="1 sigma beyond which the state is not to be used")
     diverged_attitude: float = quantity(0.6, unit="rad", above=0.0, doc="1 sigma beyond which the state is not to be used")
-    covariance_stride: int = quantity(5, low=1, high=100, doc="IMU steps per update of the published covariance")

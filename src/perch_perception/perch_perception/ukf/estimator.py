@@ -24,6 +24,7 @@ from perch_perception.ukf.rest import rested, stopped
 from perch_perception.ukf.stillness import still, window
 from perch_perception.ukf.unscented import Belief, CovarianceError, Innovation, UnscentedTransform
 
+COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
 _MOST_WAITING = 20  # poses ahead of the IMU that are kept
 
 
@@ -65,7 +66,7 @@ class Estimator:
             row = self._imu.latest
             kernels.advance(self._x, row[1], row[2], row[3], row[4], row[5], row[6], row[0])
             self._lag += 1
-            if self._lag >= self.config.covariance_stride:
+            if self._lag >= COVARIANCE_STRIDE:
                 self._refresh()
                 self._rest()
         if self._waiting and self._waiting[0].stamp <= self._imu.newest.stamp:
@@ -173,7 +174,7 @@ class Estimator:
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
         R = pose.covariance + start.white(self.config.vio)
-        if self.config.use_velocity and pose.velocity_covariance is not None:
+        if pose.velocity_covariance is not None:
             R = block_diag(R, pose.velocity_covariance)
         return self._transform.innovate(prior, pose, R)
 

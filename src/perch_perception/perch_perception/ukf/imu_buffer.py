@@ -11,6 +11,8 @@ import numpy as np
 from perch_core.values import ImuSample
 from perch_perception.ukf.config import ImuFaults, ImuNoise
 
+_GAP_ACCEL = 5.0  # 1 sigma of what a missing sample may have been [m/s^2]
+_GAP_GYRO = 2.0  # the same [rad/s]
 _PERIODS = 9  # last intervals whose median is the period
 _ABSURD = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
 
@@ -87,7 +89,7 @@ class ImuBuffer:
         gyro, accel = self._densities[0] / dt, self._densities[1] / dt
         if self._is_gap(interval):
             # the error persists over the gap: its variance must not average out over the one long step
-            gyro, accel = gyro + faults.gap_gyro**2, accel + faults.gap_accel**2
+            gyro, accel = gyro + _GAP_GYRO**2, accel + _GAP_ACCEL**2
             outcome = ImuOutcome.GAP
         s = sample
         if max(abs(s.w_B[0]), abs(s.w_B[1]), abs(s.w_B[2])) >= 0.99 * imu.gyro_range:

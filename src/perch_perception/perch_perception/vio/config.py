@@ -21,15 +21,10 @@ class TrackerConfig:
     flatten: float = quantity(20.0, unit="px", low=0.0, high=200.0,
                               doc="sigma over which brightness is averaged and taken off (vignetting, shadows); 0: not at all")
     quality: float = quantity(0.01, above=0.0, high=1.0, doc="least corner strength, share of the strongest")
-    smoothing: float = quantity(1.5, unit="px", above=0.1, high=5.0, doc="sigma of the smoothing before detection")
     noise_factor: float = quantity(8.0, low=0.0, high=100.0, doc="least corner strength, in those that noise alone makes")
     window: int = quantity(21, unit="px", low=5, high=61, doc="side of the tracked patch")
     levels: int = quantity(3, low=0, high=6, doc="pyramid levels above the image")
-    reference_reach: float = quantity(1.5, unit="px", above=0.0, doc="largest correction by the reference frame's patch")
     reference_change: float = quantity(8.0, unit="px", low=0.0, doc="motion apart that asks for a new reference; 0: each frame")
-    back_check: float = quantity(0.7, unit="px", above=0.0, doc="tracking there and back must return this close")
-    epipolar: float = quantity(2.0, unit="px", above=0.0, doc="largest distance from the epipolar plane")
-    view_angle: float = quantity(1.40, unit="rad", above=0.1, high=1.6, doc="features beyond this from the axis are not used")
 
 
 @dataclass(frozen=True)
@@ -38,14 +33,11 @@ class FilterConfig:
 
     clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
-    landmarks_per_frame: int = quantity(5, low=1, high=50, doc="most new landmarks per frame")
     pixel_noise: float = quantity(0.085, unit="px", above=0.0, doc="1 sigma of a track, white from frame to frame")
     slide_turn: float = quantity(0.9, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the angle that its bearing moves")
     slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
-    tracks_per_frame: int = quantity(12, low=1, high=100, doc="most ended tracks used per frame")
     least_parallax_deg: float = quantity(1.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
-    landmark_strikes: int = quantity(3, low=1, doc="refused observations after which a landmark is dropped")
 
 
 @dataclass(frozen=True)
@@ -66,23 +58,14 @@ class StartConfig:
     position_sigma: float = quantity(0.001, unit="m", above=0.0)
     yaw_sigma: float = quantity(0.001, unit="rad", above=0.0)
     motion_time: float = quantity(0.5, unit="s", above=0.2, high=3.0, doc="frames needed for a start in motion")
-    motion_noise: float = quantity(1.0, unit="px", above=0.0, doc="1 sigma of a track about its point over the frames of a start in motion")
-    rest_motion: float = quantity(0.7, unit="px", above=0.0, doc="largest median motion of tracks over the window of rest")
-    rest_lag: float = quantity(0.25, unit="s", low=0.0, high=1.0, doc="the filter stays this far behind while it stands still")
     ground_sigma: float = quantity(0.005, unit="m", above=0.0, doc="1 sigma of the ground about its plane")
     ground_least_height: float = quantity(0.08, unit="m", above=0.0, doc="a camera standing lower sees no landmarks on the ground")
-    unnoticed_velocity: float = quantity(0.02, unit="m/s", low=0.0, doc="1 sigma of a take-off that is not yet noticed")
 
 
 @dataclass(frozen=True)
 class LossConfig:
     """When odometry counts as blind, as lost, and when it starts again."""
 
-    least_tracks: int = quantity(8, low=3, doc="tracks below which a frame says nothing")
-    dark_after: float = quantity(0.15, unit="s", above=0.0, doc="time without a visual update that is blindness where nothing is tracked")
-    blind_after: float = quantity(0.5, unit="s", above=0.0, doc="time without a visual update that is blindness whatever is tracked")
-    leaving_time: float = quantity(1.0, unit="s", above=0.0, doc="from rest on, in which a take-off may go on blind")
-    leaving_velocity: float = quantity(0.05, unit="m/s", above=0.0, doc="1 sigma up to which a take-off may go on blind")
     restart_velocity: float = quantity(1.0, unit="m/s", above=0.0, doc="1 sigma that ends a run")
     speed: float = quantity(25.0, unit="m/s", above=0.0, doc="faster flies no vehicle that this is for: the filter has diverged")
     frames: int = quantity(15, low=2, doc="frames over which observations that are refused and used are counted")

@@ -33,6 +33,7 @@ from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Tracks
 from perch_perception.vio.triangulation import triangulate
 
+_TRACK_NOISE = 1.0  # 1 sigma of a track about its point over the frames of a start [px]
 _LEAST_FEATURES = 12
 _LEAST_FRAMES = 6
 _MOST_FRAMES = 16      # of the longest stretch; more cost time and tell little
@@ -219,7 +220,7 @@ class MotionStart:
                 rays.append(np.array([b for _, b in sights]) @ self._mount.R_BC.T)
         if len(rays) < _LEAST_FEATURES:
             return None
-        sigma = self._config.start.motion_noise / self._mount.camera.fx
+        sigma = _TRACK_NOISE / self._mount.camera.fx
         self._find_gyro_bias(frames, imu, rays, seen, sigma)
         if self.gyro_sigma > _GYRO_SIGMA:
             return None
@@ -265,7 +266,7 @@ class MotionStart:
             js = np.array([place[track.frames[k]] for k in ks])
             b_C = np.array([track.b_C[k] for k in ks])
             X = triangulate(centres[js], np.einsum("nij,nj->ni", R[js] @ self._mount.R_BC, b_C), np.radians(_PARALLAX_DEG),
-                            2.0 * self._config.start.motion_noise / self._mount.camera.fx)
+                            2.0 * _TRACK_NOISE / self._mount.camera.fx)
             if X is not None:
                 out.append(Sight(js, Bearings(b_C, np.array([track.shape[k] for k in ks])), X))
         return sorted(out, key=lambda sight: -len(sight.frames))[:_MOST_POINTS]

@@ -22,6 +22,9 @@ from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
 
+_NEW_LANDMARKS = 5  # per frame, at most
+_MOST_TRACKS = 12  # ended tracks used per frame
+_STRIKES = 3  # refused observations in a row after which a landmark is dropped
 _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
 
 
@@ -108,7 +111,7 @@ class Msckf:
 
     def _update_landmarks(self, report: FrameReport) -> None:
         """Update with all landmarks seen in the newest frame; drop those that are not seen or refused again and again."""
-        s, limits = self.state, self.config.filter
+        s = self.state
         s.drop_landmarks({i for i in s.landmarks if i not in self.tracks.by_id})
         if not s.landmarks:
             return
@@ -134,7 +137,7 @@ class Msckf:
         bad = set()
         for ok, (i, landmark) in zip(good, s.landmarks.items()):
             landmark.strikes = 0 if ok else landmark.strikes + 1
-            if landmark.strikes >= limits.landmark_strikes:
+            if landmark.strikes >= _STRIKES:
                 bad.add(i)
         report.landmarks_used, report.refused = int(good.sum()), report.refused + int((~good).sum())
         if good.any():
@@ -154,7 +157,7 @@ class Msckf:
         """Use spanning tracks that found no place as landmarks as if they had ended here; they begin anew."""
         spent: dict[int, Track] = {}
         for i in spanning:
-            if i not in self.state.landmarks and len(spent) < self.config.filter.tracks_per_frame:
+            if i not in self.state.landmarks and len(spent) < _MOST_TRACKS:
                 spent[i] = self.tracks.by_id[i]
                 self.tracks.by_id[i] = Track()
         return spent
@@ -168,8 +171,8 @@ class Msckf:
         columns, rows, rests = self._window_columns(), [], []
         P = s.P[np.ix_(columns, columns)]
         candidates = {i: t for i, t in spanning.items() if spread.admits(t.b_C[-1])}
-        for i, prepared in self._prepare_some(candidates, limits.landmarks_per_frame, report):
-            if report.landmarks_new >= limits.landmarks_per_frame:
+        for i, prepared in self._prepare_some(candidates, _NEW_LANDMARKS, report):
+            if report.landmarks_new >= _NEW_LANDMARKS:
                 break
             if prepared is None or not spread.admits(spanning[i].b_C[-1]):
                 continue
@@ -198,9 +201,9 @@ class Msckf:
 
     def _update_tracks(self, ended: dict[int, Track], report: FrameReport) -> None:
         """Update with tracks that have just ended, longest first; their points are eliminated."""
-        s, limits = self.state, self.config.filter
+        s = self.state
         useful = [t for i, t in ended.items() if i not in self._used and i not in s.landmarks and len(t.frames) >= 4]
-        useful = sorted(useful, key=lambda t: -len(t.frames))[: limits.tracks_per_frame]
+        useful = sorted(useful, key=lambda t: -len(t.frames))[:_MOST_TRACKS]
         if not useful:
             return
         columns, rows, rests = self._window_columns(), [], []

@@ -27,6 +27,14 @@ from perch_perception.vio.start import KnownPose
 from perch_perception.vio.tracker import Features, Tracker
 from perch_perception.vio.triangulation import triangulate
 
+_REST_MOTION = 0.7  # largest median motion of tracks at rest [px]
+_REST_LAG = 0.25  # the filter stays this far behind while it stands still [s]
+_UNNOTICED = 0.02  # 1 sigma of a take-off that is not yet noticed [m/s]
+_LEAST_TRACKS = 8  # below which a frame says nothing
+_DARK = 0.15  # time without a visual update that is blindness where nothing is tracked [s]
+_BLIND = 0.5  # the same whatever is tracked [s]
+_LEAVING = 1.0  # from rest on, in which a take-off may go on blind [s]
+_LEAVING_VELOCITY = 0.05  # 1 sigma up to which it may [m/s]
 _STANDS = 0.8  # what is seen not to move for so long stands, however it is shaken [s]
 _FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
@@ -225,7 +233,7 @@ class VisualInertialOdometry:
         While vision says where the vehicle is, nobody asks: a very quiet hover looks like rest.
         """
         state = self._running.state
-        if self._sight is not None and exposed - self._sight < round(1e9 * self.config.loss.dark_after):
+        if self._sight is not None and exposed - self._sight < round(1e9 * _DARK):
             return False
         quiet = self._quiet()
         return (quiet is not False and (self._resting or rest.can_stand(state))
@@ -240,21 +248,21 @@ class VisualInertialOdometry:
         span = duration or self.config.rest.window
         until, now = self._seen[-1]
         since, then = next(((t, f) for t, f in reversed(self._seen) if t <= until - round(0.8e9 * span)), self._seen[0])
-        if len(now.ids) < self.config.loss.least_tracks:
+        if len(now.ids) < _LEAST_TRACKS:
             return None
         _, i, j = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
-        if len(i) < self.config.loss.least_tracks or until - since < round(0.8e9 * span):
+        if len(i) < _LEAST_TRACKS or until - since < round(0.8e9 * span):
             return False
-        return float(np.median(np.linalg.norm(now.pixels[j] - then.pixels[i], axis=1))) < self.config.start.rest_motion
+        return float(np.median(np.linalg.norm(now.pixels[j] - then.pixels[i], axis=1))) < _REST_MOTION
 
     def _hold(self, exposed: int, features: Features) -> VioResult:
         """Tell the filter that the vehicle stood still, up to a little before now.
 
-        A take-off is noticed some time after it began. The filter stays behind by `rest_lag`, so that what it was told
+        A take-off is noticed some time after it began. The filter stays behind by `_REST_LAG`, so that what it was told
         remains true, and catches up with the IMU when the vehicle leaves.
         """
         filter, state = self._running, self._running.state
-        until = max(state.stamp, exposed - round(self.config.start.rest_lag * 1e9))
+        until = max(state.stamp, exposed - round(_REST_LAG * 1e9))
         if not self._resting:
             filter.propagate(self._imu.run(state.stamp, until), until)
             rest.stop(filter)
@@ -272,7 +280,7 @@ class VisualInertialOdometry:
         estimate = result.estimate
         assert estimate is not None  # RESTING comes with a pose
         # what is said of now, not of `until`: a take-off may just have begun
-        estimate.P[3:6, 3:6] += self.config.start.unnoticed_velocity**2 * np.eye(3)
+        estimate.P[3:6, 3:6] += _UNNOTICED**2 * np.eye(3)
         return replace(result, blind_for=0.0, estimate=replace(estimate, stamp=exposed, w_WB_B=np.zeros(3)))
 
     def _stand_on(self, floor: float, features: Features) -> None:
@@ -316,9 +324,9 @@ class VisualInertialOdometry:
             return self._lose(features, why)
         blind = (exposed - self._informed) * 1e-9
         outcome = FrameOutcome.TRACKING
-        if blind > (loss.blind_after if len(features.ids) - features.new >= loss.least_tracks else loss.dark_after):
+        if blind > (_BLIND if len(features.ids) - features.new >= _LEAST_TRACKS else _DARK):
             # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
-            leaving = self._sight is None and blind < loss.leaving_time and sigma[at.VELOCITY].max() < loss.leaving_velocity
+            leaving = self._sight is None and blind < _LEAVING and sigma[at.VELOCITY].max() < _LEAVING_VELOCITY
             outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 

@@ -22,6 +22,11 @@ from perch_core.camera import Camera
 from perch_perception.vio.bearing import observe
 from perch_perception.vio.config import TrackerConfig
 
+_SMOOTHING = 1.5  # sigma of the smoothing before detection [px]
+_REACH = 1.5  # largest correction by the reference frame's patch [px]
+_RETURNS = 0.7  # tracking there and back ends this close [px]
+_EPIPOLAR = 2.0  # largest distance from the epipolar plane [px]
+_VIEW = 1.40  # features beyond this from the axis are not used [rad]
 _DRAWS = 24
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
 # the way back begins where it should end, and is judged at 0.7 px: stopping as on the way there cost a tenth of VIO, and gave nothing
@@ -77,7 +82,7 @@ class Tracker:
         self._pixels, self._ids, self._next = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4].astype(float))
-        inside = np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(config.view_angle)
+        inside = np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(_VIEW)
         mask = cv2.resize(inside.astype(np.uint8) * 255, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         border = 8  # a patch at the border has no gradient beyond it
         mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
@@ -121,7 +126,7 @@ class Tracker:
                         [image.shape[1] - 1, image.shape[0] - 1]).astype(int)
         good = found & self.camera.contains(after) & (self._view[place[:, 1], place[:, 0]] > 0)
         back, returned = self._search(image, previous, after[good], before[good], 0, _CHECK)
-        good[good] = returned & (np.linalg.norm(back - before[good], axis=1) < c.back_check)
+        good[good] = returned & (np.linalg.norm(back - before[good], axis=1) < _RETURNS)
         good &= self._one_translation(rays, after, good, slack)
         self._pixels, self._ids = after[good], ids[good]
 
@@ -142,7 +147,7 @@ class Tracker:
             return
         origins = np.array([self._origins[i] for i in self._ids[index].tolist()], np.float32)
         placed, found = self._search(self._reference, image, origins, self._pixels[index], 0)
-        near = found & (np.linalg.norm(placed - self._pixels[index], axis=1) < self.config.reference_reach)
+        near = found & (np.linalg.norm(placed - self._pixels[index], axis=1) < _REACH)
         self._pixels[index[near]] = placed[near]
 
     def _thin(self) -> None:
@@ -183,7 +188,7 @@ class Tracker:
         t = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
         length = np.linalg.norm(t, axis=1, keepdims=True)
         t = np.where(length > 1e-12, t / np.maximum(length, 1e-12), 0.0)
-        inliers = np.abs(normals @ t.T) < self.config.epipolar / self.camera.fx + slack
+        inliers = np.abs(normals @ t.T) < _EPIPOLAR / self.camera.fx + slack
         best = inliers[:, np.argmax(inliers.sum(axis=0) * (length.ravel() > 1e-12))]
         out = np.zeros(len(good), bool)
         out[index[best]] = True
@@ -213,8 +218,7 @@ class Tracker:
         for x, y in self._pixels:
             cv2.circle(mask, (round(x / 2), round(y / 2)), int(c.spacing / 2), 0, -1)
         half = cv2.pyrDown(image)
-        if c.smoothing > _HALVING:
-            half = cv2.GaussianBlur(half, (0, 0), 0.5 * np.sqrt(c.smoothing**2 - _HALVING**2))
+        half = cv2.GaussianBlur(half, (0, 0), 0.5 * np.sqrt(_SMOOTHING**2 - _HALVING**2))
         corners, strength = cv2.goodFeaturesToTrackWithQuality(
             half, c.features - len(self._pixels), c.quality, c.spacing / 2, mask, blockSize=3)
         if corners is None:
