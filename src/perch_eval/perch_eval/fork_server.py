@@ -86,6 +86,9 @@ def _become(what: str, arguments: tuple[str, ...], log: Path, environment: dict[
     """Be the node."""
     os.setsid()
     end_with_parent(signal.SIGKILL)
+    caller = multiprocessing.parent_process()
+    if caller is not None and not caller.is_alive():  # and the fork server with it, before this process could be told
+        os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     file, nothing = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), os.open(os.devnull, os.O_RDONLY)
     for target, source in ((0, nothing), (1, file), (2, file)):
