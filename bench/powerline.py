@@ -3,7 +3,7 @@
     python3 scripts/bench.py powerline            1,000 starts of the five cases and 2,000 anywhere, some ten minutes
     python3 scripts/bench.py powerline --quick    50 and 100
 
-Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
+With the settings of `config/powerline_planner.yaml`. Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from harness import Figure, figure
 
-from perch_core import compiled, so3
+from perch_core import compiled, config, so3
 from perch_core.errors import PlanningRefusal
 from perch_core.rotor_model import P, Q, V
 from perch_core.vehicle import Vehicle, load_vehicle
@@ -26,6 +26,7 @@ from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.solving import Solver
 from perch_planner.powerline.starts import random_start
 from perch_planner.powerline.visibility import visibility
+from perch_planner.powerline_planner import PowerlinePlannerParameters
 
 SOLVE_BARS = {"line_20": 60.0, "line_80": 60.0, "line_20_pa": 100.0, "line_80_pa": 100.0, "line_180": 110.0}  # [ms]
 PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # [s]
@@ -60,9 +61,15 @@ def figures(quick: bool) -> list[Figure]:
     return out + _published() + _perception()
 
 
+def shipped_settings() -> PowerlinePlannerParameters:
+    """The planner's settings in `config/powerline_planner.yaml`."""
+    content = config.read_yaml(config.config_dir() / "powerline_planner.yaml")
+    return config.from_mapping(PowerlinePlannerParameters, content["/**"]["ros__parameters"], "powerline_planner.yaml")
+
+
 def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
     """What the planner says to so many random starts of each case."""
-    found, planner, progress = [], PowerlinePlanner(vehicle), Progress(len(SOLVE_BARS) * starts, what="starts")
+    found, planner, progress = [], PowerlinePlanner(vehicle, shipped_settings()), Progress(len(SOLVE_BARS) * starts, what="starts")
     planner.warm_up()
     for case in SOLVE_BARS:
         setup, rng = problem.load(f"powerline_{case}"), np.random.default_rng(2026)
@@ -76,7 +83,7 @@ def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
 
 def _anywhere(vehicle: Vehicle, starts: int) -> list[dict]:
     """What the planner says to perches at 0 to 180 deg on any of three wires, from anywhere 2 to 5 m before them, with and without perception."""
-    setup, found, planner = problem.load("powerline_line_80"), [], PowerlinePlanner(vehicle)
+    setup, found, planner = problem.load("powerline_line_80"), [], PowerlinePlanner(vehicle, shipped_settings())
     nominal, progress = setup.request(vehicle), Progress(starts, what="starts")
     for number in range(starts):
         rng = np.random.default_rng([2027, number])

@@ -25,6 +25,7 @@ from perch_planner.powerline.validation import check_request
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
 ATTEMPTS = 6  # solves of one manoeuvre: with a larger N, or from another guess and with another solver
+EASED = 0.75  # of `leaving` and `approaching`, after each solve that finds no plan to the end: they are wishes, unlike the limits
 RADIUS_REDUCTION = 0.02  # the paper's, for a recovery that starts at the wire: part of a wire's radius is safety [m]
 
 
@@ -43,8 +44,8 @@ class _Task:
         pinned: factors on the end weights in the later phases, shape (6,).
         duration: bounds of T [s].
         margins: by which the nodes keep away from the limits.
-        leaving: clearance that the margins grow to within a quarter of the time; 0: they stay as they are.
-        approaching: clearance that they have until a tenth of the time before the end; 0: the same.
+        leaving: clearance that the margins grow to within a quarter of the time, if there is a plan; 0: they stay as they are.
+        approaching: clearance that they have until a tenth of the time before the end, if there is a plan; 0: the same.
         at_end: clearance that the wanted pose leaves, which no margin exceeds there; 1: any.
         radius_reduction: taken off the wires' radius [m].
         guess: attempt and N -> states and inputs.
@@ -175,7 +176,7 @@ class PowerlinePlanner:
         """
         s, vehicle = self.settings, self.vehicle
         thrust_max = max(s.thrust_share * vehicle.thrust_max, float(task.start[THRUST].max()))
-        margins, intervals, lines, solver_name = task.margins, s.intervals, task.lines, task.solver
+        margins, wish, intervals, lines, solver_name = task.margins, 1.0, s.intervals, task.lines, task.solver
         iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, "first"
         for attempt in range(ATTEMPTS):
             if time > task.deadline:  # a refusal with its cause is worth more than being stopped
@@ -189,13 +190,13 @@ class PowerlinePlanner:
                 height_min=s.height_min + margins.height,
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
                 body_rate=vehicle.body_rate_max - margins.body_rate, states=states, inputs=inputs,
-                clearance=_clearances(margins.clearance, task.leaving, task.approaching, task.at_end, intervals),
+                clearance=_clearances(margins.clearance, wish * task.leaving, wish * task.approaching, task.at_end, intervals),
                 defects=np.zeros((intervals, STATES + 1)))
             structure = Structure(intervals, len(lines), task.perception, solver_name)
             found = self.solver.solve(structure, numbers, numbers.end_weights * task.pinned, phase)
             iterations, time, cpu_time = iterations + found.iterations, time + found.time, cpu_time + found.cpu_time
             if not (found.converged and np.all(np.isfinite(found.states))):
-                previous, phase = None, "first"
+                previous, phase, wish = None, "first", EASED * wish
                 solver_name = "ipopt" if attempt >= 1 else solver_name
                 continue
             rates = vehicle.thrust_rate_max * np.clip(found.inputs, -1.0, 1.0)
@@ -208,9 +209,11 @@ class PowerlinePlanner:
                                  found.cost)
             worst = broken[0]
             lines = _joined(lines, task.known, flown, max(vehicle.body_radii))
-            drifted = phase != "polish" and all(bound.quantity.startswith("end_") for bound in broken)
+            missed = all(bound.quantity.startswith("end_") for bound in broken)
+            drifted = missed and phase != "polish"
             if not drifted:
                 intervals = int(np.ceil(1.5 * intervals))
+                wish *= EASED if missed else 1.0
             previous, phase = _resampled(found, intervals), "polish" if drifted else "second"
         if worst is not None:
             raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {task.name} within the limits: {worst}")
