@@ -141,13 +141,17 @@ def test_processes_of_a_fork_server_are_their_own_and_end_with_it(tmp_path, monk
     os.killpg(pids[1], signal.SIGKILL)
 
 
-def test_processes_of_a_fork_server_end_with_a_caller_that_is_killed(tmp_path):
+@pytest.mark.parametrize("begun", [False, True])
+def test_processes_of_a_fork_server_end_with_a_caller_that_is_killed(tmp_path, monkeypatch, begun):
+    (tmp_path / "sleeper.py").write_text("import time\ndef sleeper():\n    print('up', flush=True)\n    time.sleep(300)\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    log = tmp_path / "log"
     caller = subprocess.Popen([sys.executable, "-c", (
-        "import sys, time; from pathlib import Path; from perch_eval.fork_server import ForkServer\n"
-        f"print(ForkServer(()).start('signal:pause', [], Path({str(tmp_path / 'log')!r}), {{}}), flush=True); time.sleep(60)")],
+        "import time; from pathlib import Path; from perch_eval.fork_server import ForkServer\n"
+        f"print(ForkServer(('sleeper',)).start('sleeper:sleeper', [], Path({str(log)!r}), {{}}), flush=True); time.sleep(60)")],
         stdout=subprocess.PIPE, text=True)
     pid = int(caller.stdout.readline())
-    assert alive(pid)
+    until(lambda: not begun or log.exists() and log.read_text())
     caller.kill(), caller.wait()
     until(lambda: not alive(pid))
 
