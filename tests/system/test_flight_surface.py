@@ -25,7 +25,7 @@ from perch_eval.ros.recorded_flight import RecordedFlight
 from system.scripts import PATIENCE, ROOT
 
 SCENARIO, SEED = "surface_90", 1
-ECHOED = (("/odometry", "nav_msgs/msg/Odometry"), ("/camera_front/image_raw", "sensor_msgs/msg/Image"))
+WATCHED = (("/odometry", "nav_msgs/msg/Odometry"), ("/camera_front/image_raw", "sensor_msgs/msg/Image"))
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +97,11 @@ def test_the_page_is_complete(flight):
 
 @pytest.fixture
 def crowd(ros_domain, monkeypatch) -> Iterator[list[subprocess.Popen]]:
-    """A foreign publisher on every topic, a viewer and two echoes, in the domain that the next demo flies in."""
+    """A foreign publisher on every topic, a viewer and two who measure rates, in the domain that the next demo flies in."""
     monkeypatch.setattr(demo, "reserved_domain", lambda: contextlib.nullcontext(ros_domain))
     stranger = subprocess.Popen([sys.executable, str(Path(__file__).parent / "stranger.py")], stdout=subprocess.PIPE, text=True,
                                 env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")))})
-    scripts = [("run_node.py", "viewer", "--ros-args", "-p", "port:=0"), *(("topic.py", "echo", *topic) for topic in ECHOED)]
+    scripts = [("run_node.py", "viewer", "--ros-args", "-p", "port:=0"), *(("topic.py", "hz", *topic) for topic in WATCHED)]
     others = [subprocess.Popen([sys.executable, str(ROOT / "scripts" / script), *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
               for script, *arguments in scripts]
     try:
