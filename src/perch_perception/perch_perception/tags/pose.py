@@ -98,6 +98,8 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
     best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start)
     # of two tags that disagree, either may be wrong
     while best.misfit > _limit(_freedom(len(keep))) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
+        if best.misfit * _freedom(len(keep)) < 8.0 * OUTLIER:
+            break  # no tag's leaving could explain so much
         expected, seen = camera.project(corners_S[keep] @ best.R_CS.T + best.p_CS)[0], camera.project(rays_C[keep])[0]
         off = np.linalg.norm(expected - seen, axis=2) / sigma[keep]
         trials = []
