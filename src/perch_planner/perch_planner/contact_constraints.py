@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from math import cos, pi, sin
+from typing import Any
 
 import numpy as np
 
+from perch_core.arrays import Array, Flags, Indices
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
+from perch_planner.linear_bounds import BoundArrays
 from perch_planner.problem import PerchProblem, PerchSettings
 
 INSET = 1e-7
@@ -20,7 +23,8 @@ _OCTAGON = np.array([[cos(k * pi / _FACETS), sin(k * pi / _FACETS)] for k in ran
 
 
 @compiled
-def _bounds(durations, before_end, tube_lower, tube_upper, window, window_lower, window_upper):
+def _bounds(durations: Array, before_end: Array, tube_lower: Array, tube_upper: Array, window: Array, window_lower: Array,
+            window_upper: Array) -> BoundArrays:
     """Tube rows for each instant and axis, then the window's rows: fields of `Bounds`. Instants before the start are dropped.
 
     Args:
@@ -55,7 +59,7 @@ def _bounds(durations, before_end, tube_lower, tube_upper, window, window_lower,
 
 
 @compiled
-def tube_bounds(end_acceleration, share, floor):
+def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Array, Array]:
     """Bounds on the acceleration before contact [m/s^2], two arrays of shape (3,). [defines M:eq15]
 
     The paper scales each component by (1 - q) and (1 + q): for a negative component that swaps the bounds, so they are
@@ -70,7 +74,7 @@ def tube_bounds(end_acceleration, share, floor):
 
 
 @compiled
-def _window(R_WS, velocity, least, most, tangential):
+def _window(R_WS: Array, velocity: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
     """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]"""
     count = 1 + len(_OCTAGON)
     directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
@@ -88,7 +92,7 @@ def _window(R_WS, velocity, least, most, tangential):
 
 
 @compiled
-def _knots(durations, given, values, velocity):
+def _knots(durations: Array, given: Flags, values: Array, velocity: Array) -> tuple[Flags, Array]:
     """What is given at the knots; those between the last waypoint and contact are free."""
     f, last = len(durations), len(given) - 1
     out, at = np.zeros((f + 1, 4), np.bool_), np.zeros((f + 1, 4, 3))
@@ -105,7 +109,7 @@ def _knots(durations, given, values, velocity):
 
 
 @compiled
-def _bubbles(count, given, first_in_tube, everywhere):
+def _bubbles(count: int, given: Flags, first_in_tube: int, everywhere: bool) -> Flags:
     """Which segments have bubbles: those of the tube, and those after a waypoint at which everything is given, or all."""
     out = np.zeros(count, np.bool_)
     for i in range(count):
@@ -117,7 +121,7 @@ def _bubbles(count, given, first_in_tube, everywhere):
 
 
 @compiled
-def tube_times(duration, tube_time, tube_step):
+def tube_times(duration: float, tube_time: float, tube_step: float) -> Array:
     """The instants t_f - t_k + j dt, 0 <= j < t_k / dt, of the tube [s]. [M:eq15]"""
     count = int(np.ceil(tube_time / tube_step - 1e-9))
     out = np.empty(count)
@@ -127,8 +131,9 @@ def tube_times(duration, tube_time, tube_step):
 
 
 @compiled
-def _contact(points, v, a, j, places, orders, fixed, R_WS, velocity, alpha, share, floor, tube_time, tube_step, least, most,
-             tangential):
+def _contact(points: Array, v: Array, a: Array, j: Array, places: Indices, orders: Indices, fixed: Array, R_WS: Array, velocity: Array,
+             alpha: float, share: float, floor: float, tube_time: float, tube_step: float, least: float, most: float, tangential: float
+             ) -> tuple[Flags, Array, tuple[Array, Array, Array, Array, Array, Array]]:
     """Knots, tube and window of a problem, for a target that stands still. [defines M:eq11]
 
     Returns:
@@ -152,7 +157,7 @@ def _contact(points, v, a, j, places, orders, fixed, R_WS, velocity, alpha, shar
 
 
 @compiled
-def conditions(durations, everywhere, velocity, problem):
+def conditions(durations: Array, everywhere: bool, velocity: Array, problem: tuple[Any, ...]) -> tuple[Flags, Array, Flags, BoundArrays]:
     """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] for given durations.
 
     A moving target is met where it is at the end. Where there are more durations than segments of the problem, nothing is

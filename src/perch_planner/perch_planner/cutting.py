@@ -11,12 +11,13 @@ from math import cos, sin
 
 import numpy as np
 
+from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_core.vector3 import cross, dot
 from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import spin_rate
 from perch_planner.bounds import derivative, derivatives_at, value
-from perch_planner.linear_bounds import no_bounds
+from perch_planner.linear_bounds import BoundArrays, no_bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 
 _KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
@@ -29,7 +30,7 @@ _FLAT = 0.97        # of the limit; a peak is cut beside its place where the thr
 
 
 @compiled
-def _specific_force(coefficients, duration, place):
+def _specific_force(coefficients: Array, duration: float, place: float) -> tuple[float, float, float, float]:
     """f = a + g e3 at one place of a segment as three floats, and its length [m/s^2]."""
     f = derivatives_at(coefficients, duration, place, 3)[2]
     f_z = f[2] + GRAVITY
@@ -37,7 +38,7 @@ def _specific_force(coefficients, duration, place):
 
 
 @compiled
-def thrust_cuts(coefficients, durations, extrema, low, high, side):
+def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: float, high: float, side: Array) -> BoundArrays:
     """Cuts where the specific thrust leaves [low, high]. [M:eq16]
 
     Args:
@@ -80,13 +81,14 @@ def thrust_cuts(coefficients, durations, extrema, low, high, side):
     return owner[:r], segments[:r], places[:r], orders[:r], direction[:r], lower[:r], upper[:r]
 
 
-def turning_side(heading: float) -> np.ndarray:
+def turning_side(heading: float) -> Array:
     """Direction over which the thrust turns from up to s3: against the heading of the approach [rad], shape (3,)."""
     return np.array([-cos(heading), -sin(heading), 0.0])
 
 
 @compiled
-def limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension):
+def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, p_S: Array, v_S: Array, s3: Array, low_height: float,
+               high_height: float, speed: float, rate: float, extension: float) -> BoundArrays:
     """Cuts where speed, height, clearance or body rate could not be proved.
 
     Args:

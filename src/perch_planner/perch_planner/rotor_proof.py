@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array, Vector3
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import split, time_derivative
 from perch_planner.rotor_thrusts import add_values, bases_at, thrusts_at
 from perch_planner.taylor_models import (
-    ROUNDING, ZERO, add, axpy, cosine, cross, dot, greatest, inverse_root, least, mul, scale, sine, sub, times, vector_add)
+    ROUNDING, ZERO, Taylor, Vector, add, axpy, cosine, cross, dot, greatest, inverse_root, least, mul, scale, sine, sub, times, vector_add)
 
 _ORDERS = 5    # of f_x, f_y, f_z and the yaw: the functions themselves and four derivatives
 _ROWS = 4 * _ORDERS
@@ -32,7 +33,7 @@ _BASES = bases_at(np.linspace(0.0, 1.0, _SAMPLES + 1))
 
 
 @compiled
-def _rows(coefficients, yaw, duration, out):
+def _rows(coefficients: Array, yaw: Array, duration: float, out: Array) -> None:
     """Bernstein coefficients of the specific force and of the yaw, each with four derivatives, into `out`, shape (20, 15)."""
     for order in range(_ORDERS):
         force, turn = time_derivative(coefficients, 2 + order, duration), time_derivative(yaw.reshape((1, 15)), order, duration)
@@ -46,7 +47,7 @@ def _rows(coefficients, yaw, duration, out):
 
 
 @compiled
-def _halve(right, left, half, numbers):
+def _halve(right: Array, left: Array, half: float, numbers: Array) -> None:
     """Halve the interval of all rows: the left halves into `left`, `right` becomes the other.
 
     Args:
@@ -69,12 +70,12 @@ def _halve(right, left, half, numbers):
 
 
 @compiled
-def _number(numbers, d, k):
+def _number(numbers: Array, d: int, k: int) -> Taylor:
     return numbers[d, k, 0], numbers[d, k, 1], numbers[d, k, 2], numbers[d, k, 3]
 
 
 @compiled
-def _direction(f, df, ddf, k):
+def _direction(f: Vector, df: Vector, ddf: Vector, k: Taylor) -> tuple[Vector, Vector, Vector]:
     """As `flatness.direction_derivatives`, with k = 1 / |f|."""
     u = scale(k, f)
     dn = dot(u, df)
@@ -84,7 +85,7 @@ def _direction(f, df, ddf, k):
 
 
 @compiled
-def _heading(yaw, rate, acceleration):
+def _heading(yaw: Taylor, rate: Taylor, acceleration: Taylor) -> tuple[Vector, Vector, Vector]:
     """As `flatness.heading_derivatives`."""
     s, c, squared = sine(yaw), cosine(yaw), mul(rate, rate)
     return ((times(-1.0, s), c, ZERO), (times(-1.0, mul(c, rate)), times(-1.0, mul(s, rate)), ZERO),
@@ -92,7 +93,7 @@ def _heading(yaw, rate, acceleration):
 
 
 @compiled
-def rotor_models(numbers, mass, J, mixing, out):
+def rotor_models(numbers: Array, mass: float, J: Vector3, mixing: Array, out: Array) -> bool:
     """Models of the four rotor thrusts [N], into `out`, shape (4, 4); False where thrust or heading may vanish.
 
     Args:
@@ -130,7 +131,7 @@ def rotor_models(numbers, mass, J, mixing, out):
 
 
 @compiled
-def _sampled(rows, mass, J, mixing):
+def _sampled(rows: Array, mass: float, J: Vector3, mixing: Array) -> tuple[float, float]:
     """Least and greatest thrust of a rotor [N] among the samples of an interval; rows: of `_rows`, of the interval."""
     x = np.zeros((12, _SAMPLES + 1))
     for d in range(4):
@@ -139,13 +140,14 @@ def _sampled(rows, mass, J, mixing):
             add_values(rows[row, :_SIZES[row]], _BASES[_SIZES[row] - 11], x[3 * order + d if d < 3 else 9 + order])
     lowest, highest = np.inf, -np.inf
     for k in range(_SAMPLES + 1):
-        a, b, c, d = thrusts_at(x, k, mass, J, mixing)
-        lowest, highest = min(lowest, min(min(a, b), min(c, d))), max(highest, max(max(a, b), max(c, d)))
+        p, q, r, s = thrusts_at(x, k, mass, J, mixing)
+        lowest, highest = min(lowest, min(min(p, q), min(r, s))), max(highest, max(max(p, q), max(r, s)))
     return lowest, highest
 
 
 @compiled
-def prove_rotors(coefficients, yaw, durations, lowest, highest, low, high, mass, J, mixing):
+def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: float, highest: float, low: float, high: float, mass: float,
+                 J: Vector3, mixing: Array) -> tuple[bool, float, float]:
     """Prove that each rotor's thrust stays within [low, high], or find where it does not.
 
     Args:

@@ -17,11 +17,13 @@ from functools import lru_cache
 import numpy as np
 
 from perch_core import bernstein
+from perch_core.arrays import Array, Indices, Vector3, vector3
 from perch_core.flatness import commanded_frame, heading_derivatives
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.bounds import time_derivative
+from perch_planner.linear_bounds import BoundArrays
 
 _COUNT = 49
 _FINER = 4  # samples from one place to the next, where a segment's thrusts come near a limit
@@ -35,19 +37,25 @@ _KEEP = 2e-3        # bounds are set inside by this share of the range,
 _BETWEEN = 1.5      # and by this multiple of what was seen between the places
 
 
-def rotor_model(vehicle: Vehicle) -> tuple[float, tuple[float, float, float], np.ndarray]:
-    """What the kernels need of a vehicle: mass [kg], principal inertias [kg m^2], wrench to rotor thrusts, shape (4, 4)."""
-    return vehicle.mass, tuple(float(x) for x in vehicle.inertia), _inverse(tuple(vehicle.allocation.ravel().tolist()))
+Four = tuple[float, float, float, float]
+"""A number for each rotor."""
+RotorModel = tuple[float, Vector3, Array]
+"""Mass [kg], principal inertias [kg m^2], wrench to rotor thrusts, shape (4, 4)."""
+
+
+def rotor_model(vehicle: Vehicle) -> RotorModel:
+    """What the kernels need of a vehicle."""
+    return vehicle.mass, vector3(vehicle.inertia), _inverse(tuple(vehicle.allocation.ravel().tolist()))
 
 
 @lru_cache(maxsize=16)
-def _inverse(entries: tuple[float, ...]) -> np.ndarray:
+def _inverse(entries: tuple[float, ...]) -> Array:
     """Inverse of a matrix of four rows: every plan of a vehicle takes the same."""
     return np.ascontiguousarray(np.linalg.inv(np.reshape(entries, (4, 4))))
 
 
 @compiled
-def thrusts_of(f, j, s, heading, mass, J, mixing):
+def thrusts_of(f: Vector3, j: Vector3, s: Vector3, heading: Vector3, mass: float, J: Vector3, mixing: Array) -> Four:
     """Rotor thrusts [N] of the specific force f, jerk and snap (3 floats each) and yaw with two derivatives; 4 floats."""
     specific = norm(f)
     h, dh, ddh = heading_derivatives(heading[0], heading[1], heading[2])
@@ -62,7 +70,7 @@ def thrusts_of(f, j, s, heading, mass, J, mixing):
             mixing[3, 0] * T + mixing[3, 1] * M[0] + mixing[3, 2] * M[1] + mixing[3, 3] * M[2])
 
 
-def bases_at(places: np.ndarray) -> tuple[np.ndarray, ...]:
+def bases_at(places: Array) -> tuple[Array, ...]:
     """Bernstein bases of degree 10 to 14 at places in [0, 1], each of shape (degree + 1, places)."""
     return tuple(bernstein.basis(n, places).T.copy() for n in range(10, 15))
 
@@ -71,7 +79,7 @@ _BASES, _FINE_BASES = bases_at(_PLACES), bases_at(_SAMPLES)
 
 
 @compiled
-def add_values(row, basis, out):
+def add_values(row: Array, basis: Array, out: Array) -> None:
     """Add the values of a polynomial, given by Bernstein coefficients, at the places of a basis."""
     for i in range(len(row)):
         for k in range(basis.shape[1]):
@@ -79,7 +87,7 @@ def add_values(row, basis, out):
 
 
 @compiled
-def motion(coefficients, yaw, duration, bases):
+def motion(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, ...]) -> Array:
     """Specific force, jerk and snap, yaw and its first two derivatives at the places of `bases_at`, shape (12, places)."""
     out = np.zeros((12, bases[0].shape[1]))
     for order in range(3):
@@ -92,14 +100,14 @@ def motion(coefficients, yaw, duration, bases):
 
 
 @compiled
-def thrusts_at(x, k, mass, J, mixing):
+def thrusts_at(x: Array, k: int, mass: float, J: Vector3, mixing: Array) -> Four:
     """Rotor thrusts [N] of column k of `motion`."""
     return thrusts_of((x[0, k], x[1, k], x[2, k]), (x[3, k], x[4, k], x[5, k]), (x[6, k], x[7, k], x[8, k]),
                       (x[9, k], x[10, k], x[11, k]), mass, J, mixing)
 
 
 @compiled
-def _vertex(values, k, sign):
+def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
     """Place near sample k where the parabola through it and its neighbours is extreme, and that value.
 
     The parabola runs over the samples' numbers, in which their places are smooth.
@@ -115,7 +123,7 @@ def _vertex(values, k, sign):
 
 
 @compiled
-def _segment(coefficients, yaw, duration, bases, mass, J, mixing):
+def _segment(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, ...], mass: float, J: Vector3, mixing: Array) -> Array:
     """Rotor thrusts of a segment at the places of `bases_at`, shape (4, places) [N]."""
     x = motion(coefficients, yaw, duration, bases)
     out = np.empty((4, x.shape[1]))
@@ -125,7 +133,8 @@ def _segment(coefficients, yaw, duration, bases, mass, J, mixing):
 
 
 @compiled
-def sampled(coefficients, yaw, durations, low, high, mass, J, mixing):
+def sampled(coefficients: Array, yaw: Array, durations: Array, low: float, high: float, mass: float, J: Vector3, mixing: Array
+            ) -> tuple[Array, Array]:
     """Rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
 
     Args:
@@ -160,7 +169,8 @@ def sampled(coefficients, yaw, durations, low, high, mass, J, mixing):
 
 
 @compiled
-def linear_bounds(thrusts, row, coefficients, yaw, durations, low, high, mass, J, mixing):
+def linear_bounds(thrusts: Array, row: Array, coefficients: Array, yaw: Array, durations: Array, low: float, high: float, mass: float,
+                  J: Vector3, mixing: Array) -> tuple[Indices, BoundArrays]:
     """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:

@@ -47,12 +47,15 @@ class Attempt(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a set of durations [s] gave: a plan whose limits are proved, or one whose are not, and how much longer to try."""
+    """What a set of durations [s] gave: a plan whose limits are proved, or one whose are not, and how much longer to try.
+
+    Coefficients, yaw and results are empty where there are none.
+    """
 
     durations: np.ndarray
-    coefficients: np.ndarray | None
-    yaw: np.ndarray | None
-    results: np.ndarray | None
+    coefficients: np.ndarray = np.empty((0, 3, 15))
+    yaw: np.ndarray = np.empty((0, 15))
+    results: np.ndarray = np.empty((0, 5))
     proved: bool = False
     stretch: float = _PLAIN_STRETCH
     extrema: np.ndarray | None = None
@@ -98,7 +101,7 @@ class Search:
             patient: give up early where longer durations promise more than cuts.
         """
         settings, start = self.settings, self.problem.start
-        nothing = Outcome(durations, None, None, None)
+        nothing = Outcome(durations)
         try:
             program = SegmentProgram(self.contact, durations, settings, self.question)
         except np.linalg.LinAlgError:
@@ -116,7 +119,7 @@ class Search:
             self._note(duration, found.least, found.most, count)
             self._remember(found)
             outcome = self._thrust(durations, found)
-            if found.stretch:
+            if outcome and found.stretch:
                 return outcome
             count += found.cuts
             if found.checked:
@@ -145,7 +148,7 @@ class Search:
         """The outcome where the thrust leaves its range, or None."""
         if found.most <= self.high and found.least >= self.low:
             return None
-        return Outcome(durations, found.coefficients, None, None, stretch=stretch_factor(found.most, self.high), extrema=found.extrema)
+        return Outcome(durations, found.coefficients, stretch=stretch_factor(found.most, self.high), extrema=found.extrema)
 
     def _note(self, duration: float, least: float, most: float, cuts: int) -> None:
         mass = self.vehicle.mass
@@ -176,7 +179,7 @@ class Search:
             outcome = self.try_durations(divided(durations, fails), patient=stretched < _PATIENCE)
             if outcome.proved:
                 return durations, outcome
-            if best is None or outcome.results is not None:
+            if best is None or len(outcome.results):
                 best = outcome
             if self.fails_early(durations, outcome):
                 grown, stretched = outcome.stretch * durations, stretched + 1

@@ -76,13 +76,13 @@ def plan_way_out(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
             trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
             return PerchPlan(trajectory, certificates(outcome.results, limits, vehicle.mass), search.iterations, perf_counter() - begin,
                              tuple(search.attempts))
-        best = outcome if best is None or outcome.results is not None else best
+        best = outcome if best is None or len(outcome.results) else best
     raise _refusal(best, search, limits, vehicle.mass)
 
 
 def _refusal(best: Outcome | None, search: Search, limits: Limits, mass: float) -> PerchRefusal:
     """Why there is no way out: a limit that the last stop breaks."""
-    if best is None or best.results is None:
+    if best is None or not len(best.results):
         return PerchRefusal(refusals.THRUST_FLOOR, "thrust range [M:eq16]", -np.inf, "no way out: no stop keeps the thrust within its range",
                             iterations=search.iterations)
     proofs = certificates(best.results, limits, mass)
