@@ -225,6 +225,15 @@ def test_a_refusal_solves_a_bounded_number_of_programs_and_names_limits_that_wer
     checked(problem, PerchSettings(**caught.value.relaxed))
 
 
+def test_a_refusal_whose_programs_are_used_up_names_limits_without_which_there_is_a_plan(monkeypatch):
+    monkeypatch.setattr(relaxation, "PROGRAMS", 10)
+    problem = random_problem(np.random.default_rng(20010))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(), VEHICLE)
+    assert caught.value.relaxed and "even without" not in str(caught.value)
+    plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE)
+
+
 def test_a_ceiling_near_the_floor_is_refused_for_the_floor():
     """Not for the thrust, of which it would take more than the vehicle has."""
     problem = PerchProblem(HOVER, surface(179.0, p=(1.7, 0.0, 1.6)))

@@ -3,7 +3,7 @@
 Only limits that acted on the search can be the cause: without one that did not, it would go the same way. Those that alone may
 do are taken away one at a time: what a caller can change first, then the range of the single rotors, which binds before other
 limits of the vehicle. Where none is enough, all are taken away, and put back one by one where there is a plan with them (the
-deletion filter of Chinneck and Dravnieks, 1991). Bisection finds how little is enough. With every value that is named there was a
+deletion filter of Chinneck and Dravnieks, 1991). Bisection looks for how little is enough. With every value that is named there was a
 plan.
 """
 
@@ -24,10 +24,10 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
-PROGRAMS = 200
+PROGRAMS = 150
 """Quadratic programs of all searches with relaxed limits."""
 _EACH = 30       # of one of them
-_HALVINGS = 4    # of the logarithm of what a limit gives
+_TRIALS = 3      # of values: what the plan took of a limit, then halves of the logarithm
 _LEAST = 1 / 64  # of what a plan takes beyond a limit that was taken away; less is not tried
 
 
@@ -73,7 +73,7 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
     """
     settings, vehicle = search.settings, search.vehicle
     asked = _asked(settings, Limits.of(settings, vehicle))
-    proofs = () if best.results is None else certificates(best.results, Limits.of(settings, vehicle), vehicle.mass)
+    proofs = certificates(best.results, Limits.of(settings, vehicle), vehicle.mass)
     longest = max((attempt.duration for attempt in search.attempts), default=float(search.first.sum()))
     tried = f"{search.iterations} programs up to {longest:.2f} s"
     least, most = vehicle.thrust_min, vehicle.thrust_max
@@ -142,11 +142,12 @@ class _Trials:
 
     def _smallest(self) -> tuple[list[str], dict[str, float]] | None:
         """Limits without which there is a plan, none of which can stay, and what it takes; None: no plan without any limit."""
-        for name in _ALONE:
-            if name in self._search.acted and (used := self._without([name])):
-                return [name], used
         taken = [name for name in _LIMITS if name != "thrust_min"]  # where the thrust may vanish, proofs fail
-        if not (used := self._without(taken)):
+        used = self._without(taken)  # first, as it takes few programs: what is named where they are used up before fewer limits are tried
+        for name in _ALONE:
+            if name in self._search.acted and (found := self._without([name])):
+                return [name], found
+        if not used:
             taken = list(_LIMITS)
             if not (used := self._without(taken)):
                 return None
@@ -164,9 +165,8 @@ class _Trials:
         if (smallest := self._smallest()) is None:
             return None
         names, used = smallest
-        values, low, high = _free(names), _LEAST, 2.0  # under a limit a plan may need more than it took without
-        for _ in range(_HALVINGS):
-            share = sqrt(low * high)
+        values, low, high, share = _free(names), _LEAST, 2.0, 1.0  # under a limit a plan may need more than it took without
+        for _ in range(_TRIALS):
             tried = {}
             for name in names:
                 asked, free = self._asked[name], _LIMITS[name].free
@@ -175,6 +175,7 @@ class _Trials:
                 values, high = tried, share
             else:
                 low = share
+            share = sqrt(low * high)
         return values
 
 
