@@ -3,7 +3,9 @@
     python3 scripts/bench.py powerline            1,000 starts of the five cases and 2,000 anywhere, some ten minutes
     python3 scripts/bench.py powerline --quick    50 and 100
 
-With the settings of `config/powerline_planner.yaml`. Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
+With the settings of `config/powerline_planner.yaml`.
+
+Solve times are processor time: what a solve takes on one core that it has to itself, also when others use the machine.
 """
 
 from __future__ import annotations
