@@ -13,6 +13,7 @@ from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import WireEstimate
 
 
+WIDTH_RATIO = 1.4  # of wires in line, the sighting is of those that look as wide as it, up to this factor
 MAPPED_GATE = 1.2  # of a sighting to a triangulated wire [deg]
 FOLLOWED_GATE = 5.0  # to the last sighting of a wire that is not triangulated yet [deg]
 
@@ -22,8 +23,6 @@ class AssociationConfig:
     """How near a sighting must be to what is expected."""
 
     distinct: float = config.quantity(2.0, low=1.0, high=10.0, doc="the second-best wire must be so many times worse")
-    width_ratio: float = config.quantity(1.4, low=1.0, high=10.0,
-                                         doc="of wires in line, the sighting is of those that look as wide as it, up to this factor")
     reach: float = config.quantity(1.5, unit="m", low=0.0, high=20.0, doc="how far a wire may go on beyond what was seen")
 
 
@@ -74,12 +73,12 @@ def _score_followed(last: LineObservation, seen: LineObservation) -> float:
     return offset
 
 
-def _as_wide(track: Track, seen: LineObservation, settings: AssociationConfig) -> bool:
+def _as_wide(track: Track, seen: LineObservation) -> bool:
     """Whether a wire looks about as wide as a sighting: of wires in line it is the nearest that is seen, and it is the widest."""
     if track.estimate is None or seen.width <= 0.0:
         return False
     ratio = seen.width / track.estimate.width_from(seen.p_WC)
-    return bool(1.0 / settings.width_ratio < ratio < settings.width_ratio)
+    return bool(1.0 / WIDTH_RATIO < ratio < WIDTH_RATIO)
 
 
 def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings: AssociationConfig) -> list[int | None]:
@@ -90,7 +89,7 @@ def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings
     scores = np.array([[score(track, one, settings) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
     for i, one in enumerate(seen):
         near = np.flatnonzero(scores[i] <= 1.0)
-        as_wide = [_as_wide(tracks[j], one, settings) for j in near.tolist()]
+        as_wide = [_as_wide(tracks[j], one) for j in near.tolist()]
         if len(near) > 1 and any(as_wide):
             scores[i, near[~np.array(as_wide)]] = np.inf
     answer: list[int | None] = [-1] * len(seen)

@@ -22,6 +22,7 @@ from perch_core.errors import PerchError
 from perch_perception.line_mapping.curve import PARAMETERS, WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 
+WIDTH_EDGES = 0.3  # error of a wire's edges in an image beside that of its rays: share of it
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
@@ -46,7 +47,6 @@ class TriangulationConfig:
     mount_rotation: float = config.quantity(0.3, unit="deg", above=0.0, high=10.0,
                                             doc="error of the camera's attitude on the body, per axis, 1 sigma: the same in all sightings")
     width: float = config.quantity(0.01, above=0.0, high=1.0, doc="error of a wire's width in an image, beside that of its edges: share of it")
-    width_edges: float = config.quantity(0.3, above=0.0, high=2.0, doc="error of a wire's edges in an image beside that of its rays: share of it")
     radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5,
                                     doc="radius of the wires, where it is known; else of one too thin to be measured")
     radius_sigma: float = config.quantity(0.0, low=0.0, high=1.0, doc="how well it is known, 1 sigma, as a share of it; 0: not at all")
@@ -250,7 +250,7 @@ def _widths(curve, size, observations, settings, apart):
     to, s = _feet(curve, [observations[k] for k in seen])
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     misfit = np.log(np.sin(0.5 * width) * distance) - size
-    sigma = np.sqrt(settings.width**2 + (settings.width_edges * ray / width) ** 2 + (settings.pose_position / distance) ** 2)
+    sigma = np.sqrt(settings.width**2 + (WIDTH_EDGES * ray / width) ** 2 + (settings.pose_position / distance) ** 2)
     x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
     zero = np.zeros_like(s)
     rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]

@@ -24,6 +24,9 @@ from perch_perception.ukf.rest import rested, stopped
 from perch_perception.ukf.stillness import still, window
 from perch_perception.ukf.unscented import Belief, CovarianceError, Innovation, UnscentedTransform
 
+_PATIENCE = 15  # rejections in a row after which VIO is believed to have jumped
+_LOST_POSITION = 2.0  # 1 sigma beyond which the state is not to be used [m]
+_LOST_ATTITUDE = 0.6  # the same [rad]
 COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
 _MOST_WAITING = 20  # poses ahead of the IMU that are kept
 
@@ -117,7 +120,7 @@ class Estimator:
             diagonal = np.diag(self._live.P)
             position = float(np.sqrt(diagonal[at.D_POSITION].max()))
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
-            lost = position > self.config.diverged_position or attitude > self.config.diverged_attitude
+            lost = position > _LOST_POSITION or attitude > _LOST_ATTITUDE
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
         return Status(health, age, self._accepted, self._rejected, self._breaks, self._nis, position, attitude, self._message)
 
@@ -165,7 +168,7 @@ class Estimator:
         self._nis = innovation.nis
         if innovation.nis > self._gates[len(innovation.residual)]:
             self._refused_in_row += 1
-            if self._refused_in_row < self.config.gate_patience:
+            if self._refused_in_row < _PATIENCE:
                 return VioOutcome.GATED
             prior, outcome = self._jumped(prior, innovation), VioOutcome.JUMPED
             innovation = self._innovate(prior, pose)

@@ -37,7 +37,6 @@ class FilterConfig:
     slide_turn: float = quantity(0.9, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the angle that its bearing moves")
     slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
     gate_probability: float = quantity(0.99, above=0.5, high=0.999999, doc="chi2 gate of a track or landmark")
-    least_parallax_deg: float = quantity(1.0, unit="deg", above=0.0, high=45.0, doc="of a triangulated point")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
 
+_PARALLAX = 1.0  # of a triangulated point [deg]
 _NEW_LANDMARKS = 5  # per frame, at most
 _MOST_TRACKS = 12  # ended tracks used per frame
 _STRIKES = 3  # refused observations in a row after which a landmark is dropped
@@ -237,7 +238,7 @@ class Msckf:
         Returns:
             For each track: X_W (3,), H_x (2m, k), H_f (2m, 3), r (2m,); None where it is not usable.
         """
-        s, limits = self.state, self.config.filter
+        s = self.state
         place = {c.frame: j for j, c in enumerate(s.clones)}
         R, p = s.window()
         seen = [[k for k, f in enumerate(track.frames) if f in place] for track in tracks]
@@ -251,7 +252,7 @@ class Msckf:
         noise = np.array([track.noise[k] for _, track, ks in chosen for k in ks])
         centres = (p + R @ s.p_BC)[js]
         rays = np.einsum("nij,nj->ni", (R @ s.R_BC)[js], bearings.b_C)
-        X, parts, begin, least = np.zeros((len(js), 3)), [], 0, np.radians(limits.least_parallax_deg)
+        X, parts, begin, least = np.zeros((len(js), 3)), [], 0, np.radians(_PARALLAX)
         for number, _, ks in chosen:
             rows = slice(begin, begin + len(ks))
             begin = rows.stop
@@ -289,7 +290,7 @@ class Msckf:
         first, last = (np.einsum("nij,nj->ni", R[[place[t.frames[k]] for t in tracks.values()]],
                                  np.array([t.b_C[k] for t in tracks.values()])) for k in (0, -1))
         ends = (first * last).sum(axis=1)
-        enough = np.cos(np.radians(self.config.filter.least_parallax_deg))
+        enough = np.cos(np.radians(_PARALLAX))
         order = np.argsort(ends, kind="stable")
         ids = list(tracks)
         return {ids[k]: tracks[ids[k]] for k in order if ends[k] < enough}
