@@ -24,7 +24,7 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
-PROGRAMS = 150
+PROGRAMS = 170
 """Quadratic programs of all searches with relaxed limits."""
 _EACH = 30       # of one of them
 _TRIALS = 3      # of values: what the plan took of a limit, then halves of the logarithm
