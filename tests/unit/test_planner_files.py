@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +11,8 @@ from perch_core import config
 from perch_core.errors import ConfigError
 from perch_planner.planner import plan
 from perch_planner.problem_file import read_problem
+from system.scripts import call_script
 
-ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("surface_90", "surface_60_waypoints", "ceiling", "moving_pad")
 
 
@@ -39,12 +36,8 @@ def test_mistakes_are_named_with_their_file(change, words):
     assert "my.yaml" in str(caught.value) and words in str(caught.value)
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, str(ROOT / "scripts" / "plan.py"), *arguments], capture_output=True, text=True)
-
-
 def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
-    done = run("surface_90", "--out", str(tmp_path))
+    done = call_script("plan.py", "surface_90", "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     written = json.loads((tmp_path / "plan.json").read_text())
     assert all(c["holds"] for c in written["certificates"])
@@ -63,6 +56,6 @@ def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
     (("surface_90", "--set", "solver=x"), 2, "settings.solver"), ((), 2, "problem is needed"),
     (("surface_90", "--set", "thrust_max=["), 2, "--set: thrust_max=[: is not valid YAML")])
 def test_the_script_says_what_is_wrong_by_word_and_exit_code(arguments, code, words, tmp_path):
-    done = run(*arguments, "--out", str(tmp_path / "never"))
+    done = call_script("plan.py", *arguments, "--out", str(tmp_path / "never"))
     assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "never").exists()

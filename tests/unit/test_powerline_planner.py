@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.report import write_report
 from perch_planner.powerline.request import PerchPose
+from system.scripts import call_script
 
 ROOT = Path(__file__).resolve().parents[2]
 VEHICLE = load_vehicle("rpg")
@@ -157,8 +157,7 @@ def test_the_report_holds_what_was_planned(planned: PlannedProblem, tmp_path: Pa
 
 def test_plan_script_plans_and_refuses(tmp_path: Path) -> None:
     def run(*arguments: str) -> subprocess.CompletedProcess:
-        return subprocess.run([sys.executable, str(ROOT / "scripts" / "plan.py"), *arguments, "--out", str(tmp_path)],
-                              capture_output=True, text=True, check=False, timeout=600)
+        return call_script("plan.py", *arguments, "--out", str(tmp_path))
 
     done = run("powerline_line_20")
     assert done.returncode == 0 and "perch of 2." in done.stdout and (tmp_path / "plan.png").is_file(), done.stderr
