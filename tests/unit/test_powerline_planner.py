@@ -56,6 +56,22 @@ def test_a_plan_is_found_where(planner: PowerlinePlanner, why: str, target: int,
     assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), why
 
 
+@pytest.mark.parametrize("what, pitch_deg, along, position, yaw, velocity", [
+    ("perch", 154.67, -0.039, (1.97, 1.126, 5.259), -0.143, (0.03, -0.093, -0.124)),
+    ("recovery", 120.42, -0.082, (1.279, -1.429, 5.275), 0.624, (0.428, 0.118, -0.305))])
+def test_clearance_in_the_open_is_eased_where_no_plan_has_what_is_shipped(what: str, pitch_deg: float, along: float, position: tuple, yaw: float,
+                                                                          velocity: tuple) -> None:
+    shipped = config.read_yaml(config.config_dir() / "powerline_planner.yaml")["/**"]["ros__parameters"]["margins"]
+    start = REQUEST.start.copy()
+    start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
+    line = SETUP.segments()[2]
+    perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
+    settings = replace(SETUP.settings, margins=replace(SETUP.settings.margins, **shipped))
+    request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=False, deadline=10.0)
+    plan = PowerlinePlanner(VEHICLE, settings).plan(request)
+    assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), what
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.8, 1.0])
 def test_an_abort_at_any_time_finds_a_recovery(planner: PowerlinePlanner, planned: PlannedProblem, share: float) -> None:
     perch = planned.plan.perch
