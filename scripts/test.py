@@ -7,17 +7,24 @@ Everything that is not an option of this script goes to pytest.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fcntl
 import os
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 
 from perch_setup import EXTRAS, ROOT, enter
 
-FLIGHTS = ("tests/system/", "tests/nodes/")
-WHOLE = ("tests/nodes/", "tests/recordings/")  # folders whose files share what is dear to make
+PARTS = (
+    ("tests/system/test_restart.py", "tests/system/test_stopping.py", "tests/nodes/"),
+    ("tests/system/test_flight_surface.py",), ("tests/system/test_campaign.py",), ("tests/system/test_bad_input.py",),
+    ("tests/unit/test_goals_in_a_row.py",), ("tests/unit/test_autopilot_firmware.py",), ("tests/recordings/",),
+)
+"""What takes longest, so it begins first; files and folders of one part share what is dear to make. Each other file is a part."""
+PROCESSES = 1 + min(os.cpu_count() or 1, 5)
+"""One more than there are cores: some tests wait for clocks, or for processes that they have started."""
+KEPT = ROOT / ".perch" / "pycache"
 
 EXAMPLES = """examples:
   python3 scripts/test.py                        all tests
@@ -38,8 +45,10 @@ def main() -> int:
     )
     parser.add_argument("--quick", action="store_true", help="only the unit tests that fly, draw and start nothing")
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
-    parser.add_argument("--beside", help=argparse.SUPPRESS)  # the file of `Share`, for the second process
+    parser.add_argument("--beside", help=argparse.SUPPRESS)  # the file of `Share`, for the other processes
     arguments, for_pytest = parser.parse_known_args()
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as tests/conftest.py does, and says why
+    os.environ.setdefault("PYTHONPYCACHEPREFIX", str(KEPT))
     enter(*EXTRAS)
     if arguments.quick:
         for_pytest = ["tests/unit", "-m", "quick", *for_pytest]
@@ -55,9 +64,9 @@ def run_tests(fast: bool, for_pytest: list[str], beside: str | None = None) -> i
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
     os.chdir(ROOT)
     if beside is not None:
-        return run_pytest(for_pytest, Share(beside, from_front=True))
-    if not fast and not for_pytest and (os.cpu_count() or 1) > 1:
-        return run_in_two()
+        return run_share(beside, for_pytest)
+    if not fast and not for_pytest and PROCESSES > 2:
+        return run_together()
     return run_pytest(["--ignore=tests/system", *for_pytest] if fast else for_pytest)
 
 
@@ -69,72 +78,93 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
     return {0: 0, 1: 1}.get(int(code), 2 if code == pytest.ExitCode.USAGE_ERROR else 1)
 
 
-def run_in_two() -> int:
-    """All tests, on two cores: a second process begins with the flights, and its output comes at the end."""
-    with tempfile.TemporaryFile("w+", errors="replace") as output, tempfile.NamedTemporaryFile("w") as taken:
-        command = [sys.executable, __file__, "--beside", taken.name, "-o", "cache_dir=.pytest_cache/flights"]
-        flights = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
-        print("two processes share the tests; what the one prints that begins with the flights comes at the end", flush=True)
+def run_share(taken: str, arguments: list[str]) -> int:
+    """Run what no other process has taken, in this one."""
+    share = Share(taken, parts(test_files()))
+    first = share.take()
+    return 0 if first is None else run_pytest(["-o", "console_output_style=classic", *arguments, *first], share)
+
+
+def run_together() -> int:
+    """All tests, in processes beside each other; what the others print comes at the end."""
+    with contextlib.ExitStack() as stack:
+        taken = stack.enter_context(tempfile.NamedTemporaryFile("w"))
+        outputs = [stack.enter_context(tempfile.TemporaryFile("w+", errors="replace")) for _ in range(PROCESSES - 1)]
+        others = [subprocess.Popen([sys.executable, __file__, "--beside", taken.name, "-o", f"cache_dir=.pytest_cache/{number}"],
+                                   stdout=output, stderr=subprocess.STDOUT) for number, output in enumerate(outputs)]
+        print(f"{PROCESSES} processes share the tests; what the others print comes at the end", flush=True)
         try:
-            code = run_pytest([], Share(taken.name, from_front=False))
-            flights.wait()
-        except KeyboardInterrupt:  # both have it
+            code = run_share(taken.name, [])
+            for other in others:
+                other.wait()
+        except KeyboardInterrupt:  # all have it
             code = 1
         finally:
-            flights.terminate()
-            flights.wait()
-            output.seek(0)
-            print(output.read(), flush=True)
-    return max(code, 1 if flights.returncode else 0)
+            for other, output in zip(others, outputs):
+                other.terminate()
+                other.wait()
+                output.seek(0)
+                print(output.read(), flush=True)
+    return max(code, *(1 if other.returncode else 0 for other in others))
 
 
 class Share:
-    """A plugin of pytest for two processes that have collected the same tests.
+    """A plugin of pytest for one of several processes: whenever it is through with a part, it takes the next one and collects it.
 
-    One takes test files from the front, where the flights are, the other from the back, until they meet: flights mostly wait,
-    and run beside what computes.
+    So no process imports the tests of another, and all are busy until nothing is left.
     """
 
-    def __init__(self, taken: str, from_front: bool) -> None:
+    def __init__(self, taken: str, parts: list[tuple[str, ...]]) -> None:
         """
         Args:
-            taken: a file that both have, empty at first; it gets a letter for each part that one has taken.
-            from_front: or from the back.
+            taken: a file that all processes have, empty at first; it gets a letter for each part that one has taken.
+            parts: what there is to take, the same in all processes.
         """
-        self._taken, self._letter = taken, "f" if from_front else "b"
+        self._taken, self._parts = taken, parts
 
-    def _take(self, count: int) -> int | None:
-        """Number of the next part of so many; None where all are taken."""
+    def take(self) -> tuple[str, ...] | None:
+        """Files and folders of the next part; None where all are taken."""
         with open(self._taken, "r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            letters = file.read()
-            if len(letters) >= count:
+            number = len(file.read())
+            if number == len(self._parts):
                 return None
-            file.write(self._letter)
-        mine = letters.count(self._letter)
-        return mine if self._letter == "f" else count - 1 - mine
+            file.write("x")
+        return self._parts[number]
 
     def pytest_runtestloop(self, session) -> bool:
-        """In place of pytest's own, which runs all that was collected."""
-        if session.testsfailed:
-            raise session.Interrupted(f"{session.testsfailed} error(s) during collection")
-        parts = list(split(session.items).values())
-        while (number := self._take(len(parts))) is not None:
-            items = parts[number]
+        """In place of pytest's own: the part that was collected at first, then others."""
+        items, count = session.items, session.testscollected
+        reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+        if reporter is not None:
+            reporter.report_collect = lambda final=False: None  # a line for each part
+        while True:
             for item, following in zip(items, [*items[1:], None]):
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if session.shouldstop:
                     raise session.Interrupted(session.shouldstop)
-        return True
+            part = self.take()
+            if part is None:
+                session.testscollected = count
+                return True
+            items = session.perform_collect(part)  # a file that cannot be imported counts as a failure
+            count += len(items)
 
 
-def split(items: list) -> dict[str, list]:
-    """File or folder -> its tests, which stay together; flights first."""
-    parts: dict[str, list] = {}
-    for item in items:
-        file = Path(item.path).relative_to(ROOT).as_posix()
-        parts.setdefault(next((folder for folder in WHOLE if file.startswith(folder)), file), []).append(item)
-    return dict(sorted(parts.items(), key=lambda part: next((k for k, folder in enumerate(FLIGHTS) if part[0].startswith(folder)), len(FLIGHTS))))
+def test_files() -> list[str]:
+    """All of them, relative to the repository."""
+    return sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
+
+
+def parts(files: list[str]) -> list[tuple[str, ...]]:
+    """`PARTS` as far as there are such files, then each of the others, those of whole stacks first."""
+    def within(name: str, file: str) -> bool:
+        return file == name or name.endswith("/") and file.startswith(name)
+
+    found = [tuple(name for name in part if any(within(name, file) for file in files)) for part in PARTS]
+    named = [name for part in PARTS for name in part]
+    others = [(file,) for file in files if not any(within(name, file) for name in named)]
+    return [part for part in found if part] + sorted(others, key=lambda part: not part[0].startswith("tests/system/"))
 
 
 if __name__ == "__main__":
