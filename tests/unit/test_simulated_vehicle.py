@@ -164,6 +164,21 @@ def test_in_real_time_the_hosts_time_paces_the_flight_and_what_was_missed_is_tol
     assert len(seen["diagnostics"]) == 2 and seen["diagnostics"][-1].stamp == 2_058 * MS
 
 
+@pytest.mark.parametrize("lost, told", [(0, False), (8, False), (2, True)])
+def test_commands_that_get_lost_on_their_way_are_told(lost, told):
+    """One of `lost`; 0: none."""
+    flown, seen = vehicle()
+    flown.on_pace(0)
+    said = []
+    flown.log.receivers.append(lambda line: said.append(line.text) if line.level == "warning" else None)
+    for k in range(1, 1_100):
+        if not lost or k % lost:
+            flown.on_motor_command(MotorCommand(flown.time, True, (500.0,) * 4))
+        flown.on_pace(2 * MS * k)
+    assert set(said) == ({"50 % of the controller's commands are lost or late"} if told else set())
+    assert (seen["diagnostics"][-1].level == 1) == told
+
+
 def test_in_real_time_images_come_when_they_are_drawn_and_at_most_two_are_being_drawn():
     pending = []
 

@@ -31,6 +31,7 @@ from perch_sim.state_history import TrueState
 SLOW_STEPS = 5                         # steps from one clock, rotor state or pose of a moving pad to the next: 100 Hz
 MOST_WAITING = 2                       # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000  # with a busy operating system in between [ns]
+COMMANDS_MISSED = 0.25                  # share of a second's steps without a command of their own at which that is said
 EXACT = np.zeros((6, 6))               # covariance of the truth
 
 MakeDrawing = Callable[[Scenario, int, Collection[str]], Drawing]
@@ -89,7 +90,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         self._last_command = 0                   # newest stamp of a command
         self._pacing: Pacing | None = None       # in real time
         self._broken: set[str] = set()           # cameras without images for the rest of the flight
-        self._diagnosed = self.time
+        self._diagnosed, self._judged = self.time, (0, 0)  # then; steps, and commands that were missed, by then
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
 
     def warm_up(self) -> None:
@@ -242,7 +243,12 @@ class SimulatedVehicle(Component[VehicleParameters]):
         if self._pacing is not None:
             values |= {"images_dropped": sum(camera.dropped for camera in simulation.cameras.values()),
                        "deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
+        steps, missed = self._index - self._judged[0], self._counts["commands_missed"] - self._judged[1]
+        self._judged = self._index, self._counts["commands_missed"]
         level, message = 0, "ok"
+        if missed > COMMANDS_MISSED * steps:
+            level, message = 1, f"{100 * missed / steps:.0f} % of the controller's commands are lost or late"
+            self.warn(message, every=5.0)
         if simulation.motors.timed_out:
             level, message = 1, "motors stopped: no motor_command"
         if simulation.plant.crashed:
