@@ -45,10 +45,20 @@ def takes_time(file: Path) -> bool:
     return TAKES_TIME.search(file.read_text()) is not None
 
 
+def is_quick(file: Path) -> bool:
+    """Whether a test file may have quick tests."""
+    return file.parent == UNIT and not takes_time(file)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """`-m quick` imports no file that has no quick test."""
+    return True if config.option.markexpr == "quick" and collection_path.match("test_*.py") and not is_quick(collection_path) else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """`quick` are unit tests of files that neither fly, draw nor start anything, but those that are marked `slow`."""
     for item in items:
-        if item.path.parent == UNIT and not takes_time(item.path) and item.get_closest_marker("slow") is None:
+        if is_quick(item.path) and item.get_closest_marker("slow") is None:
             item.add_marker("quick")
 
 
