@@ -82,6 +82,24 @@ def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
     assert asking.answers == [Unavailable("service plan_perch is not there")]
 
 
+def test_a_server_that_is_started_anew_while_nobody_asks_is_told(executor, monkeypatch):
+    monkeypatch.setattr("perch_core.ros.asking.WATCH", 0.02)
+    asking, told = node(executor, Asking), []
+    asking.component.log.receivers.append(lambda line: told.append(line.text))
+    first = node(executor, Serving)
+    while not asking.get_publishers_info_by_topic("rr/plan_perchReply", no_mangle=True):
+        executor.spin_once(0.1)
+    for _ in range(20):
+        executor.spin_once(0.02)
+    assert not told
+    executor.remove_node(first), close_nodes([first])
+    node(executor, Serving)
+    for _ in range(300):
+        if not told:
+            executor.spin_once(0.1)
+    assert told == ["plan_perch: another node answers from now on: it was started anew, or is a second one"]
+
+
 class Silent(Serving):
     """Takes a request, and ends before its answer."""
 

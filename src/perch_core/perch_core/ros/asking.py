@@ -13,7 +13,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 DISCOVERY = 5.0  # without a server for so long, a request is given up; a node that was just started finds it later [s]
-LOOK = 0.1       # between two looks for servers [s]
+LOOK = 0.1       # between two looks for servers while a request is open [s]
+WATCH = 1.0      # between two looks at who would answer [s]
 
 Deliver = Callable[[Client[Any, Any], Any], None]
 
@@ -24,12 +25,30 @@ def connect_clients(node: Node, component: Component[Any], deliver: Deliver) -> 
         row = topics.service(port.channel(component))
         client = node.create_client(row.type, port.channel(component))
         setattr(component, port.name, _asker(node, port, row, client, deliver))
+        _watch(node, component, client)
+
+
+def _servers(node: Node, client: Any) -> set[bytes]:
+    """The servers of a client: who publishes its replies, under the name that the middleware gives them."""
+    replies = f"rr{node.resolve_service_name(client.srv_name)}Reply"
+    return {bytes(info.endpoint_gid) for info in node.get_publishers_info_by_topic(replies, no_mangle=True)}
+
+
+def _watch(node: Node, component: Component[Any], client: Any) -> None:
+    """Say when a server is started anew, also where no request was open meanwhile: what it had been told is forgotten."""
+    known = set[bytes]()
+
+    def look() -> None:
+        servers = _servers(node, client)
+        if known and not servers <= known:
+            component.warn(f"{client.srv_name}: another node answers from now on: it was started anew, or is a second one")
+        known.update(servers)
+
+    node.create_timer(WATCH, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: Any, deliver: Deliver) -> Callable[[Any, int], None]:
     """A request goes to every server that appears until one has answered: who was asked first may have ended, and been started anew."""
-    replies = f"rr{node.resolve_service_name(client.srv_name)}Reply"  # as the middleware names it
-
     def ask(request: Any, due: int) -> None:
         message, asked, calls = row.request_message(request), set[bytes](), list[Any]()
         unanswered, seen = True, time.monotonic()
@@ -47,7 +66,7 @@ def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: A
             nonlocal seen
             if client.service_is_ready():
                 seen = time.monotonic()
-                servers = {bytes(info.endpoint_gid) for info in node.get_publishers_info_by_topic(replies, no_mangle=True)}
+                servers = _servers(node, client)
                 if not calls or not servers <= asked:
                     asked.update(servers)
                     calls.append(client.call_async(message))
