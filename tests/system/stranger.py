@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-RATE = 10.0  # rounds of one message on each topic [Hz]
+RATE = 5.0  # rounds of one message on each topic [Hz]
 NEXT = 4_000_000  # [ns] ahead of the clock: nobody else has said anything of this stamp yet
 
 

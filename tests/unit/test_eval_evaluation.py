@@ -68,6 +68,7 @@ def test_the_cable_has_its_length_and_sag(share):
 
 
 @pytest.mark.parametrize("waypoints", [3, 10])
+@pytest.mark.slow
 def test_the_nonlinear_program_keeps_the_thrust_bound_and_costs_no_more_than_the_papers_plan(waypoints):
     vehicle = load_vehicle("snapdragon")
     planned = paper_m.plan(waypoint_problem(np.random.default_rng(1), waypoints), SETTINGS, vehicle)

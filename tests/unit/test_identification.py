@@ -55,6 +55,7 @@ def found():
     return {one.key: one for one in identify(record(), VEHICLE)[0]}
 
 
+@pytest.mark.slow
 def test_what_a_record_was_made_with_is_found(found):
     true = {f"actuation.rate_{name}[{i}]": values[i] for name, values in (("lag", LAG), ("gain", GAIN)) for i in range(3)}
     true |= {"actuation.delay": DELAY, "actuation.thrust_lag": THRUST_LAG, "actuation.thrust_gain": THRUST_GAIN}
@@ -91,6 +92,7 @@ def test_a_loop_that_rings_is_none_of_first_order():
     assert "explains" in found[0].refused and answers[0].explained < 0.9
 
 
+@pytest.mark.slow
 def test_rotors_are_identified_from_their_speeds():
     n, tau, hover = 9000, 0.04, 1200.0
     t, scale = PERIOD * np.arange(n), 1.07
@@ -140,6 +142,7 @@ def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
     assert words in line and line.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_loop_where_rates_are_taken(monkeypatch):
     monkeypatch.setattr(page, "perch_window", lambda flight: (1.0, 2.0))
     one = record(seconds=3.0)
