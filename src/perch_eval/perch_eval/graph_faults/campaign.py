@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.arguments import count, output_folder
 from perch_eval.campaign.progress import Progress
-from perch_eval.campaign.workers import prepare_worker
+from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine
 from perch_eval.fork_server import ForkServer
 from perch_eval.graph_faults.cases import FAULTS, MODES, NAMED, PHASES, SAFE, TRAFFIC, Case, cases
@@ -99,43 +97,31 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
     """Fly cases, `jobs` at a time; each is kept when it has been flown.
 
     Raises:
-        PerchError: a process that flies has died.
+        PerchError: the process of a flight has died again and again.
     """
     file.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
     progress = Progress(len(missing), what="flights")
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _prepare)
     try:
-        flights = {pool.submit(_fly, case, logs): case for case in missing}
-        for flight in as_completed(flights):
-            _keep(flights[flight], flight.result(), file, rows, progress)
-    except BrokenProcessPool:
-        raise PerchError("a process that flies has died: the same command goes on") from None
-    except BaseException:
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
+        for case, row in in_processes(partial(_fly, logs), missing, jobs):
+            _keep(case, row, file, rows, progress)
     finally:
-        pool.shutdown(cancel_futures=True)
         progress.close()
 
 
-_server: ForkServer
+@lru_cache(maxsize=1)
+def _server() -> ForkServer:
+    """One in each process that flies."""
+    return ForkServer(("perch_eval.graph_faults.preload",))
 
 
-def _prepare() -> None:
-    global _server
-    prepare_worker()
-    _server = ForkServer(("perch_eval.graph_faults.preload",))
-
-
-def _fly(case: Case, logs: Path) -> dict[str, Any] | str:
+def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
     """The row of a flight, or why there is none."""
     folder = logs / case.name.replace(", ", "_").replace(" ", "_")
     for old in folder.glob("*.log"):
         old.unlink()
     code = digest()
     try:
-        return {**fly(case, _server, folder, commit()).as_json(), "code": code}
+        return {**fly(case, _server(), folder, commit()).as_json(), "code": code}
     except PerchError as error:
         return f"not flown: {error}"
 
