@@ -49,6 +49,7 @@ def serve(requests: socket.socket) -> tuple[list[str], dict[str, str], list[int]
                 for file in (requests.detach(), woken, wake, *answers.values(), files[3]):
                     os.close(file)
                 return *json.loads(message), files[:3]
+            os.setpgid(pid, pid)  # before anybody knows of it: a group of its own, as where it is started alone
             for file in files[:3]:
                 os.close(file)
             answers[pid] = files[3]
@@ -64,8 +65,7 @@ def tell(file: int, number: int) -> None:
 
 
 def become(arguments: list[str], environment: dict[str, str], files: list[int]) -> None:
-    """Be the script's process: a group of its own, as it is started alone."""
-    os.setpgid(0, 0)
+    """Be the script's process."""
     end_with_parent(signal.SIGKILL)
     for number in (signal.SIGCHLD, signal.SIGPIPE):
         signal.signal(number, signal.SIG_DFL if number == signal.SIGCHLD else signal.SIG_IGN)
