@@ -44,7 +44,7 @@ class Sent:
 class World:
     """A controller that obeys, a pad in view, velcro that holds; a planner as told. IMU at a rate of its own."""
 
-    def __init__(self, planner=None, period=2_000_000, params=None, **goal):
+    def __init__(self, planner=None, period=10_000_000, params=None, **goal):
         self.mission = Mission(params or MissionParameters())
         self.period, self.stamp, self.clock, self.planner = period, 5 * NANOSECONDS, 900 * NANOSECONDS, planner or self.plan
         self.p, self.q, self.state, self.id = np.zeros(3), LEVEL, ControllerState.DISARMED, 0
