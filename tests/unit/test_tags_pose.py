@@ -134,6 +134,7 @@ def test_sensitivity_to_the_lens_agrees_with_another_lens():
                                    atol=0.05 * np.abs(error).max() + 1e-6)
 
 
+@pytest.mark.slow
 def test_a_lens_known_to_its_sigmas_makes_a_pose_as_sure_as_it_is():
     """And a better one than without considering the lens: an error of fx / fy does not go into the attitude."""
     rng = np.random.default_rng(6)
@@ -174,6 +175,7 @@ def test_a_board_glued_to_its_sigma_makes_a_pose_as_sure_as_it_is():
     assert np.mean(nees[0.0]) > 8.0
 
 
+@pytest.mark.slow
 def test_the_papers_average_has_no_flips_but_the_joint_solution_is_better():
     """[M:sec. IV-B] at 3 m: single tags flip, their average with branches resolved does not."""
     rng = np.random.default_rng(6)
