@@ -13,6 +13,7 @@ from pathlib import Path
 import psutil
 
 from perch_core.errors import PerchError
+from perch_eval.shared_memory import FIRST_PORT, PORTS, clean_ports
 
 USABLE = range(43, 102)
 """Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
@@ -22,7 +23,7 @@ _given: list[int] = []
 
 @contextlib.contextmanager
 def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None = None) -> Iterator[int]:
-    """A domain id that no other reservation on this machine holds, and in which nobody takes part.
+    """A domain id that no other reservation on this machine holds, in which nobody takes part, and in which killed nodes have left nothing.
 
     The kernel gives it back when the process ends, however it ends.
 
@@ -43,6 +44,7 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 continue
             if participants(candidate):
                 continue
+            clean_ports(candidate)
             _given.append(candidate)
             yield candidate
             return
@@ -50,9 +52,9 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
 
 
 def participants(domain: int) -> list[int]:
-    """UDP ports of a domain that are bound on this machine: 7400 + 250 domain, and the 249 after it (DDSI-RTPS 2.5, 9.6.2.3)."""
-    first = 7400 + 250 * domain
-    return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + 250})
+    """UDP ports of a domain that are bound on this machine."""
+    first = FIRST_PORT + PORTS * domain
+    return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + PORTS})
 
 
 def free_domain() -> int:

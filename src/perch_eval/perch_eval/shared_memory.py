@@ -9,8 +9,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
+FIRST_PORT, PORTS = 7400, 250
+"""First port of domain 0, and how many each domain has (DDSI-RTPS 2.5, 9.6.2.3)."""
+PORT = re.compile(r"(?:sem\.)?fast\w+_port(\d+)")
+_FOLDER = Path("/dev/shm")
 _SEGMENT = re.compile(r"(/dev/shm/(?:sem\.)?fast(?:rtps|dds)_\S+)")
 
 
@@ -66,3 +71,24 @@ class SharedMemory:
             return set(_SEGMENT.findall((process / "maps").read_text()))
         except OSError:  # the process has ended, or belongs to somebody else
             return set()
+
+
+def of_ports(domain: int) -> set[Path]:
+    """Files of the segments in which the ports of a ROS domain receive, with their locks."""
+    first = FIRST_PORT + PORTS * domain
+    return {file for file in _FOLDER.glob("*fast*_port*") if (of := PORT.match(file.name)) and first <= int(of[1]) < first + PORTS}
+
+
+def segment(file: Path) -> str:
+    """The segment to which a file belongs: itself, or that whose lock it is."""
+    return str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name)))
+
+
+def clean_ports(domain: int) -> None:
+    """Remove the segments of a domain's ports that no process uses: where one was killed while it made it, all others wait for ever."""
+    files = of_ports(domain)
+    used = SharedMemory().used() if files else set()
+    for file in files:
+        if segment(file) not in used:
+            with suppress(OSError):  # gone already, or another user's
+                file.unlink()

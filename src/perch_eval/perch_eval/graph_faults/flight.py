@@ -24,7 +24,7 @@ from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS, blind_launch
 from perch_eval.node_launch import NodeLaunch
 from perch_eval.nodes import ros_arguments
 from perch_eval.ros.mission_client import MissionClient
-from perch_eval.shared_memory import SharedMemory
+from perch_eval.shared_memory import PORT, SharedMemory, of_ports, segment
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
 from perch_sim.obstacles import pad_surface
@@ -46,8 +46,6 @@ LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
 UNANSWERED = "unanswered"
 STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
 GOING = 10.0     # for what processes had open to vanish after their end, on a busy machine [s]
-PORTS, DOMAIN_PORTS = 7400, 250  # first port of domain 0, and ports of each, by the standard of DDS
-_PORT = re.compile(r"(?:sem\.)?fast\w+_port(\d+)")
 NICE = 10        # of flights in lockstep: those in real time go first
 NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
 
@@ -126,7 +124,7 @@ class Group:
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []
         self._memory = SharedMemory()
-        self._before = self._ports()
+        self._before = of_ports(domain)
 
     @staticmethod
     def _place(one: NodeLaunch) -> str:
@@ -192,14 +190,9 @@ class Group:
     def _shared_memory(self, seen: frozenset[str]) -> list[str]:
         """Segments of these processes, or of a port of their domain, that no process uses any more."""
         used = SharedMemory().used()
-        found = (self._ports() - self._before) | {Path(name) for name in seen if Path(name).exists() and not _PORT.match(Path(name).name)}
-        return [f"shared memory {file.name}" for file in sorted(found)
-                if str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name))) not in used]
-
-    def _ports(self) -> set[Path]:
-        """Segments of the domain's ports; others are shared with other domains."""
-        ports = range(PORTS + DOMAIN_PORTS * self._domain, PORTS + DOMAIN_PORTS * (self._domain + 1))
-        return {file for file in Path("/dev/shm").iterdir() if (of := _PORT.match(file.name)) and int(of[1]) in ports}
+        ports = of_ports(self._domain) - self._before  # other ports are shared with other domains
+        found = ports | {Path(name) for name in seen if Path(name).exists() and not PORT.match(Path(name).name)}
+        return [f"shared memory {file.name}" for file in sorted(found) if segment(file) not in used]
 
 
 class _Director:
