@@ -80,9 +80,7 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
 
 def run_share(taken: str, arguments: list[str]) -> int:
     """Run what no other process has taken, in this one."""
-    share = Share(taken, parts(test_files()))
-    first = share.take()
-    return 0 if first is None else run_pytest(["-o", "console_output_style=classic", *arguments, *first], share)
+    return run_pytest(["-o", "console_output_style=classic", *arguments], Share(taken, parts(test_files())))
 
 
 def run_together() -> int:
@@ -109,10 +107,7 @@ def run_together() -> int:
 
 
 class Share:
-    """A plugin of pytest for one of several processes: whenever it is through with a part, it takes the next one and collects it.
-
-    So no process imports the tests of another, and all are busy until nothing is left.
-    """
+    """A plugin of pytest for one of several processes: whenever it is through with a part, it takes the next one, until nothing is left."""
 
     def __init__(self, taken: str, parts: list[tuple[str, ...]]) -> None:
         """
@@ -133,22 +128,21 @@ class Share:
         return self._parts[number]
 
     def pytest_runtestloop(self, session) -> bool:
-        """In place of pytest's own: the part that was collected at first, then others."""
-        items, count = session.items, session.testscollected
-        reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-        if reporter is not None:
-            reporter.report_collect = lambda final=False: None  # a line for each part
-        while True:
+        """In place of pytest's own. All processes have collected all tests: a session of pytest collects only once."""
+        if session.testsfailed:
+            raise session.Interrupted(f"{session.testsfailed} files could not be collected")
+        while (part := self.take()) is not None:
+            items = [item for item in session.items if any(within(name, item.nodeid.split("::")[0]) for name in part)]
             for item, following in zip(items, [*items[1:], None]):
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if session.shouldstop:
                     raise session.Interrupted(session.shouldstop)
-            part = self.take()
-            if part is None:
-                session.testscollected = count
-                return True
-            items = session.perform_collect(part)  # a file that cannot be imported counts as a failure
-            count += len(items)
+        return True
+
+
+def within(name: str, file: str) -> bool:
+    """Whether a file is that of a part, or lies in its folder."""
+    return file == name or name.endswith("/") and file.startswith(name)
 
 
 def test_files() -> list[str]:
@@ -158,9 +152,6 @@ def test_files() -> list[str]:
 
 def parts(files: list[str]) -> list[tuple[str, ...]]:
     """`PARTS` as far as there are such files, then each of the others, those of whole stacks first."""
-    def within(name: str, file: str) -> bool:
-        return file == name or name.endswith("/") and file.startswith(name)
-
     found = [tuple(name for name in part if any(within(name, file) for file in files)) for part in PARTS]
     named = [name for part in PARTS for name in part]
     others = [(file,) for file in files if not any(within(name, file) for name in named)]

@@ -38,19 +38,21 @@ def test_every_part_is_taken_once_whoever_is_faster(tmp_path: Path, order):
 
 PROGRAM = """
 import sys, pytest, test
-sys.exit(pytest.main(["-p", "no:cacheprovider", "--rootdir=.", "-c", "/dev/null", "-rA", (share := test.Share("taken", PARTS)).take()[0]], [share]))
+sys.exit(pytest.main(["-p", "no:cacheprovider", "--rootdir=.", "-c", "/dev/null", "-rA", "."], [test.Share("taken", PARTS)]))
 """
-GOOD, BAD, BROKEN = "def test_{0}(): pass", "def test_{0}(): assert False", "import no_such_module"
+GOOD, BAD, BROKEN = "def test_{0}(one): assert one", "def test_{0}(): assert False", "import no_such_module"
+SHARED = "import pytest\n@pytest.fixture\ndef one(): return 1\n"
 SKIPPED = "import pytest\npytest.skip('{0}', allow_module_level=True)"
 
 
 @pytest.mark.parametrize("contents, code, words", [
     ((GOOD, GOOD), 0, "2 passed"), ((GOOD, SKIPPED), 0, "1 passed, 1 skipped"), ((BAD, GOOD), 1, "1 failed, 1 passed"),
-    ((GOOD, BROKEN, GOOD), 1, "2 passed, 1 error")])
-def test_parts_are_collected_one_after_the_other_and_whatever_fails_is_told(contents, code, words, tmp_path):
+    ((GOOD, BROKEN, GOOD), 2, "1 error")])
+def test_parts_are_run_one_after_the_other_and_whatever_fails_is_told(contents, code, words, tmp_path):
     names = [f"test_{number}.py" for number in range(len(contents))]
     for name, content in zip(names, contents):
         (tmp_path / name).write_text(content.format(name[:-3]))
+    (tmp_path / "conftest.py").write_text(SHARED)  # whose fixtures all parts have
     (tmp_path / "taken").touch()
     done = subprocess.run([sys.executable, "-c", PROGRAM.replace("PARTS", repr([(name,) for name in names]))], cwd=tmp_path, capture_output=True, text=True,
                           env={**os.environ, "PYTHONPATH": os.pathsep.join([str(script.ROOT / "scripts"), os.environ.get("PYTHONPATH", "")])})
