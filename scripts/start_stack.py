@@ -101,17 +101,15 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_core import config
     from perch_sim.scenario import load_scenario
     from perch_eval.arguments import open_network, output_folder
-    from perch_eval.domain import participants
+    from perch_eval.domain import vacant
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs, sharing
-    from perch_eval.shared_memory import clean_ports
     from perch_eval.stack import Stack
     from perch_eval.view.gate import check_free
     from ros_graph.connection import visit
 
-    if not participants(domain := int(os.environ["ROS_DOMAIN_ID"])):
-        clean_ports(domain)
+    vacant(int(os.environ["ROS_DOMAIN_ID"]))  # and so without what killed nodes have left in it
     open_network(arguments.network)
     source = config.find("scenarios", arguments.scenario).resolve()
     scenario = load_scenario(source)

@@ -100,6 +100,19 @@ def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
     assert "1 of " in (tmp_path / "README.md").read_text() and set(SAFE) >= {"landed"}
 
 
+def test_flights_in_real_time_have_the_machine_to_themselves(tmp_path, monkeypatch):
+    flown = []
+
+    def in_order(_, missing, jobs):
+        flown.append((jobs, {case.mode for case in missing}, len(missing)))
+        yield from ((case, row(mode=case.mode)) for case in missing)
+
+    monkeypatch.setattr(campaign, "in_processes", in_order)
+    campaign.fly_all(campaign.cases()[:40], tmp_path / campaign.ROWS, tmp_path, {}, 3)
+    assert [(jobs, modes) for jobs, modes, _ in flown] == [(3, {campaign.LOCKSTEP}), (1, {REAL_TIME})]
+    assert sum(number for *_, number in flown) == 40
+
+
 def test_rows_of_other_code_are_flown_again_and_dropped(tmp_path, monkeypatch):
     file, other = tmp_path / campaign.ROWS, CASE._replace(node="mission")
     file.write_text(json.dumps(row(code="before")) + "\n" + json.dumps(row(node="mission")) + "\n")

@@ -42,9 +42,8 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            if participants(candidate):
+            if not vacant(candidate):
                 continue
-            clean_ports(candidate)
             _given.append(candidate)
             yield candidate
             return
@@ -55,6 +54,14 @@ def participants(domain: int) -> list[int]:
     """UDP ports of a domain that are bound on this machine."""
     first = FIRST_PORT + PORTS * domain
     return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + PORTS})
+
+
+def vacant(domain: int) -> bool:
+    """Whether nobody takes part in a domain; if so, what killed nodes have left in it is removed: new ones would wait for it without end."""
+    if participants(domain):
+        return False
+    clean_ports(domain)
+    return True
 
 
 def free_domain() -> int:

@@ -116,7 +116,7 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
         started = blind_programs(node_programs(blind_launches(scenario, seed, str(source), True), folder, composed=composed))
     with reserved_domain(range(43, 70)) as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        progress, pilot = Progress(flights or 0, what="flights"), MissionClient()
+        progress, pilot = Progress(flights, what="flights"), MissionClient()
         try:
             with Stack(started, folder) as stack:
                 stack.wait_until_ready(pilot.visible_nodes, READY)

@@ -8,9 +8,9 @@ from typing import TextIO
 
 
 class Progress:
-    """One line that is rewritten on a terminal; elsewhere a line every few seconds."""
+    """One line that is rewritten on a terminal; elsewhere a line every few seconds. Without a total it says how many there have been."""
 
-    def __init__(self, total: int, already: int = 0, good_already: int = 0, what: str = "runs", out: TextIO | None = None,
+    def __init__(self, total: int | None, already: int = 0, good_already: int = 0, what: str = "runs", out: TextIO | None = None,
                  period: float = 10.0) -> None:
         self._total, self._done, self._good, self._already = total, already, good_already, already
         self._what, self._out, self._period = what, out or sys.stderr, period
@@ -33,12 +33,12 @@ class Progress:
         """The line at a time of the monotonic clock."""
         fresh, elapsed = self._done - self._already, max(now - self._began, 1e-9)
         rate = fresh / elapsed
-        text = f"  {self._done}/{self._total} {self._what}"
+        text = f"  {self._done}" + ("" if self._total is None else f"/{self._total}") + f" {self._what}"
         if self._done:
             text += f", {self._good} good ({100 * self._good / self._done:.0f} %)"
         if fresh:
             text += f", {60 * rate:.1f} per minute"
-            if self._done < self._total:
+            if self._total is not None and self._done < self._total:
                 text += f", {span((self._total - self._done) / rate)} left"
         return text
 

@@ -18,7 +18,7 @@ from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine
 from perch_eval.fork_server import ForkServer
-from perch_eval.graph_faults.cases import FAULTS, MODES, NAMED, PHASES, SAFE, TRAFFIC, Case, cases
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, commit, digest
 
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--logs", type=Path, default=Path("out/faults"), metavar="DIR", help="logs of the flights (default: %(default)s)")
     out.add_argument("--only", default="", metavar="WORDS", help="cases with all of these words in their names")
     out.add_argument("--most", type=count, metavar="N", help="fly at most so many")
-    out.add_argument("--jobs", type=count, default=len(os.sched_getaffinity(0)), metavar="N", help="flights at a time (default: %(default)s)")
+    out.add_argument("--jobs", type=count, default=len(os.sched_getaffinity(0)), metavar="N", help="flights in lockstep at a time (default: %(default)s)")
     out.add_argument("--again", action="store_true", help="fly what has been flown, too")
     out.add_argument("--page", action="store_true", help="fly nothing")
     return out
@@ -94,7 +94,8 @@ def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
 
 
 def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int) -> None:
-    """Fly cases, `jobs` at a time; each is kept when it has been flown.
+    """Fly cases, `jobs` at a time in lockstep, then one by one in real time: two flights have too little processor time on two cores.
+    Each is kept when it has been flown.
 
     Raises:
         PerchError: the process of a flight has died again and again.
@@ -102,8 +103,9 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
     file.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
     progress = Progress(len(missing), what="flights")
     try:
-        for case, row in in_processes(partial(_fly, logs), missing, jobs):
-            _keep(case, row, file, rows, progress)
+        for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
+            for case, row in in_processes(partial(_fly, logs), [case for case in missing if case.mode == mode], at_once):
+                _keep(case, row, file, rows, progress)
     finally:
         progress.close()
 
