@@ -7,6 +7,7 @@ import numpy as np
 from perch_core import config
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import Vehicle
+from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.verifier import Requirements, Rotors
 
@@ -51,7 +52,7 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         s2=surface.R_WS[:, 1], s3=surface.normal, v_S=problem.target_velocity, perch_offset=vehicle.perch_offset,
         mass=vehicle.mass, impact_acceleration=settings.impact_acceleration,
         impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
-        tube=(settings.tube_time, settings.tube_step, settings.tube_tolerance, settings.tube_floor), thrust=limits.thrust,
+        tube=(settings.tube_time, TUBE_STEP, TUBE_SHARE, TUBE_FLOOR), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
         rotors=each)
 

@@ -21,6 +21,7 @@ from perch_core.isolated import IsolatedRunner
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import PerchPlan, PerchPlanRequest
+from perch_core.vehicle import load_vehicle
 from perch_planner import perching_planner
 from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
 from perch_planner.verifier import Requirements, verify
@@ -220,9 +221,9 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
 def test_all_parameters_but_the_vehicle_may_change() -> None:
     asked = planner(PerchingPlannerParameters())
     assert "vehicle" not in PerchingPlanner.changeable and "duration_max" in PerchingPlanner.changeable
-    asked.component.reconfigure(PerchingPlannerParameters(thrust_max=3.8, contact_time=0.7))
+    asked.component.reconfigure(PerchingPlannerParameters(thrust_reserve=0.8))
     plan = asked(request())
-    assert plan.contact_time == 0.7 and {c.quantity: c for c in plan.certificates}["thrust"].upper_limit == 3.8
+    assert {c.quantity: c for c in plan.certificates}["thrust"].upper_limit == pytest.approx(0.8 * 4.0 * load_vehicle("snapdragon").thrust_max)
 
 
 def test_an_unknown_vehicle_is_refused() -> None:

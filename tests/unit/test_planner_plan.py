@@ -11,7 +11,7 @@ from perch_core.errors import ConfigError
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_planner import refusals, relaxation, solvers
+from perch_planner import refusals, relaxation, search, solvers
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
 from perch_planner.refusals import PerchRefusal
@@ -220,7 +220,7 @@ def test_a_refusal_solves_a_bounded_number_of_programs_and_names_limits_that_wer
     problem = random_problem(np.random.default_rng(seed))
     with pytest.raises(PerchRefusal) as caught:
         plan(problem, PerchSettings(), VEHICLE)
-    assert len(solved) <= PerchSettings().iterations_max + relaxation.PROGRAMS
+    assert len(solved) <= search.ITERATIONS_MAX + relaxation.PROGRAMS
     assert caught.value.relaxed
     checked(problem, PerchSettings(**caught.value.relaxed))
 

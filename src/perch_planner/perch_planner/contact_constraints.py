@@ -16,6 +16,9 @@ from perch_planner.problem import PerchProblem, PerchSettings
 INSET = 1e-7
 """Bounds are tightened by this [SI], so that a solver's residual (1e-9 of a row) cannot leave the true ones."""
 
+TUBE_STEP = 0.01    # dt of [M:eq15] [s]
+TUBE_SHARE = 0.1    # q of [M:eq15]
+TUBE_FLOOR = 0.33   # least half width of the tube per axis [m/s^2]: the printed one closes where a component of the acceleration is zero
 _FACETS = 4  # the tangential speed stays inside a regular octagon
 _INSCRIBED = cos(pi / (2 * _FACETS))
 _NO_DERIVATIVES = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))  # of waypoints: their numbers, orders, values
@@ -63,7 +66,7 @@ def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Ar
     """Bounds on the acceleration before contact [m/s^2], two arrays of shape (3,). [defines M:eq15]
 
     The paper scales each component by (1 - q) and (1 + q): for a negative component that swaps the bounds, so they are
-    sorted here; for a component near zero it leaves no room, so each axis has at least `tube_floor` on both sides.
+    sorted here; for a component near zero it leaves no room, so each axis has at least `TUBE_FLOOR` on both sides.
     """
     lower, upper = np.empty(3), np.empty(3)
     for d in range(3):
@@ -200,5 +203,4 @@ class Contact:
                  for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)) if value is not None]
         derivatives = tuple(map(np.array, zip(*fixed))) if fixed else _NO_DERIVATIVES
         self.problem = (self.points, start.v, start.a, start.j, *derivatives, R_WS, self.velocity, settings.impact_acceleration,
-                        settings.tube_tolerance, settings.tube_floor, settings.tube_time, settings.tube_step, least, most,
-                        settings.tangential_speed_max * _INSCRIBED - INSET)
+                        TUBE_SHARE, TUBE_FLOOR, settings.tube_time, TUBE_STEP, least, most, settings.tangential_speed_max * _INSCRIBED - INSET)

@@ -20,11 +20,12 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_planner import planner, refusals
-from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
+from perch_planner.problem import PerchParameters, PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.refusals import PerchRefusal
 from perch_planner.way_out import plan_way_out
 
 OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
+CONTACT_TIME = 0.3  # how long a contact is awaited after the end of a plan, where the mission says nothing [s]
 OBJECTIVES = {4: "snap", 3: "jerk"}
 Method = Callable[[PerchProblem, PerchSettings, Vehicle], planner.PerchPlan]
 
@@ -44,12 +45,16 @@ class PerchPlanError(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PerchingPlannerParameters(PerchSettings):
+class PerchingPlannerParameters(PerchParameters):
     """Parameters of the component: those of the planner, and the vehicle it plans for."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    contact_time: float = quantity(0.3, unit="s", above=0.0, high=10.0, doc="wait for contact after the end")
     time_limit: float = quantity(2.0, unit="s", above=0.0, high=60.0, doc="wall-clock limit of a plan, from the request on")
+
+    @property
+    def settings(self) -> PerchSettings:
+        """Those of the planner."""
+        return PerchSettings(**{field.name: getattr(self, field.name) for field in fields(PerchParameters)})
 
 
 class PerchingPlanner(Component[PerchingPlannerParameters]):
@@ -67,7 +72,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
     def preload(self) -> Callable[[], None]:
         """Load or compile the kernels."""
-        return partial(_load, self.config, self._vehicle)
+        return partial(_load, self.config.settings, self._vehicle)
 
     def on_plan_perch(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
         """Plan, and reply when there is an answer."""
@@ -83,7 +88,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            arguments = (method, problem, perch_settings(request, self.config, problem.surface), self._vehicle)
+            arguments = (method, problem, perch_settings(request, self.config.settings, problem.surface), self._vehicle)
         except PerchError as error:
             answer(error)
             return
@@ -92,7 +97,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
     def _answer(self, perch: bool, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
         """Reply with a plan, or with the error that there is in its place."""
         if isinstance(found, planner.PerchPlan):
-            answer = perch_plan(found, request, float(self.config.contact_time) if perch else 0.0)
+            answer = perch_plan(found, request, CONTACT_TIME if perch else 0.0)
         else:
             answer = refused(found, limit)
             if perch:  # near the contact, ways out are refused one after the other

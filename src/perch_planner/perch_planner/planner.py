@@ -2,7 +2,7 @@
 
 For given durations a QP is solved and its plan checked; where a limit is violated, linear bounds are added and the QP is
 solved again; where that does not help, the durations grow [M:IV-C.3] and the approach is divided more finely. Each loop is
-bounded: a search ends after `iterations_max` programs. The procedure as the paper has it: `paper.paper_m`.
+bounded: a search ends after `search.ITERATIONS_MAX` programs. The procedure as the paper has it: `paper.paper_m`.
 """
 
 from __future__ import annotations

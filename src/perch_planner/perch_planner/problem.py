@@ -131,36 +131,22 @@ class PerchProblem:
 
 
 @dataclass(frozen=True)
-class PerchSettings:
-    """Settings of the planner: `config/perching_planner.yaml` and the parameters of the node.
-
-    Where 0 stands for "the vehicle's", the limit comes from the vehicle file.
-    """
+class PerchParameters:
+    """Parameters of the planner: `config/perching_planner.yaml`."""
 
     impact_acceleration: float = quantity(3.3, unit="m/s^2", above=0.0, high=100.0, doc="alpha of [M:eq11]")
     impact_speed_min: float = quantity(0.5, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3")
     impact_speed_max: float = quantity(0.6, unit="m/s", low=0.0, high=20.0, doc="v_max of [M:eq14], along -s3")
     tangential_speed_max: float = quantity(0.3, unit="m/s", above=0.0, high=20.0, doc="slip over the surface at contact")
     tube_time: float = quantity(0.15, unit="s", low=0.0, high=2.0, doc="t_k of [M:eq15]")
-    tube_step: float = quantity(0.01, unit="s", low=0.001, high=0.1, doc="dt of [M:eq15]")
-    tube_tolerance: float = quantity(0.1, low=0.001, high=1.0, doc="q of [M:eq15]")
-    tube_floor: float = quantity(0.33, unit="m/s^2", above=0.0, high=10.0, doc="least half width of the tube per axis")
-    thrust_max: float = quantity(0.0, unit="N", low=0.0, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
-    thrust_min: float = quantity(0.0, unit="N", low=0.0, doc="tau_min of [M:eq16]; 0: the vehicle's")
     thrust_reserve: float = quantity(0.9, above=0.0, high=1.0, doc="share of the vehicle's thrust that a plan may use")
-    body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
+    rotor_margin: float = quantity(0.0, low=-1e3, high=0.4, doc="share of a rotor's range kept free at both its ends; negative: of what lies beyond")
     speed_max: float = quantity(12.0, unit="m/s", above=0.0, doc="bound on the speed in W")
     height_min: float = quantity(0.15, unit="m", low=-1e4, high=1e4, doc="floor for the centre of mass")
     height_max: float = quantity(1e3, unit="m", low=-1e4, high=1e4, doc="ceiling for the centre of mass")
-    extension: float = quantity(-1.0, unit="m", high=2.0, doc="rim radius that clears the surface; negative: the vehicle's")
-    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of that rim from the surface")
-    objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
-    solver: str = choice("daqp", options=("daqp", "osqp"), doc="quadratic programming solver; osqp where DAQP has no wheel")
-    rotor_margin: float = quantity(0.0, low=-1e3, high=0.4, doc="share of a rotor's range kept free at both its ends; negative: of what lies beyond")
-    minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
+    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of the body's rim from the surface")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
-    last_segment_min: float = quantity(0.25, unit="s", low=0.05, high=5.0, doc="shortest last segment")
-    iterations_max: int = quantity(100, low=1, high=1000, doc="QPs per search")
+    solver: str = choice("daqp", options=("daqp", "osqp"), doc="quadratic programming solver; osqp where DAQP has no wheel")
 
     def __post_init__(self) -> None:
         if self.impact_speed_max < self.impact_speed_min:
@@ -168,6 +154,20 @@ class PerchSettings:
                               f"{self.impact_speed_max:g} is below impact_speed_min {self.impact_speed_min:g} m/s")
         if self.height_max <= self.height_min:
             raise ConfigError("", "height_max", f"{self.height_max:g} is not above height_min {self.height_min:g} m")
+
+
+@dataclass(frozen=True)
+class PerchSettings(PerchParameters):
+    """Parameters of the planner with what one plan may choose: a request, a problem file, a trial with relaxed limits.
+
+    Where 0 stands for "the vehicle's", the limit comes from the vehicle file.
+    """
+
+    thrust_max: float = quantity(0.0, unit="N", low=0.0, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
+    thrust_min: float = quantity(0.0, unit="N", low=0.0, doc="tau_min of [M:eq16]; 0: the vehicle's")
+    body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
+    objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
+    minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
 
 
 class Limits(NamedTuple):
@@ -201,7 +201,7 @@ class Limits(NamedTuple):
             body_rate=settings.body_rate_max or vehicle.body_rate_max,
             speed=settings.speed_max,
             height=(settings.height_min, settings.height_max),
-            extension=settings.extension if settings.extension >= 0.0 else max(vehicle.body_radii[:2]),
+            extension=max(vehicle.body_radii[:2]),
             clearance=settings.clearance_min,
             rotor_thrust=(least + free, most - free),
         )

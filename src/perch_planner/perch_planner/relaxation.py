@@ -123,8 +123,8 @@ class _Trials:
         """What the plan under changed settings takes of each limit, None where none is soon found."""
         if not changes or self._left <= 0:
             return None
-        settings = replace(self._search.settings, iterations_max=min(_EACH, self._left), minimum_time=False, **changes)
-        trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle))
+        settings = replace(self._search.settings, minimum_time=False, **changes)
+        trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle), min(_EACH, self._left))
         try:
             _, outcome = trial.run()
         except PerchRefusal:

@@ -18,9 +18,10 @@ from perch_planner.rotor_proof import prove_rotors
 from perch_planner.rotor_thrusts import linear_bounds, rotor_model, sampled
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
-    FINE, allocate, lengthen_approach, split_finely, split_last, stretch_factor, with_last_segment)
+    FINE, LAST_SEGMENT_MIN, allocate, lengthen_approach, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
+ITERATIONS_MAX = 100  # quadratic programs of a search
 _CUT_ROUNDS = 24
 _PATIENCE = 5         # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
 _NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
@@ -72,9 +73,11 @@ def divided(durations: np.ndarray, fails: int) -> np.ndarray:
 
 
 class Search:
-    """State of one planning call."""
+    """State of one planning call, which ends after `iterations_max` programs."""
 
-    def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, limits: Limits) -> None:
+    def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, limits: Limits,
+                 iterations_max: int = ITERATIONS_MAX) -> None:
+        self._iterations_max = iterations_max
         self.problem, self.settings, self.vehicle, self.limits = problem, settings, vehicle, limits
         self.low, self.high = limits.thrust[0] / vehicle.mass, limits.thrust[1] / vehicle.mass
         self.contact = Contact(problem, settings, vehicle.perch_offset)
@@ -110,7 +113,7 @@ class Search:
                                COST_ORDER[settings.objective])
         best, count, turning, duration = None, 0, False, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
-            if rounds and self.iterations >= settings.iterations_max:
+            if rounds and self.iterations >= self._iterations_max:
                 break
             found = program.judged(yaw, patient, rounds > 0)
             if found is None:
@@ -191,7 +194,7 @@ class Search:
             if grown.sum() > self.settings.duration_max:
                 self.acted.add("duration_max")
                 return durations, best
-            if self.iterations >= self.settings.iterations_max:
+            if self.iterations >= self._iterations_max:
                 return durations, best
             durations = grown
 
@@ -209,10 +212,10 @@ class Search:
 
     def shortest(self, durations: np.ndarray, outcome: Outcome) -> Outcome:
         """Bisect the scale of all durations for the shortest plan whose limits are still proved."""
-        shortest = max(self.settings.tube_time, self.settings.last_segment_min)
+        shortest = max(self.settings.tube_time, LAST_SEGMENT_MIN)
         low, high = min(shortest / durations[-1], 1.0), 1.0
         for _ in range(_BISECTIONS):
-            if high - low < 1e-3 or self.iterations >= self.settings.iterations_max:
+            if high - low < 1e-3 or self.iterations >= self._iterations_max:
                 break
             middle = 0.5 * (low + high)
             tried = self.try_durations(split_last(middle * durations))

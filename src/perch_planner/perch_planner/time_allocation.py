@@ -19,6 +19,7 @@ FINE = (np.array([0.26, 0.2, 0.2]), np.array([0.375, 0.25]))  # [s] last pieces 
 PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
+LAST_SEGMENT_MIN = 0.25   # [s]; a shorter rotation is often infeasible
 
 
 @compiled
@@ -86,13 +87,13 @@ def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray)
     if problem.segment_times is not None:
         return with_last_segment(np.array(problem.segment_times), settings)
     return _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
-                            TURN_ACCELERATION, max(settings.tube_time, settings.last_segment_min))
+                            TURN_ACCELERATION, max(settings.tube_time, LAST_SEGMENT_MIN))
 
 
 def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndarray:
     """The durations with a last segment that is long enough for the tube: a shorter one is often infeasible."""
     durations = durations.copy()
-    durations[-1] = max(durations[-1], settings.tube_time, settings.last_segment_min)
+    durations[-1] = max(durations[-1], settings.tube_time, LAST_SEGMENT_MIN)
     return durations
 
 

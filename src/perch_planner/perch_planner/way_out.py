@@ -16,7 +16,7 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import Vehicle
 from perch_planner import refusals
 from perch_planner.certificates import certificates
-from perch_planner.contact_constraints import Contact
+from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP, Contact
 from perch_planner.planner import PerchPlan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
@@ -35,8 +35,7 @@ class _Hover(Contact):
         start = problem.start
         self.velocity, self.points = np.zeros(3), np.array([start.p, place])
         self.problem = (self.points, start.v, start.a, start.j, np.ones(3, np.int64), np.arange(1, 4), np.zeros((3, 3)), problem.surface.R_WS,
-                        self.velocity, settings.impact_acceleration, settings.tube_tolerance, settings.tube_floor, 0.0, settings.tube_step,
-                        -np.inf, np.inf, np.inf)
+                        self.velocity, settings.impact_acceleration, TUBE_SHARE, TUBE_FLOOR, 0.0, TUBE_STEP, -np.inf, np.inf, np.inf)
 
 
 def hover_place(problem: PerchProblem, limits: Limits, duration: float) -> np.ndarray:

@@ -123,7 +123,7 @@ def _surface(inclination: int, rng: np.random.Generator) -> Iterator[Instant]:
     from perch_planner.problem import PerchProblem, StartState
     from perch_planner.way_out import plan_way_out
 
-    settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters)
+    settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters).settings
     vehicle = load_vehicle("snapdragon")
     place = np.array([rng.uniform(1.2, 3.0), rng.uniform(-0.5, 0.5), rng.uniform(1.2, 1.8)])
     problem = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))

@@ -27,6 +27,7 @@ import numpy as np
 from perch_core import bernstein
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
 from perch_planner.paper import sturm
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.solvers import least_norm
@@ -34,6 +35,7 @@ from perch_planner.solvers import least_norm
 N = 14            # order of the polynomials [M:eq3]
 SMOOTH = 4        # continuous up to this derivative [M:eq7]
 STRETCH = 1.2     # of a violating segment and its neighbours; the paper does not say, but its Fig. 4 goes from 1 to 1.4 s
+PROGRAMS_MAX = 100  # of a plan
 E3 = np.array([0.0, 0.0, 1.0])
 _DERIVATIVES = tuple(bernstein.derivative(np.eye(N + 1), order) for order in range(SMOOTH + 1))  # of the basis
 
@@ -95,9 +97,9 @@ def impact_window(R_WS: np.ndarray, settings: PerchSettings) -> tuple[np.ndarray
 def tube(R_WS: np.ndarray, settings: PerchSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(1 -+ q)(alpha s3 - g e3) around x''(t): lower and upper bounds [m/s^2], shape (3,), and t - t_f of its instants [s]. [M:eq15]"""
     end = settings.impact_acceleration * R_WS[:, 2] - GRAVITY * E3
-    half = np.maximum(settings.tube_tolerance * np.abs(end), settings.tube_floor)
-    count = int(np.ceil(settings.tube_time / settings.tube_step - 1e-9))
-    return end - half, end + half, -settings.tube_time + settings.tube_step * np.arange(count)
+    half = np.maximum(TUBE_SHARE * np.abs(end), TUBE_FLOOR)
+    count = int(np.ceil(settings.tube_time / TUBE_STEP - 1e-9))
+    return end - half, end + half, -settings.tube_time + TUBE_STEP * np.arange(count)
 
 
 def inequalities(durations: np.ndarray, R_WS: np.ndarray, settings: PerchSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -238,14 +240,14 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pa
 
     Args:
         problem: with `segment_times`, the durations to begin with; its pad stands still.
-        settings: alpha, v_min, v_max, tube, thrust bounds, objective, `duration_max` and `iterations_max`; others do not count.
+        settings: alpha, v_min, v_max, tube, thrust bounds, objective and `duration_max`; others do not count.
         vehicle: mass, thrust range and perch offset.
     """
     begin = process_time()
     low, high = Limits.of(settings, vehicle).thrust
     durations, solved = np.array(problem.segment_times, float), False
     done: list[Any] = []
-    while not solved and durations.sum() <= settings.duration_max and len(done) < settings.iterations_max:
+    while not solved and durations.sum() <= settings.duration_max and len(done) < PROGRAMS_MAX:
         chosen = position_program(problem, settings, vehicle, durations)
         solution = least_norm(chosen.rows, chosen.lower, chosen.upper, settings.solver)
         coefficients, violated = None, np.ones(len(durations), bool)
