@@ -251,14 +251,12 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
 
 def test_a_planner_is_loaded_once_whatever_may_change(ask: Asked) -> None:
     powerline_planner.planner_of.cache_clear()
-    changed = PowerlinePlannerComponent(PowerlinePlannerParameters(sample_step=0.01, deadline=3.0))
+    changed = PowerlinePlannerComponent(PowerlinePlannerParameters(deadline=3.0))
     ask.component.preload()()
     changed.preload()()
     assert powerline_planner.planner_of.cache_info().misses == 1
-    ask.component.reconfigure(PowerlinePlannerParameters(sample_step=0.02))
-    fine = np.diff(ask(request()).trajectory.times)
-    assert np.median(fine) == pytest.approx(0.02, rel=0.1)
-    assert powerline_planner.planner_of.cache_info().misses == 1
+    ask.component.reconfigure(PowerlinePlannerParameters(deadline=4.0))
+    assert ask(request()).success and powerline_planner.planner_of.cache_info().misses == 1
 
 
 @pytest.mark.parametrize(("changes", "words"), [(dict(camera="rear"), "no camera"), (dict(vehicle="snapdragon"), "thrust_rate_max")])

@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 from perch_core.component import Component, Diagnostics, Job, JobStopped, Service
-from perch_core.config import quantity, text
+from perch_core.config import text
 from perch_core.errors import ConfigError, PerchError, PlanningRefusal
 from perch_core.rotor_model import RotorModel
 from perch_core.values import PowerlinePlan, PowerlinePlanRequest, limits
@@ -25,11 +25,9 @@ _FALLBACK_LEAST = 0.05  # it needs more than that [s]
 
 @dataclass(frozen=True, kw_only=True)
 class PowerlinePlannerParameters(PowerlineSettings):
-    """Parameters of the component: those of the planner, the vehicle it plans for, and how finely it answers."""
+    """Parameters of the component: those of the planner, and the vehicle it plans for."""
 
     vehicle: str = text("rpg", doc="config/vehicles/<name>.yaml, or a file")
-    sample_step: float = quantity(0.004, unit="s", low=0.001, high=0.05, doc="spacing of the trajectory's points")
-    contact_time: float = quantity(0.1, unit="s", low=0.0, high=10.0, doc="wait for the grip after a perch without recovery")
 
 
 @dataclass(frozen=True)
@@ -40,14 +38,12 @@ class Task:
         vehicle: name or file.
         settings: of the planner.
         request: what to plan.
-        sample_step, contact_time, start: as in `service.answer`.
+        start: as in `service.answer`.
     """
 
     vehicle: str
     settings: PowerlineSettings
     request: PowerlineRequest
-    sample_step: float
-    contact_time: float
     start: int
 
 
@@ -59,7 +55,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
     """
 
     config_type = PowerlinePlannerParameters
-    changeable = ("deadline", "sample_step", "contact_time")
+    changeable = ("deadline",)
 
     plan_powerline = Service(PowerlinePlanRequest, PowerlinePlan, "plan_powerline")
 
@@ -71,7 +67,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         if not math.isfinite(self._vehicle.thrust_rate_max):
             raise ConfigError("powerline_planner", "vehicle", f"{self._vehicle.name} has no thrust_rate_max, which [P:eq14g] needs")
         self._model = RotorModel.of(self._vehicle)
-        # What may change is not part of it: it goes with each request.
+        # The deadline may change, and goes with each request.
         own = {field.name: getattr(config, field.name) for field in fields(PowerlineSettings)}
         self._settings = PowerlineSettings(**own | {"deadline": PowerlineSettings.deadline})
 
@@ -88,24 +84,24 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         except PerchError as error:
             self._reply(request, reply, error)
             return
-        task = Task(self.config.vehicle, self._settings, wanted, self.config.sample_step, self.config.contact_time, request.start)
-        self._ask(request, reply, task, FIRST_SHARE if self._settings.solver != "ipopt" else 1.0)
+        task = Task(self.config.vehicle, self._settings, wanted, request.start)
+        self._ask(request, reply, task)
 
-    def _ask(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], task: Task, share: float) -> None:
+    def _ask(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], task: Task) -> None:
         """Have a task solved within a share of its deadline; what is left is for ipopt."""
         deadline = task.request.deadline
+        rest = (1.0 - FIRST_SHARE) * deadline
 
         def then(found: Any) -> None:
-            rest = (1.0 - share) * deadline
             if not isinstance(found, JobStopped):
                 self._reply(request, reply, found)
-            elif task.request.solver != "ipopt" and rest > _FALLBACK_LEAST:
+            elif rest > _FALLBACK_LEAST:
                 again = replace(task, request=replace(task.request, solver="ipopt"))
                 self.work(Job(solve, (again,), partial(self._reply_late, request, reply, deadline), rest, isolated=True))
             else:
                 self._reply_late(request, reply, deadline, found)
 
-        self.work(Job(solve, (task,), then, share * deadline, isolated=True))
+        self.work(Job(solve, (task,), then, FIRST_SHARE * deadline, isolated=True))
 
     def _reply_late(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], deadline: float, found: Any) -> None:
         if isinstance(found, JobStopped):
@@ -142,7 +138,7 @@ def solve(task: Task) -> PowerlinePlan:
     """
     planner = planner_of(task.vehicle, task.settings)
     try:
-        return service.answer(planner.plan(task.request), planner.solver.model, task.sample_step, task.contact_time, task.start)
+        return service.answer(planner.plan(task.request), planner.solver.model, task.start)
     except (PerchError, MemoryError):
         raise
     except Exception as error:  # whoever asked must get an answer whatever happens here

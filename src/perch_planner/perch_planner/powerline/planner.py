@@ -15,10 +15,11 @@ from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import certify, certify_end
 from perch_planner.powerline.flight import fly
+from perch_planner.powerline.formulation import OURS, Formulation, Weights
 from perch_planner.powerline.nlp import Numbers, Solution, Structure
 from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
 from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
-from perch_planner.powerline.settings import Margins, PerchWeights, PowerlineSettings
+from perch_planner.powerline.settings import Margins, PowerlineSettings
 from perch_planner.powerline.solving import PHASES, Solver, end_weights, run_weights, see_weights
 from perch_planner.powerline.stage_functions import line_parameters
 from perch_planner.powerline.validation import check_request
@@ -60,7 +61,7 @@ class _Task:
     lines: tuple[Segment, ...]
     known: tuple[Segment, ...]
     perception: bool
-    weights: PerchWeights
+    weights: Weights
     pinned: np.ndarray
     duration: tuple[float, float]
     margins: Margins
@@ -81,16 +82,17 @@ class PowerlinePlanner:
     vehicle: Vehicle
     settings: PowerlineSettings = field(default_factory=PowerlineSettings)
     gravity: float = GRAVITY
+    formulation: Formulation = OURS
     solver: Solver = field(init=False)
 
     def __post_init__(self) -> None:
-        self.solver = Solver(self.vehicle, self.gravity, self.settings.camera, self.settings.correct_drift)
+        self.solver = Solver(self.vehicle, self.gravity, self.settings.camera, self.formulation.correct_drift)
 
     def warm_up(self, lines: int = 3) -> None:
         """Build the solvers of the usual structures beforehand, so that the first plan is as fast as the others."""
         for perception in (False, True):
             for phase in PHASES:
-                self.solver.problem(Structure(self.settings.intervals, lines, perception, self.settings.solver), phase)
+                self.solver.problem(Structure(self.settings.intervals, lines, perception), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
         """Plan a perch with its recovery, or a recovery alone; a perch after which no recovery is found says so.
@@ -111,7 +113,7 @@ class PowerlinePlanner:
             return PowerlinePlan(perch, None, str(refusal))
 
     def _perch(self, request: PowerlineRequest, pose: PerchPose) -> _Task:
-        s, target = self.settings, request.target()
+        s, formulation, target = self.settings, self.formulation, request.target()
         turn = aside = 0.0
         if request.perception:
             q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)
@@ -127,12 +129,11 @@ class PowerlinePlanner:
         approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
         at_end = _share(0.5 * self._clearance(np.concatenate([pose.p_WB, pose.q_WB]), request.lines))
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
-                     request.perception, s.perch, np.full(6, s.end_factor), s.duration, s.margins, 0.0, approaching, at_end, 0.0, first_guess,
-                     (s.accuracy.position, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver,
-                     request.deadline or s.deadline)
+                     request.perception, formulation.perch, np.full(6, formulation.end_factor), s.duration, s.margins, 0.0, approaching, at_end,
+                     0.0, first_guess, formulation.accuracy, request.solver, request.deadline or s.deadline)
 
     def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
-        s = self.settings
+        s, formulation = self.settings, self.formulation
         start = start.copy()
         start[THRUST] = np.clip(start[THRUST], self.vehicle.thrust_min, s.thrust_share * self.vehicle.thrust_max)
         margins, reduction = self._room(start, request.lines)
@@ -142,10 +143,10 @@ class PowerlinePlanner:
                                         (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
 
         nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
-        pinned = np.array([1.0, 1.0, *[s.end_factor] * 4])  # upright and at rest, but not at one place
+        pinned = np.array([1.0, 1.0, *[formulation.end_factor] * 4])  # upright and at rest, but not at one place
         return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
-                     False, s.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, 1.0, reduction, first_guess,
-                     (np.inf, s.accuracy.tilt_deg, s.accuracy.speed), request.solver or s.solver, request.deadline or s.deadline)
+                     False, formulation.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, 1.0, reduction, first_guess,
+                     (np.inf, *formulation.accuracy[1:]), request.solver, request.deadline or s.deadline)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
         """Margins that the start of a recovery leaves, and what to take off the wires' radii for it to begin free.
@@ -185,7 +186,7 @@ class PowerlinePlanner:
             numbers = Numbers(
                 start=task.start, reference=np.concatenate([task.wanted.p_WB, task.wanted.s3_W, task.wanted.v_W, np.zeros(3)]),
                 lines=np.array([line_parameters(line, task.radius_reduction) for line in lines]).reshape(-1, 8),
-                run_weights=run_weights(task.weights, s.ramp, vehicle.thrust_rate_max, intervals),
+                run_weights=run_weights(task.weights, self.formulation.ramp, vehicle.thrust_rate_max, intervals),
                 end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
                 height_min=s.height_min + margins.height,
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),

@@ -14,6 +14,7 @@ from perch_core.errors import ConfigError
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, V, W, hover_state
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
+from perch_planner.powerline.formulation import OURS, PUBLISHED
 from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
@@ -89,6 +90,7 @@ class PowerlineProblem:
     perch: PerchConfig = text()
     perception: bool = quantity(False, doc="keep the target line in view [P:eq8-13]")
     recovery: bool = quantity(True, doc="append the recovery [P:V-B]")
+    published: bool = quantity(False, doc="the program as the authors published it")
     settings: PowerlineSettings = part(PowerlineSettings)
 
     def segments(self) -> tuple[Segment, ...]:
@@ -149,7 +151,7 @@ def plan(problem: PowerlineProblem, **changes: Any) -> PlannedProblem:
         PlanningRefusal: bad request, or no trajectory within the limits.
     """
     vehicle = load_vehicle(problem.vehicle)
-    planner = PowerlinePlanner(vehicle, problem.settings, problem.gravity)
+    planner = PowerlinePlanner(vehicle, problem.settings, problem.gravity, PUBLISHED if problem.published else OURS)
     request = problem.request(vehicle)
     for name, value in changes.items():
         request = config.replace(request, **{name: value})

@@ -96,7 +96,7 @@ class PowerlineRequest:
         with_recovery: append the recovery. [P:V-B]
         recovery_only: plan a recovery from `start` alone.
         hover: where a recovery shall tend to [m], shape (3,); the start of the perch when None.
-        solver: overrides the settings' first choice; empty: it stands.
+        solver: first choice, "fatrop" or "ipopt"; where it does not converge, ipopt is tried.
         deadline: wall-clock time after which no further attempt is begun [s]; 0: the settings'.
     """
 
@@ -108,7 +108,7 @@ class PowerlineRequest:
     with_recovery: bool = True
     recovery_only: bool = False
     hover: np.ndarray | None = None
-    solver: str = ""
+    solver: str = "fatrop"
     deadline: float = 0.0
 
     def target(self) -> Segment:

@@ -14,6 +14,8 @@ from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePl
 from perch_planner.powerline import plan
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 
+SAMPLE_STEP = 0.004   # spacing of the trajectory's points [s]
+CONTACT_TIME = 0.1    # how long the grip is awaited after a perch without recovery, where the mission says nothing [s]
 POINT_REACH = 3.0
 """A perch point farther from its line, or beyond its ends, means another one [m]."""
 
@@ -86,17 +88,15 @@ def _near(target: Segment, point: np.ndarray) -> None:
                               f"(allowed {POINT_REACH:g} m)")
 
 
-def answer(found: plan.PowerlinePlan, model: RotorModel, sample_step: float, contact_time: float, start: int) -> PowerlinePlan:
+def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> PowerlinePlan:
     """The answer that carries a plan.
 
     Args:
         found: what was planned.
         model: of the vehicle, for the accelerations.
-        sample_step: spacing of the trajectory's samples [s].
-        contact_time: how long the grip is awaited after a perch without recovery [s].
         start: stamp of the trajectory's start [ns].
     """
-    sampled = found.trajectory(model, step=sample_step)
+    sampled = found.trajectory(model, step=SAMPLE_STEP)
     trajectory = replace(sampled, q=sampled.q / np.linalg.norm(sampled.q, axis=1)[:, None], start_time=seconds(start))
     perch, recovery = found.perch, found.recovery
     at_end, recovery_start = AtEnd.CONTACT, -1.0
@@ -107,7 +107,7 @@ def answer(found: plan.PowerlinePlan, model: RotorModel, sample_step: float, con
     without = f", without recovery: {found.without_recovery}" if found.without_recovery else ""
     return PowerlinePlan(
         success=True, message=", then ".join(words) + without, trajectory=trajectory, at_end=at_end,
-        contact_time=0.0 if perch is None else float(contact_time), recovery_start=recovery_start,
+        contact_time=0.0 if perch is None else CONTACT_TIME, recovery_start=recovery_start,
         certificates=found.bounds,
         perch_time=0.0 if perch is None else float(perch.duration), recovery_time=0.0 if recovery is None else float(recovery.duration),
         solve_time=0.0 if perch is None else float(perch.solve_time),

@@ -18,8 +18,9 @@ import numpy as np
 from perch_core.rotor_model import RotorModel
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import compiled
+from perch_planner.powerline.formulation import Weights
 from perch_planner.powerline.nlp import Numbers, Problem, Solution, Structure
-from perch_planner.powerline.settings import PerceptionWeights, PerchWeights
+from perch_planner.powerline.settings import PerceptionWeights
 from perch_planner.powerline.stage_functions import StageFunctions, StageModel, stage_functions
 
 # Phase: tolerance, first barrier parameter, push off active bounds. The nearer the guess, the smaller the latter two.
@@ -30,6 +31,10 @@ PHASES: dict[str, dict[str, Any]] = {
     "second": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
     "polish": {"tolerance": 1e-5, "barrier": 1e-5, "push": 1e-7},
 }
+
+REPROJECTION_DECAY = 0.1  # of the cost [P:eq9], per thirtieth of the horizon
+SOFT_DECAY = 0.3          # of the soft constraints [P:eq14h, P:eq14i], the same, from SOFT_UNTIL on
+SOFT_UNTIL = 0.667        # share of the horizon
 
 
 @dataclass
@@ -91,7 +96,7 @@ class Solver:
                        cpu_time=cpu_time + found.cpu_time)
 
 
-def run_weights(weights: PerchWeights, ramp: float, thrust_rate_max: float, intervals: int) -> np.ndarray:
+def run_weights(weights: Weights, ramp: float, thrust_rate_max: float, intervals: int) -> np.ndarray:
     """Running weights for the stage functions, shape (4,).
 
     Sums over nodes grow with N; the weights are the authors' for N = 30 and are scaled to mean the same for every N.
@@ -101,7 +106,7 @@ def run_weights(weights: PerchWeights, ramp: float, thrust_rate_max: float, inte
                      weights.rate_between * share])
 
 
-def end_weights(weights: PerchWeights) -> np.ndarray:
+def end_weights(weights: Weights) -> np.ndarray:
     """End weights for the stage functions, shape (6,)."""
     return np.array([weights.xy_end, weights.z_end, weights.tilt_end, weights.v_end, weights.w_end, weights.thrust_end])
 
@@ -112,6 +117,6 @@ def see_weights(weights: PerceptionWeights, intervals: int) -> np.ndarray:
     The camera cannot see the line at the end of the perch, so that neither the cost nor the constraints may rule there.
     """
     k = np.arange(intervals) * 30.0 / intervals
-    soft = np.exp(-weights.soft_decay * np.maximum(0.0, k - 30 * weights.soft_until))
-    cost = np.exp(-weights.reprojection_decay * k)
+    soft = np.exp(-SOFT_DECAY * np.maximum(0.0, k - 30 * SOFT_UNTIL))
+    cost = np.exp(-REPROJECTION_DECAY * k)
     return np.stack([weights.reprojection * cost, weights.cheirality * soft, weights.visibility * soft], axis=1) * 30.0 / intervals

@@ -17,6 +17,8 @@ from perch_planner.powerline.settings import PowerlineSettings
 
 END_TRIM = 0.1  # neighbours of one cable touch at their ends: that much of each end does not count as crossing [m]
 CROSSING_COSINE = 0.966  # 15 deg: two estimates of one cable may overlap, lines that cross are a wrong map
+BEARING_MAX = 120.0  # a perch point farther from the camera's heading is behind the vehicle [deg]
+GRIPPER_ERROR_MAX = 0.05  # a given perch pose brings the gripper this near to the line [m]
 SPEED_MAX = 10.0  # no start of a perch is faster [m/s]
 
 
@@ -109,9 +111,9 @@ def _perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle
         if clearance < 0:
             _refuse("perch_in_collision", "clearance [P:eq14j]", clearance,
                     f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
-    if miss > settings.gripper_error_max:
-        _refuse("bad_input", "gripper", settings.gripper_error_max - miss,
-                f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {settings.gripper_error_max:g} m)")
+    if miss > GRIPPER_ERROR_MAX:
+        _refuse("bad_input", "gripper", GRIPPER_ERROR_MAX - miss,
+                f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {GRIPPER_ERROR_MAX:g} m)")
 
 
 def _reach(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> float:
@@ -128,7 +130,7 @@ def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle
     axis_W = so3.quat_to_matrix(request.start[Q]) @ mount.R_BC[:, 2]
     way = target.closest_point(perch.p_WB) - request.start[P]
     bearing = float(np.degrees(so3.angle_between(axis_W, way)))
-    if bearing > settings.bearing_max_deg:
-        _refuse("bad_input", "line ahead", settings.bearing_max_deg - bearing,
+    if bearing > BEARING_MAX:
+        _refuse("bad_input", "line ahead", BEARING_MAX - bearing,
                 f"line {target.id} is behind the vehicle: {bearing:.0f} deg from the camera's axis "
-                f"(allowed {settings.bearing_max_deg:g} deg); turn to face it first")
+                f"(allowed {BEARING_MAX:g} deg); turn to face it first")
