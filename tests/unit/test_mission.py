@@ -10,7 +10,7 @@ from perch_core.surface import PerchSurface
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
-    AdhesionLimits, AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
+    AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
     Plan, Refusal, Result, State, SurfaceMission, Target)
 from perch_control.mission.moves import Moves
 
@@ -198,7 +198,7 @@ def test_recovery_without_end_is_bounded():
 
 def test_adhesion_needs_place_attitude_speed_and_force():
     target = Target(0.0, SURFACE.p_WS, Q_PERCH, 0.01, 0.01)
-    monitor = AdhesionMonitor(AdhesionLimits())
+    monitor = AdhesionMonitor()
     g_B = so3.quat_rotate(so3.quat_conjugate(Q_PERCH), [0, 0, GRAVITY])
     at_rest = State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3))
     monitor.add(np.tile(g_B, (29, 1)))

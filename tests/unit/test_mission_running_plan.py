@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perch_control.mission import AdhesionLimits, AdhesionMonitor, Goal, MissionSettings, Mode, Plan, Refusal, State, Target
+from perch_control.mission import AdhesionMonitor, Goal, MissionSettings, Mode, Plan, Refusal, State, Target
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.requests import flown_order
 from perch_control.smooth_position import BEFORE
@@ -167,7 +167,7 @@ def test_a_grip_is_felt_and_flight_beside_the_wire_is_not_taken_for_one(pitch):
     p, zero = np.array([-0.1, 0.0, 0.1]), np.zeros(3)
 
     def felt(q: np.ndarray, force: np.ndarray) -> bool:
-        monitor = AdhesionMonitor(AdhesionLimits())
+        monitor = AdhesionMonitor()
         monitor.add(np.tile(force, (40, 1)))
         return monitor.attached(State(p, q, zero, zero), wire)
 

@@ -60,7 +60,7 @@ class ScriptedMission(Component[MissionParameters]):
 
     def __init__(self, config: MissionParameters) -> None:
         super().__init__(config)
-        self._adhesion = AdhesionMonitor(config.mission.adhesion)
+        self._adhesion = AdhesionMonitor()
         self._forces: list[tuple[float, float, float]] = []
         self._orders = 0
         self._target: Target | None = None

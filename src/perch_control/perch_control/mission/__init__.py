@@ -1,6 +1,6 @@
 """Missions: arm, take off, look, plan, fly, verify, recover. `perch_control.mission_component` brings them to their channels."""
 
-from perch_control.mission.adhesion import AdhesionLimits, AdhesionMonitor
+from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.inspection import InspectionMission
 from perch_control.mission.machine import MissionMachine
 from perch_control.mission.settings import MissionSettings
@@ -9,6 +9,6 @@ from perch_control.mission.values import (
     Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, Plan, PlanQuery, Refusal, Result, State, Target)
 from perch_control.mission.wire import PowerlineMission
 
-__all__ = ["AdhesionLimits", "AdhesionMonitor", "Command", "ControllerState", "Goal", "InspectionMission", "Inputs", "MissionMachine",
+__all__ = ["AdhesionMonitor", "Command", "ControllerState", "Goal", "InspectionMission", "Inputs", "MissionMachine",
            "MissionSettings", "Mode", "Outcome", "Outputs", "Phase", "Plan", "PlanQuery", "PowerlineMission", "Refusal", "Result", "State",
            "SurfaceMission", "Target"]

@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 from perch_core import so3
-from perch_core.config import quantity
 from perch_core.vehicle import GRAVITY
 from perch_control.mission.values import State, Target
 from perch_control.period import NOMINAL_PERIOD
 
 
+WINDOW = 0.06  # time over which the specific force is averaged [s]
+UNBALANCED = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
+SPEED = 0.5  # of a vehicle at rest, as estimated [m/s]
+TILT = np.radians(25.0)  # between b3 and the surface normal
+DISTANCE = 0.25  # from the localised pad's centre [m]
 _LEAST = 0.8  # what vibration and a wrong attitude make of a vehicle at rest [m/s^2]
 _LEAST_TILT = np.radians(8.0)  # what a grip and the attitude's estimate leave
 _UP = np.array([0.0, 0.0, 1.0])
-
-
-@dataclass(frozen=True, kw_only=True)
-class AdhesionLimits:
-    """Limits of the adhesion test."""
-
-    window: ClassVar[float] = 0.06  # time over which the specific force is averaged [s]
-    unbalanced: ClassVar[float] = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
-    speed: ClassVar[float] = 0.5  # [m/s]
-    tilt_deg: ClassVar[float] = 25.0  # between b3 and the surface normal [deg]
-    distance: float = quantity(0.25, unit="m", above=0.0, high=2.0, doc="from the localised pad's centre")
 
 
 class AdhesionMonitor:
@@ -42,9 +33,8 @@ class AdhesionMonitor:
     degrees), so that what counts as balanced is at most half of that, and a hover must not count as aligned.
     """
 
-    def __init__(self, limits: AdhesionLimits) -> None:
-        self.limits = limits
-        self._samples: deque[np.ndarray] = deque(maxlen=_count(limits, NOMINAL_PERIOD))
+    def __init__(self) -> None:
+        self._samples: deque[np.ndarray] = deque(maxlen=_count(NOMINAL_PERIOD))
 
     def reset(self) -> None:
         """Forget the past."""
@@ -52,7 +42,7 @@ class AdhesionMonitor:
 
     def add(self, specific_force_B: np.ndarray, period: float = NOMINAL_PERIOD) -> None:
         """Take IMU samples in, shape (n, 3) [m/s^2], that come with a period [s]."""
-        count = _count(self.limits, period)
+        count = _count(period)
         if count != self._samples.maxlen:
             self._samples = deque(self._samples, count)
         self._samples.extend(np.asarray(specific_force_B, float).reshape(-1, 3))
@@ -73,19 +63,18 @@ class AdhesionMonitor:
         One that rocks in what holds it feels as little for a moment; but it does not gather speed.
         """
         return (self.filled and float(np.linalg.norm(np.mean(self._samples, axis=0))) < 0.4 * GRAVITY
-                and float(np.linalg.norm(state.v_WB)) > self.limits.speed)
+                and float(np.linalg.norm(state.v_WB)) > SPEED)
 
     def attached(self, state: State, target: Target) -> bool:
         """The vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""
         if not self.filled:
             return False
-        limits = self.limits
         b3, s3 = so3.quat_rotate(state.q_WB, _UP), so3.quat_rotate(target.q_WS, _UP)
         return bool(
-            np.linalg.norm(state.p_WB - target.p_WS) < limits.distance
-            and so3.angle_between(b3, s3) < min(np.radians(limits.tilt_deg), max(_LEAST_TILT, 0.5 * so3.angle_between(s3, _UP)))
-            and np.linalg.norm(state.v_WB) < limits.speed
-            and self.imbalance(state.q_WB) < min(limits.unbalanced, max(_LEAST, 0.5 * _unbalanced_in_flight(b3))))
+            np.linalg.norm(state.p_WB - target.p_WS) < DISTANCE
+            and so3.angle_between(b3, s3) < min(TILT, max(_LEAST_TILT, 0.5 * so3.angle_between(s3, _UP)))
+            and np.linalg.norm(state.v_WB) < SPEED
+            and self.imbalance(state.q_WB) < min(UNBALANCED, max(_LEAST, 0.5 * _unbalanced_in_flight(b3))))
 
     @staticmethod
     def tells(state: State) -> bool:
@@ -93,9 +82,9 @@ class AdhesionMonitor:
         return _unbalanced_in_flight(so3.quat_rotate(state.q_WB, _UP)) > 2.0 * _LEAST
 
 
-def _count(limits: AdhesionLimits, period: float) -> int:
+def _count(period: float) -> int:
     """Samples in the window."""
-    return max(3, round(limits.window / period))
+    return max(3, round(WINDOW / period))
 
 
 def _unbalanced_in_flight(b3: np.ndarray) -> float:

@@ -15,6 +15,8 @@ from perch_control.mission.settings import MissionSettings
 from perch_control.mission.usable_target import unusable
 from perch_control.mission.values import Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, Result, Target
 
+SEARCH_RISE = 0.25              # height change of the search pattern [m]
+SEARCH_TURN = np.radians(30.0)  # its sweep [rad]
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
 
@@ -50,7 +52,7 @@ class MissionMachine(ABC):
         self.phases: dict[Phase, Callable[[Inputs, Outputs], None]] = {
             Phase.ARMING: self._arming, Phase.TAKE_OFF: self._take_off, Phase.SEARCHING: self._searching,
             Phase.RECOVERING: self._recovering}
-        self._adhesion = AdhesionMonitor(settings.adhesion)
+        self._adhesion = AdhesionMonitor()
         self._since = self._entered_search = 0.0
         self._seen_since: float | None = None
         self._asked = False
@@ -81,9 +83,8 @@ class MissionMachine(ABC):
 
     def pattern(self) -> list[Look]:
         """Places around the search hover (forward, left, up [m], turn [rad]): a pad may be out of view, the vehicle turns and rises."""
-        rise, turn = self.settings.search_rise, np.radians(self.settings.search_yaw_deg)
-        return [(np.array([0.0, 0.0, rise]), 0.0), (np.zeros(3), turn), (np.zeros(3), -turn),
-                (np.array([0.0, 0.0, -rise]), 0.0), (np.zeros(3), 0.0)]
+        return [(np.array([0.0, 0.0, SEARCH_RISE]), 0.0), (np.zeros(3), SEARCH_TURN), (np.zeros(3), -SEARCH_TURN),
+                (np.array([0.0, 0.0, -SEARCH_RISE]), 0.0), (np.zeros(3), 0.0)]
 
     def reach(self, offset: np.ndarray, p: np.ndarray, target: Target | None) -> np.ndarray:
         """How much of an offset of the pattern (forward, left, up [m]) from the search place `p` [m] is flown."""
@@ -105,7 +106,7 @@ class MissionMachine(ABC):
 
     def reconfigure(self, settings: MissionSettings) -> None:
         """New settings count from the next tick on; the moves under way stay."""
-        self.settings, self._adhesion.limits = settings, settings.adhesion
+        self.settings = settings
 
     def start(self, goal: Goal, time: float) -> None:
         """Take a goal; the machine must be idle."""

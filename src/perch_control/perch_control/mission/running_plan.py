@@ -24,6 +24,7 @@ from perch_control.mission.ways_out import DECISION, WaysOut
 from perch_control.reference import normalised
 from perch_control.smooth_position import BEFORE
 
+AHEAD_LATENCY = 0.2  # what is asked while a plan is flown is used so long after its request [s]
 _AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
 
 
@@ -70,7 +71,7 @@ class RunningPlan:
         """
         if self._asked is not None:
             return None
-        s, soonest = self._settings, time + self._settings.ahead_latency + DECISION
+        s, soonest = self._settings, time + AHEAD_LATENCY + DECISION
         if goal.replan and target is not None and self._better(target, time, soonest):
             self._replanned_at = time
             return self._ask(soonest, self.state(soonest), target, goal, perch_pose=self._perch_pose(target))
@@ -152,6 +153,6 @@ class RunningPlan:
     def _ask(self, start: float, x: StateSample, target: Target, goal: Goal, recovery: bool = False,
              perch_pose: tuple[np.ndarray, np.ndarray] | None = None) -> PlanQuery:
         zero = np.zeros(3)
-        self._asked = PlanQuery(start, x.p, x.v, zero, zero, 0.0, target, goal, latency=self._settings.ahead_latency,
+        self._asked = PlanQuery(start, x.p, x.v, zero, zero, 0.0, target, goal, latency=AHEAD_LATENCY,
                                 state=x, recovery=recovery, perch_pose=perch_pose)
         return self._asked

@@ -8,9 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from perch_core.config import part, quantity
+from perch_core.config import quantity
 from perch_core.errors import ConfigError
-from perch_control.mission.adhesion import AdhesionLimits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,17 +21,12 @@ class MissionSettings:
     settle_time: ClassVar[float] = 0.6  # rest after a move before it counts as reached [s]
     settle_speed: ClassVar[float] = 0.15  # speed below which the vehicle rests [m/s]
     search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0)
-    search_yaw_deg: float = quantity(30.0, unit="deg", low=0.0, high=180.0, doc="sweep of the search pattern")
-    search_rise: float = quantity(0.25, unit="m", low=0.0, high=2.0, doc="height change of the search pattern")
     search_dwell: ClassVar[float] = 2.0  # look this long at each place of the pattern [s]
     target_settle: ClassVar[float] = 0.5  # observe the target this long before planning [s]
     target_position_sigma: float = quantity(0.06, unit="m", above=0.0, high=1.0,
                                           doc="plan only on a target whose place relative to the vehicle is as certain as this")
-    target_attitude_sigma_deg: float = quantity(5.0, unit="deg", above=0.0, high=45.0)
-    inclination_tolerance_deg: float = quantity(15.0, unit="deg", above=0.0, high=90.0, doc="allowed difference from the hint")
     planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")
     powerline_latency: float = quantity(1.0, unit="s", low=0.0, high=10.0, doc="the same for a powerline plan")
-    ahead_latency: float = quantity(0.2, unit="s", low=0.0, high=5.0, doc="the same for what is asked while a powerline plan is flown")
     way_out_spacing: ClassVar[float] = 0.3  # between the starts of recoveries that are kept ready [s]
     way_out_until: ClassVar[float] = 0.3  # closer to the contact the plan's own recovery is the way out [s]
     powerline_replan_period: ClassVar[float] = 0.35  # [s]
@@ -40,9 +34,6 @@ class MissionSettings:
     shift_distance: ClassVar[float] = 0.004  # ... where the wire has moved by more than this ... [m]
     shift_max: ClassVar[float] = 0.15  # ... and less than this; beyond it the rest is planned again [m]
     replan_shift: ClassVar[float] = 0.3  # a new plan whose contact is earlier or later by more is not flown [s]
-    mapping_reach: float = quantity(0.8, unit="m", above=0.0, high=3.0, doc="how far the vehicle moves to see lines from other places")
-    mapping_legs: int = quantity(3, low=0, high=5,
-                                 doc="moves of the pattern that are flown before a plan: up, nearer, down, back; three perch from the near place")
     mapping_approach: float = quantity(2.8, unit="m", low=0.0, high=10.0, doc="how far the vehicle goes nearer to see lines better")
     mapping_standoff: float = quantity(2.2, unit="m", above=0.0, high=50.0, doc="but not nearer to the target than this")
     plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
@@ -55,7 +46,6 @@ class MissionSettings:
     rest_time: ClassVar[float] = 0.6  # rest with motors off that confirms the perch [s]
     arming_timeout: ClassVar[float] = 10.0  # [s]
     phase_timeout: ClassVar[float] = 20.0  # longest take-off or recovery [s]
-    adhesion: AdhesionLimits = part(AdhesionLimits)
 
     def __post_init__(self) -> None:
         if len(self.waypoints) % 4:

@@ -10,6 +10,8 @@ from perch_core import so3
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, Target
 
+ATTITUDE_SIGMA_MAX = math.radians(5.0)      # of a target to plan on [rad]
+INCLINATION_TOLERANCE = math.radians(15.0)  # difference from what the goal says, beyond which it is another surface [rad]
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -23,10 +25,10 @@ def unusable(target: Target, goal: Goal, settings: MissionSettings) -> str:
     """
     if target.position_sigma > settings.target_position_sigma:
         return f"position uncertain by {target.position_sigma:.3f} m"
-    if target.attitude_sigma > math.radians(settings.target_attitude_sigma_deg):
+    if target.attitude_sigma > ATTITUDE_SIGMA_MAX:
         return f"attitude uncertain by {math.degrees(target.attitude_sigma):.1f} deg"
     if goal.inclination_hint is not None:
         inclination = so3.angle_between(so3.quat_rotate(target.q_WS, _UP), _UP)
-        if abs(inclination - goal.inclination_hint) > math.radians(settings.inclination_tolerance_deg):
+        if abs(inclination - goal.inclination_hint) > INCLINATION_TOLERANCE:
             return f"inclination {math.degrees(inclination):.0f} deg, expected {math.degrees(goal.inclination_hint):.0f} deg"
     return ""

@@ -12,6 +12,9 @@ from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.values import Inputs, Outputs, Plan, Target
 
+MAPPING_REACH = 0.8  # how far the vehicle moves up to see lines from other places [m]
+MAPPING_LEGS = 3     # moves of the pattern before a plan: up, nearer, down; perches begin from the near place
+
 
 class LineMission(MissionMachine):
     """What is done at a mapped powerline: the lines are looked at from several places first."""
@@ -24,7 +27,7 @@ class LineMission(MissionMachine):
 
     def pattern(self) -> list[Look]:
         """Lines have to be seen from different places: up and down, nearer (the error of a distance grows with its square), and back."""
-        reach, near = self.settings.mapping_reach, self.settings.mapping_approach
+        reach, near = MAPPING_REACH, self.settings.mapping_approach
         return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
 
 
@@ -34,7 +37,7 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
     @property
     def legs(self) -> int:
         """The first moves of the pattern are flown before any plan."""
-        return self.settings.mapping_legs
+        return MAPPING_LEGS
 
     def reach(self, offset: np.ndarray, p: np.ndarray, target: Target | None) -> np.ndarray:
         """Towards the lines no nearer to the target than `mapping_standoff`."""
