@@ -9,7 +9,10 @@ import rclpy
 from perch_core.component import Component
 from perch_core.config import choice, quantity, text
 from perch_core.errors import ConfigError
+from perch_core.registry import resolved
 from perch_core.ros.node import node
+from perch_core.ros.parameters import _leaves
+from perch_eval.in_process.parameters import COMPONENTS
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -111,3 +114,14 @@ def test_an_accepted_value_counts_at_once_whole_numbers_for_real_ones_too(graph,
     assert (list(shown) if isinstance(got, list) else shown) == got
     config = getattr(graph.tuned.component.config, name)
     assert (list(config) if isinstance(got, list) else config) == got
+
+
+AUTOPILOTS = {"betaflight": "perch_autopilot.betaflight:Betaflight", "mavlink": "perch_autopilot.mavlink:Mavlink"}
+
+
+@pytest.mark.parametrize("nodes, most", [
+    (("powerline_planner",), 17), (("perching_planner",), 15), (("mission",), 12),
+    (("vehicle", "vio_model", "description", "recorder", "viewer", *AUTOPILOTS), 27)])
+def test_parameters_are_those_that_a_user_has_a_reason_to_set(nodes, most):
+    """Of the vehicle, its sensors, the site, the processor, safety; what belongs to an algorithm is a constant beside its equation."""
+    assert sum(len(_leaves(resolved((COMPONENTS | AUTOPILOTS)[node]).config_type)) for node in nodes) <= most
