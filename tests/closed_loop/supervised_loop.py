@@ -13,7 +13,7 @@ from closed_loop.plant import Plant
 from perch_autopilot import msp
 from perch_autopilot.supervised_link import COMMAND, LinkSupervisor
 from perch_autopilot.loop import FirmwareLoop
-from perch_autopilot.watchdog import OFF, ON, Watchdog, WatchdogSettings
+from perch_autopilot.watchdog import DESCENT, OFF, ON, Watchdog
 from perch_core import so3
 from perch_core.timing import CONTROL_PERIOD_NS
 from perch_core.values import NANOSECONDS
@@ -33,15 +33,15 @@ class SupervisedLoop(FirmwareLoop):
         aimed: what the motors aim at, (4,) [rad/s].
     """
 
-    def __init__(self, vehicle: Vehicle, settings: WatchdogSettings = WatchdogSettings()) -> None:
+    def __init__(self, vehicle: Vehicle) -> None:
         super().__init__(vehicle)
         self.severed = False
         self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
-        self.watchdog = Watchdog(settings, self.sticks.throttle_for(1.0), self.sticks.throttle_for(settings.descent))
+        self.watchdog = Watchdog(self.sticks.throttle_for(1.0), self.sticks.throttle_for(DESCENT))
         self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._node.setblocking(False)
         self._time, self._parser = 0.0, msp.Parser()
-        self._supervisor = LinkSupervisor(f"fd:{self.sitl.file}", theirs, self.watchdog, settings.rate, lambda: self._time)
+        self._supervisor = LinkSupervisor(f"fd:{self.sitl.file}", theirs, self.watchdog, lambda: self._time)
         self._killed = False
         self.aimed = np.zeros(4)
 

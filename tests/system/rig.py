@@ -28,7 +28,7 @@ SHORT = """
 extends: surface_90
 name: short
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
-parameters: {vehicle: {start_timeout: 300.0, lockstep_timeout: 300.0}}
+parameters: {vehicle: {lockstep_timeout: 300.0}}
 """
 """A perch without images: VIO and sightings are made from the truth. On a busy machine nodes may take their time to start."""
 BLIND = SHORT.replace("target_localizer, ", "")

@@ -19,7 +19,7 @@ from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import RateCurve, Sticks, rate_curves
-from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog, WatchdogSettings
+from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog
 from perch_autopilot.link import Link, LinkError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
@@ -144,7 +144,7 @@ class StubAutopilot:
 
     voltage, silent = 16.0, False
 
-    def __init__(self, address, settings, hover, descent) -> None:
+    def __init__(self, address, hover, descent, disarm_after) -> None:
         self.throttles, self._said, self._parser, self.closed = (hover, descent), b"", msp.Parser(), False
         self.mode: list[str] = []
 
@@ -201,7 +201,7 @@ def test_hover_and_descent_without_commands_follow_the_battery(flown_on, monkeyp
         node.on_poll(k * 10_000_000)
     empty = node._link.throttles
     assert all(now > then for now, then in zip(empty, full))
-    dog = Watchdog(WatchdogSettings(arming=0.0), *full)
+    dog = Watchdog(*full, arming=0.0)
     dog.command(1.0, True, (1500, 1500, 1500, 1500))
     dog.set_throttles(*empty)
     assert (dog.channels(1.1)[2], dog.channels(1.6)[2]) == empty
@@ -314,13 +314,13 @@ STICKS = (1510, 1520, 1600, 1530)
 
 def watchdog() -> Watchdog:
     """One that has been told to arm a second ago."""
-    dog = Watchdog(WatchdogSettings(), hover=1450, descent=1420)
+    dog = Watchdog(hover=1450, descent=1420)
     dog.command(-1.0, True, STICKS)
     return dog
 
 
 def test_it_arms_with_the_throttle_down():
-    dog = Watchdog(WatchdogSettings(), hover=1450, descent=1420)
+    dog = Watchdog(hover=1450, descent=1420)
     dog.command(5.0, True, STICKS)
     assert dog.channels(5.03) == (1500, 1500, 1000, 1500, ON, OFF)
     dog.command(5.25, True, STICKS)
@@ -398,7 +398,7 @@ def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
 def test_the_supervisor_sends_without_a_node_reopens_the_link_and_ends_with_the_motors_off():
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(120.0)
-        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", WatchdogSettings(), 1450, 1420)
+        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", 1450, 1420, 4.0)
         frame = msp.channels((1500, 1500, 1000, 1500, OFF, OFF))
         for _ in range(2):  # the first link ends; the supervisor opens another
             with server.accept()[0] as peer:

@@ -8,7 +8,7 @@ from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.values import CameraModel, OdometryState, rotated
 from perch_core.vehicle import load_vehicle
-from perch_sim import seeding
+from perch_sim import modelled_vio, seeding, vio_model
 from perch_sim.imu import Imu
 from perch_sim.modelled_vio import ModelledVio
 from perch_sim.vio_model import VioModelParameters
@@ -72,11 +72,12 @@ def test_in_real_time_answers_come_after_their_latency_by_the_stamps_of_the_trut
 
 
 @pytest.mark.slow
-def test_its_whole_state_is_as_wrong_as_its_covariance_says():
+def test_its_whole_state_is_as_wrong_as_its_covariance_says(monkeypatch):
     """Over seeds, 15 errors whitened by the covariance have unit variance; so have those that the drift of yaw correlates."""
+    monkeypatch.setattr(vio_model, "YAW_DRIFT", 0.005)
     nees, pairs = [], []
     for seed in range(120):
-        vio, states, _, _ = model(seed=seed, yaw_drift=0.005)
+        vio, states, _, _ = model(seed=seed)
         vio.on_truth(truth(START + 2 * MS)), vio.on_truth(truth(START + 4 * MS))
         vio.on_camera_info(frame(START + 3 * MS + OFFSET))
         stamp = START + 20_000 * MS
@@ -119,6 +120,7 @@ def test_a_flight_that_begins_anew_is_answered_anew():
     assert len(states) == 2 * before and any("begun anew" in line.text for line in log)
 
 
-def test_a_camera_that_there_is_not_is_refused():
-    with pytest.raises(ConfigError, match="'rear' is not one of down, front"):
-        model(camera="rear")
+def test_a_camera_that_there_is_not_is_refused(monkeypatch):
+    monkeypatch.setattr(modelled_vio, "CAMERA", "rear")
+    with pytest.raises(ConfigError, match="snapdragon has no camera 'rear'"):
+        model()

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
-from perch_core.config import part, quantity, text
+from perch_core.config import quantity, text
 from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
 from perch_core.vehicle import load_vehicle
 from perch_autopilot import msp
@@ -14,7 +14,7 @@ from perch_autopilot.clock import jumped
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import Sticks, rate_curves
-from perch_autopilot.watchdog import CENTRED, WatchdogSettings
+from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER
 from perch_autopilot.link import LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
@@ -30,7 +30,7 @@ class BetaflightParameters:
     link: str = text("/dev/ttyACM0", doc="/dev/ttyACM0, /dev/ttyACM0@921600, tcp:HOST:PORT")
     configuration: str = text("betaflight", doc="what the autopilot is set to: config/autopilot/<name>.txt, or a file")
     one_g: float = quantity(2048.0, above=0.0, high=1e4, doc="reading of its accelerometer at rest (RAW_IMU): 2048, before 4.6 512")
-    watchdog: WatchdogSettings = part(WatchdogSettings)
+    disarm_after: float = quantity(DISARM_AFTER, unit="s", low=0.5, high=60.0, doc="time without a command until the motors stop")
 
 
 class Betaflight(Component[BetaflightParameters]):
@@ -56,7 +56,7 @@ class Betaflight(Component[BetaflightParameters]):
         super().__init__(config)
         vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        self._link, self._parser = SupervisedLink(config.link, config.watchdog, *self._throttles()), msp.Parser()
+        self._link, self._parser = SupervisedLink(config.link, *self._throttles(), config.disarm_after), msp.Parser()
         try:
             self.version = self._identify()
         except BaseException:
@@ -73,7 +73,7 @@ class Betaflight(Component[BetaflightParameters]):
 
     def _throttles(self) -> tuple[int, int]:
         """Throttles of hover and descent [us]."""
-        return self._sticks.throttle_for(1.0), self._sticks.throttle_for(self.config.watchdog.descent)
+        return self._sticks.throttle_for(1.0), self._sticks.throttle_for(DESCENT)
 
     def _identify(self) -> msp.Version:
         """Ask for the firmware's version and the battery's voltage."""

@@ -13,12 +13,11 @@ from perch_autopilot.configuration import load_configuration
 from perch_autopilot.firmware import FirmwareError
 from perch_autopilot.rates import Sticks, rate_curves
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
-from perch_autopilot.watchdog import CENTRED, OFF, ON, Watchdog, WatchdogSettings
+from perch_autopilot.watchdog import CENTRED, DESCENT, OFF, ON, Watchdog
 
 _SETTLED = 500            # cycles on the bench before it is armed: a radio that has just come counts after half a second
 _LAST = 500               # cycles in which it arms there, or does not at all
 _STILL = (0.0, 0.0, 0.0)
-_WATCHDOG = WatchdogSettings(arming=0.0)  # the throttle follows when the motors turn: they are seen here
 
 
 class Reading(Protocol):
@@ -55,7 +54,8 @@ class FirmwareLoop:
         self.sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
         self.sticks.measured(voltage_factor * vehicle.actuation.battery.reference)
         self._voltage_factor = voltage_factor
-        self.watchdog = Watchdog(_WATCHDOG, self.sticks.throttle_for(1.0), self.sticks.throttle_for(_WATCHDOG.descent))
+        # The throttle follows when the motors turn: they are seen here.
+        self.watchdog = Watchdog(self.sticks.throttle_for(1.0), self.sticks.throttle_for(DESCENT), arming=0.0)
         self._low, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self._idle = float(loaded.settings.get("motor_idle", 550)) * 1e-4  # motors of an armed vehicle with the throttle down
         self._turning = False

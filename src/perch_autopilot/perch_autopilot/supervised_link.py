@@ -10,7 +10,6 @@ off.
 
 from __future__ import annotations
 
-import json
 import os
 import select
 import signal
@@ -20,13 +19,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 from perch_autopilot import msp
-from perch_autopilot.watchdog import Mode, Watchdog, WatchdogSettings
+from perch_autopilot.watchdog import Mode, Watchdog
 from perch_autopilot.link import Link, LinkError
 
+RATE = 200.0    # of the frames to the autopilot, in every case [Hz]
 COMMAND, THROTTLES = struct.Struct("<?4H"), struct.Struct("<2H")
 _REOPEN = 0.2   # from one attempt to open a link that has ended to the next [s]
 _FINAL_FRAMES = 10  # with the motors off, before it ends
@@ -35,20 +34,19 @@ _FINAL_FRAMES = 10  # with the motors off, before it ends
 class LinkSupervisor:
     """Sends the watchdog's channels at a fixed rate, and forwards bytes in both directions."""
 
-    def __init__(self, address: str, control: socket.socket, watchdog: Watchdog, rate: float,
+    def __init__(self, address: str, control: socket.socket, watchdog: Watchdog,
                  clock: Callable[[], float] = time.monotonic) -> None:
         """
         Args:
             address: of the link, see `Link`.
             control: to the node.
             watchdog: decides what the frames contain.
-            rate: of the frames [Hz].
             clock: [s].
 
         Raises:
             LinkError: the link cannot be opened.
         """
-        self._address, self._control, self._watchdog, self._period, self._clock = address, control, watchdog, 1.0 / rate, clock
+        self._address, self._control, self._watchdog, self._period, self._clock = address, control, watchdog, 1.0 / RATE, clock
         self._link: Link | None = Link(address)
         self._due = self._opened = clock()
         self._reported, self._node_gone, self._final_frames = Mode.DISARMED, False, 0
@@ -130,11 +128,11 @@ class LinkSupervisor:
 class SupervisedLink:
     """The node's end."""
 
-    def __init__(self, address: str, settings: WatchdogSettings, hover: int, descent: int) -> None:
+    def __init__(self, address: str, hover: int, descent: int, disarm_after: float) -> None:
         """
         Args:
             address: see `Link`.
-            settings, hover, descent: see `Watchdog`.
+            hover, descent, disarm_after: see `Watchdog`.
 
         Raises:
             LinkError: the link cannot be opened.
@@ -143,7 +141,7 @@ class SupervisedLink:
         passed = [theirs.fileno()] + ([int(address[3:])] if address.startswith("fd:") else [])
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, str(theirs.fileno()),
-                                         json.dumps(asdict(settings)), str(hover), str(descent)],
+                                         str(hover), str(descent), str(disarm_after)],
                                         pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
                                         cwd=Path(__file__).parents[1], start_new_session=True)  # a Ctrl-C is not for it
         theirs.close()
@@ -204,14 +202,13 @@ class SupervisedLink:
 
 
 def main() -> None:
-    """The process: address, file number, settings, hover, descent."""
-    address, number, words, hover, descent = sys.argv[1:]
+    """The process: address, file number, hover, descent, disarm_after."""
+    address, number, hover, descent, disarm_after = sys.argv[1:]
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
-    settings = WatchdogSettings(**json.loads(words))
     control = socket.socket(fileno=int(number))
     try:
-        supervisor = LinkSupervisor(address, control, Watchdog(settings, int(hover), int(descent)), settings.rate)
+        supervisor = LinkSupervisor(address, control, Watchdog(int(hover), int(descent), float(disarm_after)))
     except LinkError as error:
         sys.exit(str(error))
     control.send(b"M")

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
-
-from perch_core.config import quantity
 
 STICKS = 4
 CENTRED = (1500, 1500, 1000, 1500)
 ON, OFF = 1900, 1000  # of a switch [us]
+ARMING = 0.2         # the throttle stays down for this time after arming, as the firmware requires [s]
+STALE_AFTER = 0.04   # a command older than this is not sent; level instead [s]
+DESCEND_AFTER = 0.5  # time without a command until the descent [s]
+DISARM_AFTER = 4.0   # ... and until the motors stop, where nobody says otherwise [s]
+DESCENT = 0.9        # thrust of the descent as a share of the weight
 Channels = tuple[int, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class WatchdogSettings:
-    """When a command is stale, and what follows."""
-
-    rate: float = quantity(200.0, unit="Hz", low=50.0, high=250.0, doc="of the frames to the autopilot, in every case")
-    arming: float = quantity(0.2, unit="s", low=0.0, high=2.0, doc="the throttle stays down for this time after arming, as the firmware requires")
-    stale_after: float = quantity(0.04, unit="s", low=0.02, high=0.25, doc="a command older than this is not sent; level instead")
-    descend_after: float = quantity(0.5, unit="s", low=0.0, high=0.9, doc="time without a command until the descent")
-    disarm_after: float = quantity(4.0, unit="s", low=0.5, high=60.0, doc="time without a command until the motors stop")
-    descent: float = quantity(0.9, low=0.5, high=1.0, doc="thrust of the descent as a share of the weight")
 
 
 class Mode(Enum):
@@ -41,13 +31,13 @@ class Watchdog:
         mode: present mode.
     """
 
-    def __init__(self, settings: WatchdogSettings, hover: int, descent: int) -> None:
+    def __init__(self, hover: int, descent: int, disarm_after: float = DISARM_AFTER, arming: float = ARMING) -> None:
         """
         Args:
-            settings: times.
             hover, descent: throttle that carries the weight, and that of the descent [us].
+            disarm_after, arming: times [s], see `DISARM_AFTER`, `ARMING`.
         """
-        self._settings = settings
+        self._disarm_after, self._arming = disarm_after, arming
         self.set_throttles(hover, descent)
         self.mode = Mode.DISARMED
         self._sticks: Channels = CENTRED
@@ -74,14 +64,13 @@ class Watchdog:
     def channels(self, now: float) -> Channels:
         """Channels for the autopilot at a time [s], in us; never those of a stale command."""
         age = now - self._came
-        limits = self._settings
         if not self._wanted or self._locked or age < 0.0:
             self.mode = Mode.DISARMED
-        elif age <= limits.stale_after:
+        elif age <= STALE_AFTER:
             self.mode = Mode.FOLLOWING
-            return (*(self._sticks if now - self._since >= limits.arming else CENTRED), ON, OFF)
-        elif age <= limits.disarm_after:
-            self.mode = Mode.LEVEL if age <= limits.descend_after else Mode.DESCENDING
+            return (*(self._sticks if now - self._since >= self._arming else CENTRED), ON, OFF)
+        elif age <= self._disarm_after:
+            self.mode = Mode.LEVEL if age <= DESCEND_AFTER else Mode.DESCENDING
             return (1500, 1500, self._hover if self.mode is Mode.LEVEL else self._descent, 1500, ON, ON)
         else:
             self.mode, self._locked = Mode.DISARMED, True

@@ -7,11 +7,12 @@ from math import hypot
 
 from perch_core.arrays import Numbers, Quaternion, Vector3, quaternion, vector3
 from perch_core.component import Component, Input, Output, Wake
-from perch_core.config import quantity, text
+from perch_core.config import text
 from perch_core.urdf import BASE, fixed_frames, urdf
 from perch_core.values import NANOSECONDS, OdometryState, StampedTransform, TargetPose, Transform
 from perch_core.vehicle import load_vehicle
 
+PERIOD = NANOSECONDS // 50  # of the transforms of base_link, by the odometry's stamps [ns]
 MAP, ODOM, TARGET = "map", "odom", "perch_target"
 _ORIGIN, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
@@ -21,7 +22,6 @@ class DescriptionParameters:
     """Parameters of the node `description`."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    rate: float = quantity(50.0, unit="Hz", above=0.0, high=500.0, doc="transforms of base_link per second of the odometry's stamps")
 
 
 class Description(Component[DescriptionParameters]):
@@ -42,7 +42,6 @@ class Description(Component[DescriptionParameters]):
     def __init__(self, config: DescriptionParameters) -> None:
         super().__init__(config)
         self._vehicle = load_vehicle(config.vehicle)
-        self._period = round(NANOSECONDS / config.rate)
         self._next = self._ahead = -1
         self._target: tuple[Vector3, Quaternion] | None = None
         self._told = False
@@ -59,7 +58,7 @@ class Description(Component[DescriptionParameters]):
 
     def on_odometry(self, state: OdometryState) -> None:
         """The body in `odom`, at most so often."""
-        if self._next - self._period <= state.stamp < self._next:
+        if self._next - PERIOD <= state.stamp < self._next:
             return
         if state.frame not in (MAP, ODOM):
             self.warn(f"odometry in frame {state.frame!r} is not used: neither {MAP} nor {ODOM}", every=1.0)
@@ -68,8 +67,8 @@ class Description(Component[DescriptionParameters]):
             self._ahead = state.stamp  # a reader of /tf that has seen the future believes nothing else; where two agree, time has jumped
             self.warn(f"odometry: stamp {state.stamp} ns is ahead of the others: ignored", every=1.0)
             return
-        late = self._next >= 0 and state.stamp < self._next + self._period
-        self._next = (self._next if late else state.stamp) + self._period
+        late = self._next >= 0 and state.stamp < self._next + PERIOD
+        self._next = (self._next if late else state.stamp) + PERIOD
         self.frames(StampedTransform(state.stamp, ODOM, BASE, vector3(state.p_WB), _unit(state.q_WB)))
 
     def on_target(self, pose: TargetPose) -> None:

@@ -37,7 +37,7 @@ def warm_up() -> bool:
     with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         folder = Path(name)
-        overrides = {"vehicle": {"start_timeout": PATIENCE, "lockstep_timeout": PATIENCE}}
+        overrides = {"vehicle": {"lockstep_timeout": PATIENCE}}
         started = programs(scenario, composed=ALL_NODES, record=folder / "flight.mcap", folder=folder, overrides=overrides)
         with Stack(started, folder) as stack:
             client = MissionClient()

@@ -14,7 +14,7 @@ from perch_sim import seeding
 from perch_sim.imu import Imu
 from perch_sim.lockstep import START
 from perch_sim.state_history import StateHistory, TrueState
-from perch_sim.vio_model import BiasModel, VioModel, VioModelParameters
+from perch_sim.vio_model import CAMERA, BiasModel, VioModel, VioModelParameters
 
 MEMORY = 200              # true states kept: 0.4 s
 MOST_FRAMES = 20          # that wait for the truth to cover their exposure, or for their answer to be due
@@ -31,7 +31,7 @@ class ModelledVio(Component[VioModelParameters]):
     config_type = VioModelParameters
 
     truth = Input(OdometryState, "ground_truth/odometry")
-    camera_info = Input(CameraModel, "camera_{camera}/camera_info")
+    camera_info = Input(CameraModel, f"camera_{CAMERA}/camera_info")
     state = Output(InertialState, "vio/state")
     odometry = Output(OdometryState, "vio/odometry")
 
@@ -42,12 +42,12 @@ class ModelledVio(Component[VioModelParameters]):
         """
         super().__init__(config)
         vehicle = load_vehicle(config.vehicle)
-        if config.camera not in vehicle.mounts:
-            raise ConfigError("vio_model", "camera", f"{config.camera!r} is not one of {', '.join(vehicle.mounts)}")
-        self._offset = nanoseconds(vehicle.mounts[config.camera].stamp_offset)
+        if CAMERA not in vehicle.mounts:
+            raise ConfigError("vio_model", "vehicle", f"{vehicle.name} has no camera {CAMERA!r}")
+        self._offset = nanoseconds(vehicle.mounts[CAMERA].stamp_offset)
         self._model = VioModel(config, seeding.stream(config.seed, "vio_model"))
         turn_on = Imu(vehicle.imu, seeding.stream(config.seed, "imu")).bias
-        self._biases = BiasModel(config, vehicle.imu, np.concatenate([turn_on[3:], turn_on[:3]]),
+        self._biases = BiasModel(vehicle.imu, np.concatenate([turn_on[3:], turn_on[:3]]),
                                  seeding.stream(config.seed, "vio_model_biases"))
         self._latency = nanoseconds(config.latency)
         self._warned = False
@@ -76,7 +76,7 @@ class ModelledVio(Component[VioModelParameters]):
     def on_camera_info(self, model: CameraModel) -> None:
         """A frame, to be answered when the truth covers its exposure."""
         if not self._last_frame < model.stamp <= self._newest + LONGEST_AHEAD:
-            self.warn(f"camera_{self.config.camera}/camera_info: a stamp goes back or is ahead of the truth: not used", every=1.0)
+            self.warn(f"camera_{CAMERA}/camera_info: a stamp goes back or is ahead of the truth: not used", every=1.0)
             return
         self._last_frame = model.stamp
         self._frames.append(model.stamp)

@@ -23,6 +23,12 @@ from perch_core import so3
 from perch_core.config import quantity, text
 from perch_core.vehicle import ImuConfig
 
+CAMERA = "down"           # whose frames are answered
+YAW_DRIFT = 0.001         # random walk [rad/sqrt(s)]
+ATTITUDE_NOISE = 0.0015   # 1 sigma of each axis, white [rad]
+VELOCITY_NOISE = 0.03     # 1 sigma of each axis, white [m/s]
+GYRO_BIAS_ERROR, ACCEL_BIAS_ERROR = 0.0005, 0.015  # of each axis' estimate, 1 sigma [rad/s, m/s^2]
+
 
 @dataclass(frozen=True, kw_only=True)
 class VioModelParameters:
@@ -30,16 +36,10 @@ class VioModelParameters:
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="the vehicle's: the biases of its IMU are known by it")
-    camera: str = text("down", doc="whose frames are answered")
     latency: float = quantity(0.0, unit="s", low=0.0, high=1.0,
                               doc="exposure to output, by the stamps of the truth; 0 where a schedule lets the output count later")
     position_drift: float = quantity(0.004, unit="m/sqrt(s)", low=0.0, doc="random walk of each axis")
-    yaw_drift: float = quantity(0.001, unit="rad/sqrt(s)", low=0.0, doc="random walk")
     position_noise: float = quantity(0.0015, unit="m", low=0.0, doc="1 sigma of each axis, white")
-    attitude_noise: float = quantity(0.0015, unit="rad", low=0.0, doc="1 sigma of each axis, white")
-    velocity_noise: float = quantity(0.03, unit="m/s", low=0.0, doc="1 sigma of each axis, white")
-    gyro_bias_error: float = quantity(0.0005, unit="rad/s", above=0.0, doc="of each axis' estimate, 1 sigma")
-    accel_bias_error: float = quantity(0.015, unit="m/s^2", above=0.0, doc="of each axis' estimate, 1 sigma")
 
 
 class VioEstimate(NamedTuple):
@@ -74,33 +74,32 @@ class VioModel:
         self._first = time if self._first is None else self._first
         self._last = time
         self._drift = self._drift + k.position_drift * root * draw[:3]
-        self._yaw += k.yaw_drift * root * draw[3]
+        self._yaw += YAW_DRIFT * root * draw[3]
         turn = so3.quat_exp(np.array([0.0, 0.0, self._yaw]))
-        shake = so3.quat_exp(k.attitude_noise * draw[4:7])
+        shake = so3.quat_exp(ATTITUDE_NOISE * draw[4:7])
         age = time - self._first
         variance = np.concatenate([
             np.full(3, k.position_noise**2 + k.position_drift**2 * age),
-            np.full(3, k.attitude_noise**2) + np.array([0.0, 0.0, k.yaw_drift**2 * age])])
+            np.full(3, ATTITUDE_NOISE**2) + np.array([0.0, 0.0, YAW_DRIFT**2 * age])])
         p = so3.quat_rotate(turn, p_WB) + self._drift + k.position_noise * draw[7:10]
         q = so3.quat_multiply(turn, so3.quat_multiply(shake, q_WB))
-        v = so3.quat_rotate(turn, v_WB) + k.velocity_noise * draw[10:13]
+        v = so3.quat_rotate(turn, v_WB) + VELOCITY_NOISE * draw[10:13]
         of_yaw = np.array([-p[1], p[0], 0.0, -v[1], v[0], 0.0, *so3.quat_to_matrix(q)[2]])  # e3 x p, e3 x v, R^T e3
-        white = [*variance[:3], *[k.velocity_noise**2] * 3, *[k.attitude_noise**2] * 3]
-        return VioEstimate(p, q, v, variance, k.velocity_noise**2, np.diag(white) + k.yaw_drift**2 * age * np.outer(of_yaw, of_yaw))
+        white = [*variance[:3], *[VELOCITY_NOISE**2] * 3, *[ATTITUDE_NOISE**2] * 3]
+        return VioEstimate(p, q, v, variance, VELOCITY_NOISE**2, np.diag(white) + YAW_DRIFT**2 * age * np.outer(of_yaw, of_yaw))
 
 
 class BiasModel:
     """What a VIO would have found the biases to be."""
 
-    def __init__(self, params: VioModelParameters, imu: ImuConfig, turn_on: np.ndarray, rng: np.random.Generator) -> None:
+    def __init__(self, imu: ImuConfig, turn_on: np.ndarray, rng: np.random.Generator) -> None:
         """
         Args:
-            params: how wrong the estimates are.
             imu: how far the truth walks.
             turn_on: true biases as the flight began, gyro [rad/s] and accelerometer [m/s^2], (6,).
             rng: draws the errors.
         """
-        sigma = np.repeat([params.gyro_bias_error, params.accel_bias_error], 3)
+        sigma = np.repeat([GYRO_BIAS_ERROR, ACCEL_BIAS_ERROR], 3)
         self._estimate = turn_on + sigma * rng.standard_normal(6)
         self._variance, self._walk = sigma**2, np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) ** 2
 

@@ -28,6 +28,9 @@ PASSING = ("/diagnostics", "/tf")  # of which the last message is nothing to who
 KEPT = {"/tf_static": 100, "contact": 100}
 """Messages kept for who comes later, where it is more than the last one."""
 MARKERS = "markers"
+RATE, SCENE_RATE, IMAGE_RATE = 50.0, 20.0, 10.0
+"""Messages of the 500 Hz topics, markers, and images of a camera while somebody looks, per second of simulation [Hz]."""
+IMAGE_QUALITY = 75  # of JPEG [%]
 SLOW_SCENE = 5  # what does not move is sent with every so many scenes: whoever comes late sees it too
 LOCAL = (
     "http://localhost", "https://localhost", "http://127.0.0.1", "https://127.0.0.1", "http://[::1]", "file://", "https://app.foxglove.dev")
@@ -41,11 +44,6 @@ class ViewerParameters:
     host: str = text("127.0.0.1", doc="address that is served; 0.0.0.0: to every machine that reaches this one")
     port: int = quantity(8765, low=0, high=65535, doc="of the WebSocket, 0: any free one")
     origins: tuple[str, ...] = text(LOCAL, doc="web pages that may look, as scheme://host[:port], *: all; what is no browser always may")
-    rate: float = quantity(50.0, unit="Hz", above=0.0, high=1000.0, doc="messages per second of simulation of the 500 Hz topics")
-    scene_rate: float = quantity(20.0, unit="Hz", above=0.0, high=100.0, doc="markers per second of simulation")
-    image_rate: float = quantity(10.0, unit="Hz", low=0.0, high=60.0,
-                                 doc="images per second of simulation and camera, while somebody looks; 0: none")
-    image_quality: int = quantity(75, unit="%", low=10, high=100, doc="JPEG quality")
 
 
 class _Pace:
@@ -86,9 +84,9 @@ class Viewer(Listener[ViewerParameters]):
         self._truth = b""
         self._words = ""
         self._flown, self._true_path = Path(), Path()
-        self._scene_pace, self._scenes = _Pace(config.scene_rate), 0
-        self._paces = {channel: _Pace(config.rate) for channel in FAST}
-        self._image_paces = {camera: _Pace(config.image_rate) for camera in CAMERAS if config.image_rate > 0.0}
+        self._scene_pace, self._scenes = _Pace(SCENE_RATE), 0
+        self._paces = {channel: _Pace(RATE) for channel in FAST}
+        self._image_paces = {camera: _Pace(IMAGE_RATE) for camera in CAMERAS}
         self._looks: dict[str, Callable[[bytes, int], None]] = {
             "odometry": self._see_odometry, "ground_truth/odometry": self._see_truth, "trajectory": self._see_trajectory,
             "target/pose": self._see_target, "powerlines": self._see_lines, "controller/status": self._see_status}
@@ -116,15 +114,12 @@ class Viewer(Listener[ViewerParameters]):
 
     def on_image(self, camera: str, image: CameraImage) -> None:
         """Pass an image on while somebody looks."""
-        pace = self._image_paces.get(camera)
-        if pace is None:
-            return
         channel = f"camera_{camera}/image_raw/compressed"
         topic = self.resolve(channel)
         self._declare(topic, topics.message_type(channel))
-        if not pace(image.stamp) or not self.server.watched(topic):
+        if not self._image_paces[camera](image.stamp) or not self.server.watched(topic):
             return
-        packed = jpeg(image, self.config.image_quality)
+        packed = jpeg(image, IMAGE_QUALITY)
         if packed is not None:
             self._send(self.serialized(channel, packed))
 

@@ -26,6 +26,7 @@ NAG = 10.0          # ... and again this often [s]
 PATIENCE = 0.005    # with which results are waited for before other events are looked at [s]
 BURST = 40          # steps between which other events are looked at
 DRAWING_WAIT = 0.02  # for an image without which nobody can go on, at a time [s]
+START_PATIENCE = 60.0  # for participants to come, where a silent one is not given more [s]
 SETTLED_LOOKS = 3   # everybody has to be there this often in a row before the first step
 
 
@@ -206,10 +207,10 @@ class VehicleNode(ComponentNode):
                 self._schedule.join(one)
             self._started, self._progress = True, now
             self.get_logger().info(f"lockstep: starting with {', '.join(self._schedule.names) or 'no participants'}")
-        elif missing and now - self._begun > self.component.config.start_timeout:
+        elif missing and now - self._begun > (patience := max(START_PATIENCE, self.component.config.lockstep_timeout)):
             for name in missing:
                 self._dropped.add(name)
-                self.get_logger().error(f"lockstep: {name} has not come within {self.component.config.start_timeout:g} s: dropped")
+                self.get_logger().error(f"lockstep: {name} has not come within {patience:g} s: dropped")
 
     def _look_for_silent(self, now: float) -> None:
         silence = now - self._progress
