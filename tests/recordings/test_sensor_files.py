@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from perch_core.errors import ConfigError
 from perch_core.sensors import CameraSensor, load_sensors
-from perch_core.values import ImuSample
+from perch_core.values import CameraModel, ImuSample
+from perch_core.vehicle import load_vehicle
 from perch_eval.recordings import sensors_command
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_perception.estimator_component import StateEstimator
@@ -126,6 +127,16 @@ def test_components_take_everything_from_the_file(files):
         VioComponent(VioComponentConfig(sensors=name))
     with pytest.raises(ConfigError, match="no such file"):
         StateEstimator(EstimatorConfig(sensors=str(files / "none.yaml")))
+
+
+def test_a_file_of_the_imu_alone_leaves_the_cameras_to_the_vehicle(tmp_path):
+    file, camera = tmp_path / "imu.yaml", load_vehicle("rpg").mounts["down"].camera
+    file.write_text("{name: imu, imu: {rate: 200.0, accel_noise_density: 0.02, gyro_noise_density: 0.002, accel_bias_walk: 0.001, gyro_bias_walk: 1.0e-4}}")
+    vio = VioComponent(VioComponentConfig(sensors=str(file), vehicle="rpg"))
+    assert vio.config.imu.gyro_noise_density == 0.002 == StateEstimator(EstimatorConfig(sensors=str(file))).config.imu.gyro_noise_density
+    assert vio.mounted.nominal.camera == camera and vio.mounted.mount is None and vio.config.calibration == VioComponentConfig().calibration
+    vio.on_camera_info(CameraModel(1, "camera_down_optical_frame", replace(camera, fx=280.0)))
+    assert vio.mounted.known.camera.fx == 280.0
 
 
 def test_a_lens_without_distortion_has_none():

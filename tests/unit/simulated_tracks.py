@@ -222,7 +222,7 @@ def frames(name: str, seed: int, setting: Setting) -> Iterator[End]:
 def _readings(truth: Truth, setting: Setting, rng: np.random.Generator) -> tuple[ImuBuffer, np.ndarray, np.ndarray]:
     """The IMU's samples, and the true biases of gyro and accelerometer at each of its periods, (n, 3)."""
     config, h, shape = setting.believed, 1.0 / setting.imu_rate, truth.w_B.shape
-    noise, buffer = config.imu, ImuBuffer(config.imu, config.faults, 2.0 * setting.duration)
+    noise, buffer = config.imu, ImuBuffer(config.imu, 2.0 * setting.duration)
     gyro_bias = np.cumsum(rng.normal(0.0, noise.gyro_bias_walk * np.sqrt(h), shape), axis=0)
     accel_bias = np.cumsum(rng.normal(0.0, noise.accel_bias_walk * np.sqrt(h), shape), axis=0)
     w = truth.w_B + gyro_bias + rng.normal(0.0, setting.imu * noise.gyro_noise_density / np.sqrt(h), shape)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 
 from perch_core import config
-from perch_core.config import choice, part, quantity, text
+from perch_core.config import choice, derived, part, quantity, text
 from perch_core.errors import ConfigError
 
 
@@ -24,6 +24,7 @@ class Outer:
     count: int = quantity(3, low=1, high=9)
     law: str = choice("geometric", options=("geometric", "nmpc"))
     inner: Inner = part(Inner)
+    told: float = derived(0.5)
 
 
 def read(tmp_path, content):
@@ -40,6 +41,7 @@ def test_defaults_and_nesting(tmp_path):
 
 @pytest.mark.parametrize("content, key, words", [
     ("{name: a, cuont: 2}", "cuont", "unknown key; allowed: name, count, law, inner"),
+    ("{name: a, told: 0.1}", "told", "unknown key; allowed: name, count, law, inner"),
     ("{count: 2}", "name", "missing"),
     ("{name: a, count: 20}", "count", "20 is outside [1, 9]"),
     ("{name: a, count: 2.5}", "count", "not of type int"),

@@ -136,11 +136,13 @@ def test_the_doubt_of_the_cameras_mount_is_counted_once():
 
 def test_false_sightings_are_forgotten():
     rng = np.random.default_rng(9)
-    mapper = LineMapper(MapperConfig(forget_after=1.0))
+    mapper = LineMapper(MapperConfig())
     body = BodyState(0.0, np.array([0, 0, 2.0]), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
     mapper.update(0.0, body, [observe(rng, WIRE, np.array([0, 0, 2.0]))])
     assert len(mapper._tracks) == 1
-    mapper.update(1.5, body, [])
+    mapper.update(1.9, body, [])
+    assert len(mapper._tracks) == 1
+    mapper.update(2.1, body, [])
     assert mapper._tracks == []
 
 

@@ -5,7 +5,7 @@ import pytest
 from oracles.wires import WIRE, observe
 from perch_core import so3
 from perch_core.catenary import Catenary
-from perch_perception.line_mapping import DegenerateBaseline, LineObservation, TriangulationConfig, WireCurve, triangulate
+from perch_perception.line_mapping import DegenerateBaseline, LineObservation, TriangulationConfig, WireCurve, triangulate, triangulation
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
@@ -44,10 +44,11 @@ def test_jacobian_of_the_offsets_against_finite_differences():
         np.testing.assert_allclose(jacobian[:, k], numeric, atol=0.02 * np.abs(numeric).max())
 
 
-def test_exact_sightings_give_the_exact_wire():
+def test_exact_sightings_give_the_exact_wire(monkeypatch):
+    monkeypatch.setattr(triangulation, "SAG", 1.0)
     rng = np.random.default_rng(2)
     seen = [observe(rng, WIRE, np.array([0.0, 0.1 * k, 2.0 + 0.1 * k])) for k in range(9)]
-    wire = triangulate(seen, TriangulationConfig(sag=1.0)).curve
+    wire = triangulate(seen, SETTINGS).curve
     s = np.linspace(-1.5, 1.5, 7)
     nearest = np.array([WIRE.at((p - WIRE.point) @ WIRE.direction) for p in wire.at(s)])
     np.testing.assert_allclose(wire.at(s), nearest, atol=2e-3)
@@ -73,8 +74,8 @@ def test_covariance_matches_the_errors_it_predicts():
         for k in range(10):
             centre = np.array([0.0, 0.05 * k, 1.6 + 0.1 * k])
             true = observe(rng, WIRE, centre, noise=5e-4)
-            turn = so3.exp(np.radians(SETTINGS.pose_rotation) * rng.standard_normal(3))
-            seen.append(LineObservation(0.0, centre + SETTINGS.pose_position * rng.standard_normal(3),
+            turn = so3.exp(triangulation.POSE_ROTATION * rng.standard_normal(3))
+            seen.append(LineObservation(0.0, centre + triangulation.POSE_POSITION * rng.standard_normal(3),
                                         true.rays_W @ turn.T, true.ends_W @ turn.T, 5e-4, 0.005))
         wire = triangulate(seen, SETTINGS)
         point = wire.curve.at(np.array(0.0))
@@ -133,14 +134,15 @@ def test_a_wire_is_as_near_as_it_is_wide():
     assert error[0.03] < 0.025 and found.radius == pytest.approx(0.03, rel=0.02), (error, found.radius)
 
 
-def test_a_wire_of_known_radius_needs_no_parallax():
+def test_a_wire_of_known_radius_needs_no_parallax(monkeypatch):
     """Seen from 3 m along 20 cm of motion across it."""
+    monkeypatch.setattr(triangulation, "MIN_RATIO", 0.01)
     wire, error = WireCurve(np.array([4.0, 0.0, 2.0]), np.array([0.0, 1.0, 0.0])), {0.0: [], 0.01: []}
     for seed in range(10):
         rng = np.random.default_rng(seed)
         seen = [observe(rng, wire, np.array([1.0, 0.0, 1.5 + 0.02 * k]), 5e-4, time=0.1 * k, radius=0.03) for k in range(11)]
         for sigma, errors in error.items():
-            found = triangulate(seen, TriangulationConfig(min_ratio=0.01, radius=0.0303, radius_sigma=sigma))
+            found = triangulate(seen, TriangulationConfig(radius=0.0303, radius_sigma=sigma))
             errors.append(float(np.linalg.norm((found.curve.point - wire.point)[[0, 2]])))
     unknown, known = (float(np.median(errors)) for errors in error.values())
     assert known < 0.05 and known < 0.5 * unknown, (known, unknown)

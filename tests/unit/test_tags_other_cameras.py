@@ -6,7 +6,7 @@ import pytest
 from perch_core import so3
 from perch_core.camera import CameraMount, PinholeCamera
 from perch_core.tag_board import Tag, TagBoard, TagGrid
-from perch_perception.tags import BoardLocalizer, LocalizerConfig, TagDetector, refine_corners
+from perch_perception.tags import BoardLocalizer, TagDetector, refine_corners
 
 CAMERA = PinholeCamera(640, 480, 480.0, 480.0, 319.5, 239.5)
 MOUNT = CameraMount("front", CAMERA, np.zeros(3), np.eye(3))
@@ -113,10 +113,11 @@ def test_a_grid_whose_tags_touch_black_squares(distance, least):
     assert len(result.board.ids) >= least and position < 0.003 and np.degrees(attitude) < 0.3
 
 
-def test_of_two_boards_alike_the_expected_one_is_followed_and_a_stray_tag_is_left_out():
+def test_of_two_boards_alike_the_expected_one_is_followed_and_a_stray_tag_is_left_out(monkeypatch):
+    monkeypatch.setattr("perch_perception.tags.localizer.FOLLOW_IMAGES", 0)
     rng, board, alone = np.random.default_rng(4), pad(), TagBoard((0.2, 0.2), (Tag(2, (0.0, 0.0), 0.16),))
     here, there, R = np.array([-0.55, 0.0, 2.0]), np.array([0.5, 0.1, 2.0]), turned(10.0, 15.0, 0.0)
-    localizer = BoardLocalizer(board, MOUNT, LocalizerConfig(follow_images=0))
+    localizer = BoardLocalizer(board, MOUNT)
     assert errors(localizer.process(photographed([(board, here, R)], rng), 0.0).board, here, R)[0] < 0.01
     both = localizer.process(photographed([(board, here, R), (board, there, R)], rng), 0.05)
     assert errors(both.board, here, R)[0] < 0.01

@@ -10,7 +10,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from perch_core import so3
 from perch_core.vehicle import GRAVITY
 from perch_eval.perch_motion import PerchMotion
-from perch_perception.ukf import UkfConfig, VioPose, kernels, start
+from perch_perception.ukf import UkfConfig, VioPose, kernels, start, unscented
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.unscented import Belief, CovarianceError, UnscentedTransform
 
@@ -63,10 +63,11 @@ def test_compiled_and_plain_kernels_agree():
     np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
 
 
-def test_compiled_prediction_equals_the_vectorised_one():
+def test_compiled_prediction_equals_the_vectorised_one(monkeypatch):
     rng = np.random.default_rng(3)
-    for config in (UkfConfig(), UkfConfig(alpha=0.3, kappa=0.0)):
-        transform = UnscentedTransform(config)
+    for alpha in (unscented.ALPHA, 0.3):
+        monkeypatch.setattr(unscented, "ALPHA", alpha)
+        transform = UnscentedTransform(UkfConfig())
         belief, run = random_belief(rng), random_run(rng)
         predicted = transform.predict(belief, run, 34)
         x, P = transform.predict_vectorised(belief.x, belief.P, run)
@@ -147,8 +148,7 @@ def test_process_noise_is_the_spread_of_integrated_noise():
 def test_update_equals_filterpys_on_the_error_state(size):
     """filterpy's own UKF, whose state is the 15-dimensional error, gives the same gain, covariance and correction."""
     rng = np.random.default_rng(6)
-    config = UkfConfig()
-    transform, belief = UnscentedTransform(config), random_belief(rng)
+    transform, belief = UnscentedTransform(UkfConfig()), random_belief(rng)
     truth = at.plus(belief.x, 0.01 * rng.normal(size=15))
     R = np.diag([1e-5] * 3 + [1e-6] * 3 + [1e-4] * 3)[:size, :size]
 
@@ -159,7 +159,7 @@ def test_update_equals_filterpys_on_the_error_state(size):
     pose = VioPose(0, truth[at.POSITION], truth[at.QUATERNION], R[:6, :6], so3.quat_to_matrix(truth[at.QUATERNION]).T @ truth[at.VELOCITY],
                    np.eye(3))
     innovation = transform.innovate(belief, pose, R)
-    points = MerweScaledSigmaPoints(15, config.alpha, config.beta, config.kappa)
+    points = MerweScaledSigmaPoints(15, unscented.ALPHA, unscented.BETA, unscented.KAPPA)
     oracle = UnscentedKalmanFilter(15, size, 0.0, lambda error: seen(at.plus(belief.x, error)), lambda x, dt: x, points)
     oracle.P, oracle.R = belief.P.copy(), R
     oracle.sigmas_f = points.sigma_points(np.zeros(15), belief.P)

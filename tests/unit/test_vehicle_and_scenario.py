@@ -109,7 +109,7 @@ def write(folder, **files):
 
 def test_a_scenario_takes_over_what_it_does_not_say_itself(tmp_path):
     write(tmp_path, mine="extends: line_80\nname: mine\nmission: {perch_pitch_deg: 60.0}\nworld: {cables: [{start: [4.0, -2.0, 4.0], end: [4.0, 2.0, 4.0]}]}\n"
-                         "parameters: {powerline_mapper: {rate: 12.0}, estimator: {imu.gyro_noise_density: 0.001}}\n",
+                         "parameters: {powerline_mapper: {rate: 12.0}, estimator: {vio.position: 0.001}}\n",
           theirs="extends: mine.yaml\nname: theirs\nmission: {replan: false}\n")
     mine, base = load_scenario(tmp_path / "theirs.yaml"), load_scenario("line_80")
     assert (mine.name, mine.vehicle, mine.mode) == ("theirs", base.vehicle, "powerline")

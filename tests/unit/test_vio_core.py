@@ -151,7 +151,7 @@ def test_preintegration_noise_is_the_spread_of_noisy_readings():
 def test_parts_of_a_sample_gather_the_noise_of_the_whole(cut):
     """A sample that a frame cuts in two has one error: what both runs gather is what one run over it does."""
     config = VioConfig()
-    buffer = ImuBuffer(config.imu, config.faults, 1.0)
+    buffer = ImuBuffer(config.imu, 1.0)
     for k in range(11):
         buffer.add(ImuSample(10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 

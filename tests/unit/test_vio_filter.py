@@ -77,7 +77,7 @@ class Run:
         times = np.arange(0.0, self.motion.duration - 0.003, 0.002)
         truth = self.motion.sample(times)
         readings = read_imu(truth, IMU, rng)
-        imu = ImuBuffer(self.config.imu, self.config.faults, 10.0)
+        imu = ImuBuffer(self.config.imu, 10.0)
         for k, t in enumerate(times):
             imu.add(ImuSample(round(t * 1e9), tuple(readings.gyro[k]), tuple(readings.accel[k])))
         self.imu, self.k0 = imu, round(self.start / 0.002)

@@ -1,7 +1,5 @@
 """The first landmarks of a take-off: points of the ground under a standing vehicle, and features that stay spread as it rises."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -21,8 +19,8 @@ FLOOR, STANDING = 0.4, 0.15
 def standing(rng, height=STANDING):
     """A filter whose state is off by what its covariance says, and 80 features of the ground as the camera sees them."""
     p_WB = np.array([1.0, -2.0, FLOOR + height])
-    points = np.column_stack([p_WB[:2] + rng.uniform(-0.35, 0.35, (80, 2)), FLOOR + rng.normal(0, CONFIG.start.ground_sigma, 80)])
-    known = start.told(CONFIG, p_WB, 0.3)
+    points = np.column_stack([p_WB[:2] + rng.uniform(-0.35, 0.35, (80, 2)), FLOOR + rng.normal(0, ground.SIGMA, 80)])
+    known = start.told(p_WB, 0.3)
     R_WB = so3.exp(np.array([0.0, 0.0, 0.3]))
     state = start.fresh(CONFIG, MOUNT, 0, R_WB, known, np.zeros(3), np.zeros(3), 0.01, 0.005, 0.001)
     X_C = ((points - p_WB) @ R_WB - MOUNT.p_BC) @ MOUNT.R_BC
@@ -40,7 +38,7 @@ def test_points_of_the_ground_are_where_their_covariance_says():
     rng, squared = np.random.default_rng(1), []
     for _ in range(40):
         filter, points, ids, bearings = standing(rng)
-        count = ground.take_in(filter, ids, bearings, FLOOR, CONFIG.start.ground_sigma, 0.08)
+        count = ground.take_in(filter, ids, bearings, FLOOR)
         s = filter.state
         assert 10 <= count <= CONFIG.filter.landmarks and s.size == at.CORE_SIZE + 3 * count
         assert np.linalg.eigvalsh(s.P)[0] > -1e-12
@@ -55,16 +53,16 @@ def test_points_of_the_ground_are_where_their_covariance_says():
 @pytest.mark.parametrize("height", [0.02, 0.09])
 def test_a_camera_close_to_the_ground_takes_in_nothing(height):
     filter, _, ids, bearings = standing(np.random.default_rng(2), height)
-    assert ground.take_in(filter, ids, bearings, FLOOR, 0.005, 0.08) == 0
+    assert ground.take_in(filter, ids, bearings, FLOOR) == 0
     assert not filter.state.landmarks and filter.state.size == at.CORE_SIZE
 
 
-def features_after_rising(crowding):
+def features_after_rising():
     """Features of a floor that shrinks to a third, as at a take-off."""
     rng = np.random.default_rng(3)
     floor = cv2.GaussianBlur(rng.uniform(0, 255, (1440, 1920)).astype(np.float32), (0, 0), 3.0)
     floor = cv2.normalize(floor, None, 0, 255, cv2.NORM_MINMAX)
-    tracker = Tracker(replace(CONFIG.tracker, crowding=crowding), MOUNT.camera)
+    tracker = Tracker(CONFIG.tracker, MOUNT.camera)
     for scale in np.geomspace(1.0, 1.0 / 3.0, 40):
         A = np.array([[scale, 0, 320 - 960 * scale], [0, scale, 240 - 720 * scale]])
         image = cv2.warpAffine(floor, A, (640, 480), flags=cv2.INTER_AREA).astype(np.uint8)
@@ -73,10 +71,11 @@ def features_after_rising(crowding):
     return seen, between.min()
 
 
-def test_features_that_draw_together_make_room_for_others():
-    crowded, near = features_after_rising(0.0)
-    spread, apart = features_after_rising(0.6)
-    assert near < 0.6 * CONFIG.tracker.spacing <= apart
-    assert len(spread.ids) >= CONFIG.tracker.refill * CONFIG.tracker.features - 10
+def test_features_that_draw_together_make_room_for_others(monkeypatch):
+    spread, apart = features_after_rising()
+    monkeypatch.setattr(Tracker, "_thin", lambda self: None)
+    crowded, near = features_after_rising()
+    assert near < 10.8 <= apart  # 0.6 of the spacing of new ones
+    assert len(spread.ids) >= 0.85 * CONFIG.tracker.features - 10
     assert spread.pixels.std(axis=0).min() > 1.2 * crowded.pixels.std(axis=0).min()
     assert np.all(np.diff(spread.ids) > 0), "older features first"

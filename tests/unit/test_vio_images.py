@@ -11,6 +11,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import estimation_flight as flights
 from perch_perception.ukf import Health
 from perch_perception.vio import FrameOutcome, VioConfig
+from perch_perception.vio import tracker as tracking
 from perch_perception.vio.drawing import TrackPainter
 from perch_perception.vio.odometry import VisualInertialOdometry
 from perch_perception.vio.tracker import Features, Tracker, _noise
@@ -55,14 +56,14 @@ def assert_sane(steps):
 # -- tracks --------------------------------------------------------------------------------------------------------------
 
 
-def pulled(flatten):
+def pulled():
     """How far tracks lie from where they should be, mean over them [px]: a faint texture moves under a lens that darkens."""
     rng, camera = np.random.default_rng(4), flight().mount.camera
     texture = cv2.GaussianBlur(rng.normal(0.0, 1.0, (camera.height + 200, camera.width + 200)), (0, 0), 4.0)
     texture *= 6.0 / texture.std()
     y, x = np.mgrid[:camera.height, :camera.width]
     vignette = 1.0 - 0.5 * ((x - camera.width / 2) ** 2 + (y - camera.height / 2) ** 2) / (camera.width / 2) ** 2
-    tracker, first, shift = Tracker(replace(VioConfig().tracker, flatten=flatten, reference_change=0.0), camera), {}, 3
+    tracker, first, shift = Tracker(VioConfig().tracker, camera), {}, 3
     for k in range(13):
         scene = 110.0 + texture[100:100 + camera.height, k * shift:k * shift + camera.width]
         image = np.clip(scene * vignette + rng.normal(0.0, 2.0, vignette.shape), 0, 255).astype(np.uint8)
@@ -74,22 +75,26 @@ def pulled(flatten):
     return float(np.mean(moved))
 
 
-def test_vignetting_does_not_hold_the_tracks_back():
-    """It stands still in the image, and what stands still pulls."""
-    assert pulled(0.0) > 0.5
-    assert abs(pulled(VioConfig().tracker.flatten)) < 0.2
+def test_vignetting_does_not_hold_the_tracks_back(monkeypatch):
+    """It stands still in the image, and what stands still pulls. Followed from frame to frame, each of which is the reference."""
+    monkeypatch.setattr(tracking, "_REFERENCE_CHANGE", 0.0)
+    assert abs(pulled()) < 0.2
+    monkeypatch.setattr(tracking, "flattened", lambda image: image)
+    assert pulled() > 0.5
 
 
-def test_a_blurred_patch_is_known_less_well_than_a_sharp_one():
+def test_a_blurred_patch_is_known_less_well_than_a_sharp_one(monkeypatch):
     """Foerstner: sigma_n^2 over the least eigenvalue of sum g g^T. Where that is below the declared noise, the declared one holds."""
     rng, camera = np.random.default_rng(5), VEHICLE.mounts["down"].camera
     noise, texture = rng.normal(0.0, 2.0, (camera.height, camera.width)), rng.normal(0.0, 1.0, (camera.height, camera.width))
     vio, median = VisualInertialOdometry(VioConfig(), VEHICLE.mounts["down"], np.zeros(3)), []
-    window = vio.config.tracker.window
+    monkeypatch.setattr(tracking, "_NOISE_FACTOR", 0.0)
+    monkeypatch.setattr(tracking, "flattened", lambda image: image)
+    window = tracking._WINDOW
     for blur, contrast in ((2.0, 30.0), (6.0, 3.0)):
         smooth = cv2.GaussianBlur(texture, (0, 0), blur)
         image = np.clip(128.0 + smooth * contrast / smooth.std() + noise, 0, 255).astype(np.uint8)
-        features = Tracker(replace(vio.config.tracker, flatten=0.0, noise_factor=0.0), camera).track(image, np.eye(3))
+        features = Tracker(vio.config.tracker, camera).track(image, np.eye(3))
         assert len(features.ids) > 20
         for (x, y), sigma in zip(features.pixels, features.sigma):
             patch = cv2.getRectSubPix(image, (window + 2, window + 2), (float(x), float(y))).astype(float)
@@ -255,11 +260,11 @@ def test_imu_faults_leave_a_finite_estimate_with_a_larger_covariance(fault, leng
     assert np.linalg.norm(steps[-1].error[:3]) < 0.15
 
 
-def test_a_lost_filter_says_so_and_starts_again_in_motion():
+def test_a_lost_filter_says_so_and_starts_again_in_motion(monkeypatch):
     """Blind for so long that velocity is unknown (the bound is lowered for the test): lost, then found by motion."""
-    config = VioConfig(loss=replace(VioConfig().loss, restart_velocity=0.03))
+    monkeypatch.setattr("perch_perception.vio.odometry._LOST_VELOCITY", 0.03)
     cover = (1.9, 2.6)
-    steps = flights.run_vio(until(4.4), config, tamper=lambda t, stamp, image: [
+    steps = flights.run_vio(until(4.4), tamper=lambda t, stamp, image: [
         (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)])
     assert_sane(steps)
     lost = next(s for s in steps if s.result.outcome is FrameOutcome.LOST)

@@ -8,6 +8,7 @@ from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import ImuSample
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
+from perch_perception.vio.start import TOLD_SIGMA
 
 MS = 1_000_000
 
@@ -56,7 +57,7 @@ def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
     imu, R = config.imu, so3.exp(ATTITUDES[attitude])
     p, sigma = np.array([0.5, 0.2, 1.2]), np.array([0.001] * 3)
     vio = VisualInertialOdometry(config, mount, p + rng.normal(0.0, sigma), 0.0)
-    vio._known = replace(vio._known, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, config.start.yaw_sigma)]) @ R)  # as a filter that was lost here left it
+    vio._known = replace(vio._known, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, TOLD_SIGMA[3])]) @ R)  # as a filter that was lost here left it
     bias = rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
     walk = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(rate)
     noise = np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) * np.sqrt(rate)

@@ -32,7 +32,7 @@ def begin(name, seed, give_up=3.5):
     h, n = 1.0 / RATE, len(truth.w_B)
     w = truth.w_B + bias[:3] + rng.normal(0.0, imu.gyro_noise_density / np.sqrt(h), (n, 3))
     f = truth.f_B + bias[3:] + rng.normal(0.0, imu.accel_noise_density / np.sqrt(h), (n, 3))
-    buffer = ImuBuffer(imu, CONFIG.faults, 8.0)
+    buffer = ImuBuffer(imu, 8.0)
     for k in range(-1, n):
         buffer.add(ImuSample(round((k + 1) * h * 1e9), tuple(w[max(k, 0)]), tuple(f[max(k, 0)])))
     turn, shift, offset = rng.normal(0.0, c.rotation / np.sqrt(3.0), 3), rng.normal(0.0, c.translation, 3), rng.normal(0.0, c.time_offset)
@@ -45,7 +45,7 @@ def begin(name, seed, give_up=3.5):
         t = 0.02 + frame / FRAMES
         ids, pixels = tracks(*truth.at(t + offset)[:2])
         start.add(frame, round(t * 1e9), ids, observe(camera, pixels))
-        state = start.solve(buffer, lambda _: told(CONFIG, np.zeros(3), 0.0))
+        state = start.solve(buffer, lambda _: told(np.zeros(3), 0.0))
         if state is not None:
             R, _, v = truth.at(t)
             M = R @ state.R_WB.T  # the heading is not what a start tells

@@ -180,13 +180,13 @@ def test_drift_hardly_depends_on_the_rate_of_the_imu():
         m = PerchMotion(seed=seed).sample(times)
         read = read_imu(m, imu, np.random.default_rng(seed))
         for every in ends:
-            buffer = ImuBuffer(config.imu, config.faults, 5.0)
+            buffer = ImuBuffer(config.imu, 5.0)
             for k in range(0, len(times), every):
                 past = slice(max(0, k - every + 1), k + 1)
                 sample = ImuSample(round(times[k] * 1e9), *(tuple(x[past].mean(axis=0)) for x in (read.gyro, read.accel)))
                 assert buffer.add(sample) is ImuOutcome.USED
             start, end = round(times[0] * 1e9), round(times[-1] * 1e9)
-            s = fresh(config, MOUNT, start, m.R_WB[0], told(config, m.p_WB[0], 0.0), m.v_WB[0], np.zeros(3), 1e-6, 1e-6, 1e-6)
+            s = fresh(config, MOUNT, start, m.R_WB[0], told(m.p_WB[0], 0.0), m.v_WB[0], np.zeros(3), 1e-6, 1e-6, 1e-6)
             Msckf(config, s, MOUNT.camera.fx).propagate(buffer.run(start, end), end)
             ends[every].append(m.p_WB[-1] - s.p_WB)
             sigmas[every] = np.sqrt(np.diag(s.P)[at.POSITION])

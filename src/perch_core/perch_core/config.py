@@ -66,6 +66,16 @@ def part(cls: type, *, doc: str = "") -> Any:
     return field(default_factory=cls, metadata={"doc": doc})
 
 
+def derived(default: Any) -> Any:
+    """What follows from other fields, as from a file that one of them names: no key of a file, and no ROS parameter."""
+    return field(default=default, metadata={"derived": True})
+
+
+def settable(cls: type[DataclassInstance]) -> list[Field[Any]]:
+    """The fields of a configuration class that a file or a parameter may set."""
+    return [item for item in fields(cls) if item.init and "derived" not in item.metadata]
+
+
 def check(source: str, key: str, item: Field[Any], value: Any) -> None:
     """Refuse a number out of the declared range, or a word that is no option.
 
@@ -157,7 +167,7 @@ def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T
     if not isinstance(mapping, dict):
         raise ConfigError(source, prefix, f"{mapping!r} is not a mapping")
     hints = _hints(cls)
-    known = {f.name: f for f in fields(cls) if f.init}
+    known = {item.name: item for item in settable(cls)}
     dot = f"{prefix}." if prefix else ""
     for key in mapping:
         if key not in known:

@@ -116,15 +116,11 @@ class ImuSensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """Cameras by name, and the IMU. B has its origin in the IMU."""
+    """Cameras by name, and the IMU, as far as they are described. B has its origin in the IMU."""
 
     name: str = label()
-    cameras: dict[str, CameraSensor] = text()
+    cameras: dict[str, CameraSensor] = part(dict)
     imu: ImuSensor | None = text(None)
-
-    def __post_init__(self) -> None:
-        if not self.cameras:
-            raise ConfigError("", "cameras", "there is no camera")
 
     @cached_property
     def mounts(self) -> dict[str, CameraMount]:

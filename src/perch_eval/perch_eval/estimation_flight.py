@@ -27,6 +27,7 @@ from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotio
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import Estimate, UkfConfig
 from perch_perception.vio import VioConfig, VioPoseEstimate, VioResult
+from perch_perception.vio.start import TOLD_SIGMA
 from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_mount
 from perch_sim.lockstep import Task
@@ -107,8 +108,7 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
 
 def _told_wrong(seed: int) -> np.ndarray:
     """A start is told as well as VIO believes it: a covariance cannot be judged on an error that was never made."""
-    s = VioConfig().start
-    return np.random.default_rng([seed, 9]).standard_normal(4) * [*[s.position_sigma] * 3, s.yaw_sigma]
+    return np.random.default_rng([seed, 9]).standard_normal(4) * TOLD_SIGMA
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from perch_core.camera import CameraMount
 from perch_core.component import Component, Input
 from perch_core.errors import ConfigError
 from perch_core.values import CameraImage, CameraModel, OdometryState, Transform, seconds
+from perch_core.vehicle import load_vehicle
 from perch_perception.mounted_camera import MountedCamera
 from perch_perception.pose_buffer import BodyState, PoseBuffer
 from perch_perception.sensor_file import camera_mounts
@@ -68,13 +69,15 @@ class CameraComponent(Component[C], ABC):
         """
         super().__init__(config)
         cv2.setNumThreads(1)
-        mounts = camera_mounts(config.sensors, config.vehicle)
+        mounts = camera_mounts(config.sensors)
+        self._calibrated = bool(mounts)
+        mounts = mounts or load_vehicle(config.vehicle).mounts
         usable = [camera for camera, mount in mounts.items() if self.unusable(mount) == ""]
         if config.camera not in usable:
             mount = mounts.get(config.camera)
             why = "not there" if mount is None else self.unusable(mount)
             raise ConfigError(type(self).__name__, "camera",
-                              f"{config.camera!r} of {config.sensors or config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
+                              f"{config.camera!r} of {config.sensors if self._calibrated else config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
         self.mounted = MountedCamera(mounts[config.camera], config.extrinsics, self.warn)
         self.dropped = 0
         self._waiting: deque[CameraImage] = deque()
@@ -104,7 +107,7 @@ class CameraComponent(Component[C], ABC):
 
     def on_camera_info(self, model: CameraModel) -> None:
         """The camera's intrinsics; of a sensor file they are known."""
-        if self.config.sensors:
+        if self._calibrated:
             model = model._replace(camera=self.mounted.nominal.camera)
         if self.mounted.take_model(model):
             self.use_camera(self.mounted.known)
@@ -118,7 +121,7 @@ class CameraComponent(Component[C], ABC):
 
     def on_image(self, image: CameraImage) -> None:
         """Keep an image, and use what can be."""
-        if self.config.sensors and self.mounted.mount is None:
+        if self._calibrated and self.mounted.mount is None:
             self.on_camera_info(CameraModel(image.stamp, image.frame, self.mounted.nominal.camera))
         self._waiting.append(image)
         if len(self._waiting) > MOST_WAITING:

@@ -1,4 +1,4 @@
-"""What the sensor file says in place of single parameters: noise of the IMU, cameras and how well they are calibrated."""
+"""What the sensor file says: noise of the IMU, cameras and how well they are calibrated."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from perch_core import config
 from perch_core.camera import CameraMount
 from perch_core.errors import ConfigError
 from perch_core.sensors import CalibrationSigmas, load_sensors
-from perch_core.vehicle import load_vehicle
 from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.ukf.config import ImuNoise
 from perch_perception.vio.config import CalibrationPriors
@@ -19,17 +18,17 @@ from perch_perception.vio.config import CalibrationPriors
 def sensors_parameter() -> str:
     """Declares the parameter `sensors`."""
     return config.text("", doc=(
-        "sensor file, config/sensors/<name>.yaml or a path, in place of the vehicle file's cameras, of camera_info and of the parameters "
-        "that tell noise and calibration; empty: none"))
+        "sensor file, config/sensors/<name>.yaml or a path: noise and axes of the IMU; its cameras and how well they are calibrated, in place of "
+        "the vehicle file's and of camera_info; empty: none"))
 
 
-def camera_mounts(sensors: str, vehicle: str) -> dict[str, CameraMount]:
-    """The cameras of the sensor file, or of the vehicle where none is named.
+def camera_mounts(sensors: str) -> dict[str, CameraMount]:
+    """The cameras of the sensor file; empty: no file is named, or it describes none.
 
     Raises:
         ConfigError: no such file, or a value that is refused.
     """
-    return load_sensors(sensors).mounts if sensors else load_vehicle(vehicle).mounts
+    return load_sensors(sensors).mounts if sensors else {}
 
 
 def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:

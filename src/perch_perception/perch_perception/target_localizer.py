@@ -41,7 +41,7 @@ class TargetLocalizerConfig:
                                                 doc="worst axis, relative to the vehicle, with which target/pose is still published")
     max_attitude_sigma: float = config.quantity(5.0, unit="deg", above=0.0, high=180.0, doc="the same for the attitude")
     localizer: LocalizerConfig = config.part(LocalizerConfig)
-    calibration: CalibrationSigma = config.part(CalibrationSigma)
+    calibration: CalibrationSigma = config.derived(CalibrationSigma())
 
 
 class Localizer(Protocol):

@@ -6,7 +6,7 @@ import math
 import typing
 from array import array
 from collections.abc import Callable
-from dataclasses import Field, fields, is_dataclass
+from dataclasses import Field, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from perch_core import config
@@ -28,7 +28,7 @@ def _leaves(cls: type[DataclassInstance], prefix: str = "") -> dict[str, tuple[F
     """Dotted name -> field and type of every parameter of a configuration class."""
     hints = typing.get_type_hints(cls)
     out: dict[str, tuple[Field[Any], Any]] = {}
-    for item in fields(cls):
+    for item in config.settable(cls):
         name, kind = f"{prefix}{item.name}", hints[item.name]
         if isinstance(kind, type) and is_dataclass(kind):
             out.update(_leaves(kind, f"{name}."))

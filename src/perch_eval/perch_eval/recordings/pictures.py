@@ -28,7 +28,7 @@ class PictureFolder(Recording):
         self.files = pictures_in(path)
         if not self.files:
             raise RecordingError(f"{path}: no image in it")
-        self.camera = next(iter(sensors.cameras)) if sensors is not None else "camera"
+        self.camera = next(iter(sensors.cameras), "camera") if sensors is not None else "camera"
         self.images = {self.camera: len(self.files)}
 
     def events(self) -> Iterator[Event]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 from collections.abc import Sequence
 
 import numpy as np
 
-from perch_core import config
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import WireEstimate
 
@@ -16,14 +14,8 @@ from perch_perception.line_mapping.triangulation import WireEstimate
 WIDTH_RATIO = 1.4  # of wires in line, the sighting is of those that look as wide as it, up to this factor
 MAPPED_GATE = 1.2  # of a sighting to a triangulated wire [deg]
 FOLLOWED_GATE = 5.0  # to the last sighting of a wire that is not triangulated yet [deg]
-
-
-@dataclass(frozen=True)
-class AssociationConfig:
-    """How near a sighting must be to what is expected."""
-
-    distinct: float = config.quantity(2.0, low=1.0, high=10.0, doc="the second-best wire must be so many times worse")
-    reach: float = config.quantity(1.5, unit="m", low=0.0, high=20.0, doc="how far a wire may go on beyond what was seen")
+DISTINCT = 2.0  # the second-best wire must be so many times worse
+REACH = 1.5  # how far a wire may go on beyond what was seen [m]
 
 
 class Track(Protocol):
@@ -34,15 +26,14 @@ class Track(Protocol):
     extent: tuple[float, float] | None
 
 
-def score(track: Track, seen: LineObservation, settings: AssociationConfig) -> float:
+def score(track: Track, seen: LineObservation) -> float:
     """Misfit of a sighting to a wire in units of the gate; inf where it cannot be the same."""
     if track.estimate is not None:
-        return _score_mapped(track.estimate, track.extent, seen, settings)
+        return _score_mapped(track.estimate, track.extent, seen)
     return _score_followed(track.last, seen) / np.radians(FOLLOWED_GATE)
 
 
-def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, seen: LineObservation,
-                  settings: AssociationConfig) -> float:
+def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, seen: LineObservation) -> float:
     curve = estimate.curve
     centres = np.tile(seen.p_WC, (len(seen.rays_W), 1))
     against = curve.offsets(centres, seen.rays_W)
@@ -51,7 +42,7 @@ def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, se
     s = against.s
     if extent is not None:
         low, high = extent
-        if s.max() < low - settings.reach or s.min() > high + settings.reach:
+        if s.max() < low - REACH or s.min() > high + REACH:
             return np.inf
     middle = float(s[len(s) // 2])
     distance = float(np.linalg.norm(curve.at(middle) - seen.p_WC))
@@ -81,12 +72,12 @@ def _as_wide(track: Track, seen: LineObservation) -> bool:
     return bool(1.0 / WIDTH_RATIO < ratio < WIDTH_RATIO)
 
 
-def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings: AssociationConfig) -> list[int | None]:
+def associate(tracks: Sequence[Track], seen: Sequence[LineObservation]) -> list[int | None]:
     """For each sighting the index of its wire, -1 for a new one, or None where it could be one of several.
 
     A triangulated wire may be seen in several pieces at once; one that is only followed, in one.
     """
-    scores = np.array([[score(track, one, settings) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
+    scores = np.array([[score(track, one) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
     for i, one in enumerate(seen):
         near = np.flatnonzero(scores[i] <= 1.0)
         as_wide = [_as_wide(tracks[j], one) for j in near.tolist()]
@@ -101,7 +92,7 @@ def associate(tracks: Sequence[Track], seen: Sequence[LineObservation], settings
             continue
         done.add(i)
         rivals = [scores[i, k] for k in range(len(tracks)) if k != j]
-        if rivals and min(rivals) < min(1.0, settings.distinct * max(value, 0.1)):
+        if rivals and min(rivals) < min(1.0, DISTINCT * max(value, 0.1)):
             answer[i] = None
             continue
         answer[i] = j

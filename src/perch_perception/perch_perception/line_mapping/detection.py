@@ -19,7 +19,9 @@ from perch_perception.line_mapping.centring import centred
 from perch_perception.line_mapping.ridges import ridges
 from perch_perception.line_mapping.straight import wires
 
-PLAIN_LENGTH = 80.0  # plain arcs that are shorter are no wires [px]
+RED_LENGTH, PLAIN_LENGTH = 30.0, 80.0  # shorter arcs are no wires [px]
+TOLERANCE = 1.5  # of ridge points from their arc [px]
+SIGMA = 0.2  # error of an arc that averaging does not remove [px]
 MOST_GAP = 25.0  # hole after which an arc is another one [px]
 LEAST_WIDTH = 4.0  # the thickness of a thinner wire cannot be told [px]
 SAMPLES = 7          # rays that stand for a sighting
@@ -27,6 +29,7 @@ HYPOTHESES = 64      # arcs tried per blob and round
 MAX_BEND = 0.6       # second derivative of an arc: a wire bends no more [1/rad]
 EDGE_REACH = 4       # a run's edge is sought among so many steps and one, from one outside to three inside [px]
 MAX_LINES = 6        # lines in one blob: cables that cross in the image share one
+WIDTH_LOSS = 0.5     # a wire wider than 6 px looks narrower by this: blurred, and darker at its rims [px]
 # In a wire of a few pixels the blurred edges meet and push each other outward again: the loss is smaller by MEETING at MEETING_AT,
 # e times less per MEETING_OVER. From a round wire, 0.6 as bright at its rim as in its middle, under a blur of 1.2 px [px]
 MEETING, MEETING_AT, MEETING_OVER = 0.4, 3.25, 1.1
@@ -39,11 +42,6 @@ class LineDetectionConfig:
     appearance: str = config.choice("red", options=("red", "plain"),
                                     doc="red: redder than everything else; plain: brighter or darker than what is behind it")
     redness: float = config.quantity(20.0, low=1.0, high=255.0, doc="least R - max(G, B) of a red wire [grey values]")
-    min_length: float = config.quantity(30.0, unit="px", above=0.0, high=640.0, doc="shorter red arcs are not used")
-    tolerance: float = config.quantity(1.5, unit="px", above=0.0, high=20.0, doc="of ridge points from their arc")
-    sigma: float = config.quantity(0.2, unit="px", above=0.0, high=5.0, doc="error of an arc that averaging does not remove")
-    width_loss: float = config.quantity(0.5, unit="px", low=0.0, high=5.0,
-                                        doc="a wire wider than 6 px looks narrower by this: blurred, and darker at its rims")
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
         settings: what counts as a wire.
     """
     if settings.appearance == "plain":
-        return _plain(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), camera, settings)
+        return _plain(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), camera)
     strength = redness(image)
     red = (strength > settings.redness).astype(np.uint8)
     mask = cv2.morphologyEx(red, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
@@ -89,23 +87,23 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
     sightings = []
     for label in range(1, count):
         x, y, w, h = stats[label, :4]
-        if max(w, h) < settings.min_length:
+        if max(w, h) < RED_LENGTH:
             continue
         window = slice(y, y + h), slice(x, x + w)
         around = padded[y:y + h + 2 * EDGE_REACH, x:x + w + 2 * EDGE_REACH]
         pixels, edges = ridge_points(np.where(labels[window] == label, strength[window], 0).astype(float), around)
-        sightings += _arcs(pixels + (x, y), edges + (x, y), camera, settings)
+        sightings += _arcs(pixels + (x, y), edges + (x, y), camera)
     return sorted(sightings, key=lambda sighting: -sighting.length)
 
 
-def _plain(grey: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> list[LineSighting]:
+def _plain(grey: np.ndarray, camera: Camera) -> list[LineSighting]:
     """Wires that have no colour of their own; their widths are not measured."""
     found = ridges(grey)
     rays, edges = camera.unproject(found.pixels), np.full((len(found.pixels), 2, 2), np.nan)
-    arcs = wires(found, camera, settings.tolerance, PLAIN_LENGTH)
+    arcs = wires(found, camera, TOLERANCE, PLAIN_LENGTH)
     sightings = []
     for arc in arcs:
-        one = _sighting(arc.points, found.pixels, edges, rays, arc.scatter / camera.fx, camera, settings)
+        one = _sighting(arc.points, found.pixels, edges, rays, arc.scatter / camera.fx, camera)
         sightings.append(replace(one, rays_C=centred(grey, camera, one.rays_C, arc.bright, arc.level)))
     return sorted(sightings, key=lambda sighting: -sighting.length)
 
@@ -150,28 +148,27 @@ def _edges(around: np.ndarray, column: np.ndarray, first: np.ndarray, last: np.n
     return found
 
 
-def _arcs(pixels, edges, camera, settings) -> list[LineSighting]:
+def _arcs(pixels, edges, camera) -> list[LineSighting]:
     """Arcs through the ridge points of one blob, the best first, each split where it has holes."""
     rays = camera.unproject(pixels)
     seen = np.all(np.isfinite(rays), axis=1)
     pixels, edges, rays = pixels[seen], edges[seen], rays[seen]
-    if len(rays) < settings.min_length:
+    if len(rays) < RED_LENGTH:
         return []
     along, across = _arc_coordinates(rays)
     rng = np.random.default_rng(len(pixels))  # the same image gives the same arcs
-    tolerance = settings.tolerance / camera.fx
     left = np.arange(len(pixels))
     sightings: list[LineSighting] = []
     for _ in range(MAX_LINES):
-        if len(left) < settings.min_length:
+        if len(left) < RED_LENGTH:
             break
-        inlier, spread = _best_arc(along[left], across[left], rng, tolerance)
-        if inlier.sum() < settings.min_length:
+        inlier, spread = _best_arc(along[left], across[left], rng, TOLERANCE / camera.fx)
+        if inlier.sum() < RED_LENGTH:
             break
         chosen = left[inlier]
         chosen = chosen[np.argsort(along[chosen], kind="stable")]
-        for piece in _pieces(chosen, pixels, settings):
-            sightings.append(_sighting(piece, pixels, edges, rays, spread, camera, settings))
+        for piece in _pieces(chosen, pixels):
+            sightings.append(_sighting(piece, pixels, edges, rays, spread, camera))
         left = left[~inlier]
     return sightings
 
@@ -216,24 +213,24 @@ def _powers(t: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(t), t, t * t], axis=-1)
 
 
-def _pieces(ordered: np.ndarray, pixels: np.ndarray, settings: LineDetectionConfig) -> list[np.ndarray]:
+def _pieces(ordered: np.ndarray, pixels: np.ndarray) -> list[np.ndarray]:
     """Indices of the points of each unbroken piece of an arc, in order along it."""
     steps = np.linalg.norm(np.diff(pixels[ordered], axis=0), axis=1)
     pieces = np.split(ordered, np.nonzero(steps > MOST_GAP)[0] + 1)
     return [p for p in pieces if len(p) >= 2 * SAMPLES
-            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= settings.min_length]
+            and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= RED_LENGTH]
 
 
-def _sighting(piece, pixels, edges, rays, spread, camera, settings) -> LineSighting:
+def _sighting(piece, pixels, edges, rays, spread, camera) -> LineSighting:
     groups = np.array_split(piece, SAMPLES)
     means = np.array([rays[group].mean(axis=0) for group in groups])
     means /= np.linalg.norm(means, axis=1, keepdims=True)
     length = float(np.linalg.norm(pixels[piece[-1]] - pixels[piece[0]]))
-    sigma = np.hypot(spread / np.sqrt(len(piece) / SAMPLES), settings.sigma / camera.fx)
-    return LineSighting(means, rays[piece[[0, -1]]], float(sigma), _width(edges[piece], camera, settings), length)
+    sigma = np.hypot(spread / np.sqrt(len(piece) / SAMPLES), SIGMA / camera.fx)
+    return LineSighting(means, rays[piece[[0, -1]]], float(sigma), _width(edges[piece], camera), length)
 
 
-def _width(edges: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> float:
+def _width(edges: np.ndarray, camera: Camera) -> float:
     """Angle between the planes that touch a wire on both sides [rad], from its edges in the image (n, 2, 2).
 
     Seen askew the wire's direction is not that of its image, so the planes are fitted each to its side. 0 where half of the edges
@@ -251,5 +248,5 @@ def _width(edges: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> 
         normals.append(np.linalg.eigh(rays.T @ rays)[1][:, 0])
     between = float(np.linalg.norm(np.cross(normals[0], normals[1])))
     looks = float(np.arcsin(min(between, 1.0)) * camera.fx)
-    width = looks + settings.width_loss - MEETING * np.exp((MEETING_AT - looks) / MEETING_OVER)
+    width = looks + WIDTH_LOSS - MEETING * np.exp((MEETING_AT - looks) / MEETING_OVER)
     return float(width / camera.fx) if width >= LEAST_WIDTH else 0.0

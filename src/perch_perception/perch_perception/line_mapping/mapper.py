@@ -11,7 +11,7 @@ import numpy as np
 from perch_core import config, so3
 from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
-from perch_perception.line_mapping.association import AssociationConfig, associate
+from perch_perception.line_mapping.association import associate
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import (
@@ -21,7 +21,9 @@ from perch_perception.pose_buffer import BodyState
 BASELINE = 0.03  # motion between the sightings kept [m]
 TURN = 3.0  # or rotation between them [deg]
 MOST_OBSERVATIONS = 40  # sightings kept per wire
-SUPERSEDED = 0.3  # a wire not seen for `stale_after` gives way to one that is seen this close to it [m]
+FORGET_AFTER = 2.0  # a wire that was never triangulated and is not seen is dropped [s]
+STALE_AFTER, SUPERSEDED = 0.4, 0.3  # a wire not seen for so long gives way to one that is seen so close to it [s, m]
+STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [m]
 PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
 CERTAIN = 3           # so many more images that show a line to be attached to what is beside it than apart: no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
@@ -31,15 +33,9 @@ MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 class MapperConfig:
     """What is kept and published."""
 
-    forget_after: float = config.quantity(2.0, unit="s", above=0.0, high=60.0,
-                                          doc="a wire that was never triangulated and is not seen is dropped")
-    stale_after: float = config.quantity(0.4, unit="s", above=0.0, high=60.0, doc="a wire not seen for so long gives way to one that is seen beside it")
     max_range: float = config.quantity(8.0, unit="m", above=0.0, high=100.0, doc="ends are not believed beyond this distance")
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
-    straightness: float = config.quantity(0.02, unit="m", above=0.0, high=1.0,
-                                          doc="a sagging wire is cut into chords that stay within this")
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
-    association: AssociationConfig = config.part(AssociationConfig)
 
 
 @dataclass(frozen=True)
@@ -116,7 +112,7 @@ class LineMapper:
         self._body = replace(body, p_WB=body.p_WB - body.corrected)
         seen = [replace(one, p_WC=one.p_WC - body.corrected) for one in seen]
         changed = set()
-        owners = associate(self._tracks, seen, self.settings.association)
+        owners = associate(self._tracks, seen)
         for one, owner in zip(seen, owners):
             if owner is None:
                 continue
@@ -132,7 +128,7 @@ class LineMapper:
         self._merge()
         self._supersede(time)
         self._tracks = [t for t in self._tracks
-                        if t.estimate is not None or time - t.last.time <= self.settings.forget_after]
+                        if t.estimate is not None or time - t.last.time <= FORGET_AFTER]
         return self.map(time)
 
     def _judge(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
@@ -216,14 +212,13 @@ class LineMapper:
 
     def _supersede(self, time: float) -> None:
         """Drop wires that are no longer where they were: the odometry was corrected, and they are seen again beside there."""
-        settings = self.settings
         fresh = [t for t in self._tracks if t.estimate is not None and t.extent is not None and t.count >= MIN_OBSERVATIONS
-                 and time - t.last.time <= settings.stale_after]
-        self._tracks = [t for t in self._tracks if time - t.last.time <= settings.stale_after
+                 and time - t.last.time <= STALE_AFTER]
+        self._tracks = [t for t in self._tracks if time - t.last.time <= STALE_AFTER
                         or not any(_beside(t, other, SUPERSEDED) for other in fresh)]
 
     def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedLine]:
-        """The wire as chords that stay within `straightness`; none where it is not known well enough."""
+        """The wire as chords that stay within `STRAIGHTNESS`; none where it is not known well enough."""
         if track.extent is None:
             missing.append(f"line {track.id}: its ends were not seen yet")
             return []
@@ -231,7 +226,7 @@ class LineMapper:
         length = high - low
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
         # chords of a parabola leave it by their share of its sag; half of it once they are moved to its middle
-        pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * self.settings.straightness)))))
+        pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * STRAIGHTNESS)))))
         radius = estimate.radius if np.isfinite(estimate.radius) else self.settings.triangulation.radius
         lines = []
         for k in range(pieces):

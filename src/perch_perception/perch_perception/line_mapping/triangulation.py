@@ -22,6 +22,10 @@ from perch_core.errors import PerchError
 from perch_perception.line_mapping.curve import PARAMETERS, WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 
+MIN_RATIO = 0.03   # least sigma2/sigma1 of the planes' normals; below it the depth is not determined
+POSE_POSITION, POSE_ROTATION = 0.006, np.radians(0.1)  # 1 sigma of the camera's pose from image to image [m, rad]
+SAG = 0.03         # prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m) [1/m]
+WIDTH = 0.01       # error of a wire's width in an image, beside that of its edges: share of it
 WIDTH_EDGES = 0.3  # error of a wire's edges in an image beside that of its rays: share of it
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
@@ -34,24 +38,15 @@ ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radi
 
 @dataclass(frozen=True)
 class TriangulationConfig:
-    """What the images and poses are worth, and what baseline is enough."""
+    """What the poses are worth, and what is known of the wires."""
 
-    min_ratio: float = config.quantity(0.03, above=0.0, high=0.5,
-                                       doc="least sigma2/sigma1 of the planes' normals; below it the depth is not determined")
-    pose_position: float = config.quantity(0.006, unit="m", above=0.0, high=1.0,
-                                           doc="error of the camera's position from image to image, 1 sigma")
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="random walk of the odometry; the wire is where the newest sightings see it")
     pose_drift_moved: float = config.quantity(0.01, unit="m/sqrt(m)", low=0.0, high=1.0, doc="the same over the distance moved")
-    pose_rotation: float = config.quantity(0.1, unit="deg", above=0.0, high=10.0, doc="the same for its attitude")
-    mount_rotation: float = config.quantity(0.3, unit="deg", above=0.0, high=10.0,
-                                            doc="error of the camera's attitude on the body, per axis, 1 sigma: the same in all sightings")
-    width: float = config.quantity(0.01, above=0.0, high=1.0, doc="error of a wire's width in an image, beside that of its edges: share of it")
+    mount_rotation: float = config.derived(0.3)  # 1 sigma of the camera's attitude on the body, per axis: the same in all sightings [deg]
     radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5,
                                     doc="radius of the wires, where it is known; else of one too thin to be measured")
     radius_sigma: float = config.quantity(0.0, low=0.0, high=1.0, doc="how well it is known, 1 sigma, as a share of it; 0: not at all")
-    sag: float = config.quantity(0.03, unit="1/m", above=0.0, high=1.0,
-                                 doc="prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m)")
 
     @property
     def radius_known(self) -> bool:
@@ -62,9 +57,9 @@ class TriangulationConfig:
 class DegenerateBaseline(PerchError):
     """The camera's motion does not determine the wire. `ratio` is sigma2/sigma1 of the planes' normals."""
 
-    def __init__(self, ratio: float, needed: float) -> None:
+    def __init__(self, ratio: float) -> None:
         self.ratio = ratio
-        super().__init__(f"baseline ratio {ratio:.3f} < {needed:g}: move across the wire, not along it or towards it")
+        super().__init__(f"baseline ratio {ratio:.3f} < {MIN_RATIO:g}: move across the wire, not along it or towards it")
 
 
 @dataclass(frozen=True)
@@ -105,20 +100,20 @@ class WireEstimate:
         return by_parameters @ self.covariance @ by_parameters.T
 
 
-def intersect_planes(observations: Sequence[LineObservation], settings: TriangulationConfig) -> tuple[WireCurve, float]:
+def intersect_planes(observations: Sequence[LineObservation]) -> tuple[WireCurve, float]:
     """The straight line that all planes share, and sigma2/sigma1 of their normals.
 
     Raises:
         DegenerateBaseline: fewer than two sightings, or planes that are nearly the same.
     """
     if len(observations) < 2:
-        raise DegenerateBaseline(0.0, settings.min_ratio)
+        raise DegenerateBaseline(0.0)
     normals = np.array([o.normal for o in observations])
     centres = np.array([o.p_WC for o in observations])
     _, sizes, axes = np.linalg.svd(normals)
     ratio = float(sizes[1] / sizes[0])
-    if ratio < settings.min_ratio:
-        raise DegenerateBaseline(ratio, settings.min_ratio)
+    if ratio < MIN_RATIO:
+        raise DegenerateBaseline(ratio)
     direction = axes[2]
     # the point of the line beside the last sighting's middle: a useful origin for s
     rows = np.concatenate([normals, direction[None]])
@@ -135,13 +130,13 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
 
     Args:
         observations: sightings of one wire.
-        settings: noise and limits.
+        settings: what is known of poses and wires.
         before: an earlier result; its point keeps the origin of s where it is.
 
     Raises:
         DegenerateBaseline: the camera's motion does not determine the wire, or puts it behind the camera.
     """
-    line, ratio = intersect_planes(observations, settings)
+    line, ratio = intersect_planes(observations)
     curve, mount = (line, np.zeros(3)) if before is None else (before.curve, before.mount)
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
@@ -157,22 +152,22 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         walked = np.cumsum(walk)
         # an earlier result is where the wire was at its own last sighting: what came since may be off by the walk and by its error
         apart = np.abs(walked[newest if number == rounds else -1] - walked) + known
-        residual, _ = _whitened(curve, mount, observations, centres, rays, settings, apart)
+        residual, _ = _whitened(curve, mount, observations, centres, rays, apart)
         misfit = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
         used = misfit < 3.0 * max(1.0, float(np.median(misfit)))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
-        by_rays = _normal_equations(_whitened(curve, mount, observations, centres, rays, settings, rigid), weight)
+        by_rays = _normal_equations(_whitened(curve, mount, observations, centres, rays, rigid), weight)
         apart = apart if known > 0.0 else apart + WIDTH_GATE**2
-        by_widths = _normal_equations(_widths(curve, size, observations, settings, apart), weight)
+        by_widths = _normal_equations(_widths(curve, size, observations, apart), weight)
         information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount, size)
         try:
             step = -np.linalg.solve(information, gradient)
         except np.linalg.LinAlgError:  # the sightings that are left say nothing of one direction
-            raise DegenerateBaseline(ratio, settings.min_ratio) from None
+            raise DegenerateBaseline(ratio) from None
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
-        raise DegenerateBaseline(ratio, settings.min_ratio)
+        raise DegenerateBaseline(ratio)
     covariance = np.linalg.inv(information)[:PARAMETERS, :PARAMETERS] * max(1.0, float(np.mean(misfit[used] ** 2)))
     return WireEstimate(curve, covariance, ratio, used, mount, float(np.exp(size)), observations[-1].time)
 
@@ -208,7 +203,7 @@ def _wandering(by_rays, by_widths, walk, settings, curvature, mount, size):
     """
     parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
     by_radius, misfit = (settings.radius_sigma**-2, size - np.log(settings.radius)) if settings.radius_known else (1e-6, 0.0)
-    tight = np.concatenate([np.zeros(4), [1.0 / settings.sag**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [by_radius]])
+    tight = np.concatenate([np.zeros(4), [1.0 / SAG**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [by_radius]])
     information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [misfit]])
     for part, slope, variance in zip(parts, slopes, walk):
         if variance > 0.0:
@@ -236,7 +231,7 @@ def _feet(curve, observations):
     return to + s[:, None] * curve.direction + (0.5 * curve.curvature * s * s)[:, None] * curve.axes[:, 1], s
 
 
-def _widths(curve, size, observations, settings, apart):
+def _widths(curve, size, observations, apart):
     """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, and their Jacobian (n, 1, 9).
 
     A width that says a distance farther off than `apart` (n,) [m^2] allows is that of two wires, or of a part of one.
@@ -250,7 +245,7 @@ def _widths(curve, size, observations, settings, apart):
     to, s = _feet(curve, [observations[k] for k in seen])
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     misfit = np.log(np.sin(0.5 * width) * distance) - size
-    sigma = np.sqrt(settings.width**2 + (WIDTH_EDGES * ray / width) ** 2 + (settings.pose_position / distance) ** 2)
+    sigma = np.sqrt(WIDTH**2 + (WIDTH_EDGES * ray / width) ** 2 + (POSE_POSITION / distance) ** 2)
     x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
     zero = np.zeros_like(s)
     rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]
@@ -259,7 +254,7 @@ def _widths(curve, size, observations, settings, apart):
     return residual, jacobian
 
 
-def _whitened(curve, mount, observations, centres, rays, settings, walk):
+def _whitened(curve, mount, observations, centres, rays, walk):
     """Residuals (n, k) in sigmas and their Jacobian (n, k, 9) by wire, mount and radius, decorrelated within each image.
 
     All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. `walk` (n,)
@@ -270,9 +265,8 @@ def _whitened(curve, mount, observations, centres, rays, settings, walk):
     by_rotation = np.cross(rays, against.normals)  # n . (dtheta x r)
     # a centre moved by dc sees the wire's point moved by -dc: across the plane by n . dc / distance
     by_position = against.normals / np.maximum(against.ahead, 0.1)[:, None]
-    position = np.repeat(np.sqrt(settings.pose_position**2 + walk), k)
-    by_pose = np.concatenate([by_rotation * np.radians(settings.pose_rotation), by_position * position[:, None]],
-                             axis=1).reshape(n, k, 6)
+    position = np.repeat(np.sqrt(POSE_POSITION**2 + walk), k)
+    by_pose = np.concatenate([by_rotation * POSE_ROTATION, by_position * position[:, None]], axis=1).reshape(n, k, 6)
     sigma = np.array([o.sigma for o in observations])
     covariance = by_pose @ np.swapaxes(by_pose, 1, 2) + sigma[:, None, None] ** 2 * np.eye(k)
     root = np.linalg.cholesky(covariance)

@@ -30,14 +30,13 @@ class LocalizerConfig:
     """How the board is looked for and which sightings count."""
 
     search_rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=30.0, doc="searches of the whole frame")
-    lost_after: float = config.quantity(0.4, unit="s", above=0.0, high=5.0, doc="tracking without a tag before searching")
     max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
                                        doc="a board further away than this is taken for one of another size")
-    min_range: float = config.quantity(0.15, unit="m", above=0.0, high=10.0, doc="and so is a nearer one")
-    follow_images: int = config.quantity(4, low=0, high=30, doc="images in a row in which the expected corners are "
-                                         "measured without reading the tags' numbers")
 
 
+LOST_AFTER = 0.4   # tracking without a tag before searching [s]
+MIN_RANGE = 0.15   # a nearer board is taken for one of another size [m]
+FOLLOW_IMAGES = 4  # in a row in which the expected corners are measured without reading the tags' numbers
 VIEW_MARGIN = 1.2  # what is looked at around the pad, in pad sizes
 PRINT_SIGMA = 0.0002  # of a tag's place on the board, per axis: what plotters and careful gluing keep [m]
 FOLLOW_GAP = 0.1      # time since the last sighting over which corners are expected well enough [s]
@@ -119,7 +118,7 @@ class BoardLocalizer:
             The sighting; `board` is None where there is none, and `message` says why.
         """
         last = self._last
-        if last is not None and time - self._last_time <= self.settings.lost_after:
+        if last is not None and time - self._last_time <= LOST_AFTER:
             p_CS, R_CS = self._predict(last, body)
             view = self._aim(p_CS, self._radius)
             part = _Part.of(image, view.region(self.mount.camera, AROUND_VIEW))
@@ -149,7 +148,7 @@ class BoardLocalizer:
     def _follow(self, part: _Part, time: float, body: BodyState | None, p_CS: np.ndarray,
                 R_CS: np.ndarray) -> Localization | None:
         """Measure the corners where they are expected; None where that is not safe, or where one is not found."""
-        if (self._followed >= self.settings.follow_images or body is None or self._last_body is None
+        if (self._followed >= FOLLOW_IMAGES or body is None or self._last_body is None
                 or time - self._last_time > FOLLOW_GAP):
             return None
         pixels, valid = self.mount.camera.project(self.board.corners_S @ R_CS.T + p_CS)
@@ -238,10 +237,10 @@ class BoardLocalizer:
         pose = solve_board(camera, corners_S, rays, sigma, ids, None if expected is None else expected[1], start, self._lens_sigma,
                            PRINT_SIGMA)
         distance = float(np.linalg.norm(pose.p_CS))
-        if not self.settings.min_range <= distance <= self.settings.max_range:
+        if not MIN_RANGE <= distance <= self.settings.max_range:
             raise LocalizationRefusal(
                 f"the tags' size puts the board at {distance:.2f} m, outside "
-                f"[{self.settings.min_range:g}, {self.settings.max_range:g}] m: not a board of this size")
+                f"[{MIN_RANGE:g}, {self.settings.max_range:g}] m: not a board of this size")
         complete = len(pose.ids) == len(self.board.ids)
         average = average_board(camera, corners_S, rays, ids) if self._averaging and complete else None
         if pose.dropped:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core import config, so3
+from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.pose import BoardPose
@@ -28,12 +28,18 @@ class CalibrationSigma:
     """How well the camera is calibrated: 1 sigma of what stays the same from image to image.
 
     The defaults are those of config/sensors/snapdragon.yaml, what a careful calibration leaves.
+
+    Attributes:
+        focal: each focal length, relative.
+        centre: principal point, per axis [px].
+        rotation: extrinsic rotation, per axis of B: 0.005 rad [deg].
+        time: camera-IMU time offset [s].
     """
 
-    focal: float = config.quantity(0.003, low=0.0, high=0.1, doc="each focal length, relative")
-    centre: float = config.quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
-    rotation: float = config.quantity(0.286, unit="deg", low=0.0, high=10.0, doc="extrinsic rotation, per axis of B: 0.005 rad")
-    time: float = config.quantity(0.002, unit="s", low=0.0, high=0.05, doc="camera-IMU time offset")
+    focal: float = 0.003
+    centre: float = 0.5
+    rotation: float = 0.286
+    time: float = 0.002
 
     @property
     def lens(self) -> np.ndarray:

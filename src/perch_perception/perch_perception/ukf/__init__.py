@@ -1,10 +1,10 @@
 """The state estimator: an unscented Kalman filter on SO(3) over IMU and delayed VIO poses. Free of ROS."""
 
 from perch_core.values import ImuSample
-from perch_perception.ukf.config import ImuFaults, ImuNoise, UkfConfig, VioNoise
+from perch_perception.ukf.config import ImuNoise, UkfConfig, VioNoise
 from perch_perception.ukf.estimator import Estimator
 from perch_perception.ukf.imu_buffer import ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Inertial, Status, VioOutcome, VioPose
 
-__all__ = ["Estimate", "Estimator", "Health", "ImuFaults", "ImuNoise", "ImuOutcome", "ImuSample", "Inertial",
+__all__ = ["Estimate", "Estimator", "Health", "ImuNoise", "ImuOutcome", "ImuSample", "Inertial",
            "Status", "UkfConfig", "VioNoise", "VioOutcome", "VioPose"]

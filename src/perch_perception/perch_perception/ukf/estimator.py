@@ -21,13 +21,14 @@ from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
 from perch_perception.ukf.rest import rested, stopped
-from perch_perception.ukf.stillness import still, window
+from perch_perception.ukf.stillness import WINDOW, still, window
 from perch_perception.ukf.unscented import Belief, CovarianceError, Innovation, UnscentedTransform
 
 _PATIENCE = 15  # rejections in a row after which VIO is believed to have jumped
 _LOST_POSITION = 2.0  # 1 sigma beyond which the state is not to be used [m]
 _LOST_ATTITUDE = 0.6  # the same [rad]
 COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
+_FUTURE = 50_000_000  # VIO stamps so far ahead wait for the IMU, later ones are refused [ns]
 _MOST_WAITING = 20  # poses ahead of the IMU that are kept
 
 
@@ -41,7 +42,7 @@ class Estimator:
     def __init__(self, config: UkfConfig = UkfConfig()) -> None:
         self.config = config
         self._transform = UnscentedTransform(config)
-        self._imu = ImuBuffer(config.imu, config.faults, config.history)
+        self._imu = ImuBuffer(config.imu, config.history)
         self._gates = {m: float(chi2_quantile(config.gate_probability, m)) for m in (6, 9)}
         self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
         self._heard = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
@@ -143,7 +144,7 @@ class Estimator:
         if self._base is not None and pose.stamp <= self._base.stamp:
             return VioOutcome.DUPLICATE if pose.stamp == self._base.stamp else VioOutcome.OUT_OF_ORDER
         if pose.stamp > last.stamp:
-            if pose.stamp > last.stamp + round(self.config.future * 1e9):
+            if pose.stamp > last.stamp + _FUTURE:
                 return VioOutcome.FUTURE
             if any(w.stamp == pose.stamp for w in self._waiting):
                 return VioOutcome.DUPLICATE
@@ -156,7 +157,7 @@ class Estimator:
         return None
 
     def _begin(self, pose: VioPose) -> VioOutcome:
-        steps = window(self.config.rest, self._imu, pose.stamp)
+        steps = window(self._imu, pose.stamp)
         self._settle(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose, pose.inertial))
         self._broken = False
         return VioOutcome.STARTED
@@ -204,10 +205,10 @@ class Estimator:
         now, config = self._imu.newest.stamp, self.config
         if self._base is None or self._live is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
             return
-        if not still(config.rest, window(config.rest, self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
+        if not still(window(self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
             self._resting = False
             return
-        belief, middle = self._base, now - round(0.5e9 * config.rest.window)
+        belief, middle = self._base, now - round(0.5e9 * WINDOW)
         try:
             if not self._resting:
                 begin = max(belief.stamp, 2 * middle - now)

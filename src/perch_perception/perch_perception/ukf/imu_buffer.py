@@ -9,8 +9,9 @@ from collections import deque
 import numpy as np
 
 from perch_core.values import ImuSample
-from perch_perception.ukf.config import ImuFaults, ImuNoise
+from perch_perception.ukf.config import ImuNoise
 
+_GAP = 3.0  # longest interval between samples that counts as complete, in periods
 _GAP_ACCEL = 5.0  # 1 sigma of what a missing sample may have been [m/s^2]
 _GAP_GYRO = 2.0  # the same [rad/s]
 _PERIODS = 9  # last intervals whose median is the period
@@ -45,8 +46,8 @@ class ImuBuffer:
     measured: the median of the last intervals.
     """
 
-    def __init__(self, imu: ImuNoise, faults: ImuFaults, history: float) -> None:
-        self._imu, self._faults = imu, faults
+    def __init__(self, imu: ImuNoise, history: float) -> None:
+        self._imu = imu
         self._instant = imu.integration == "instant"
         self._densities = (imu.gyro_noise_density**2, imu.accel_noise_density**2)
         self._keep = round(history * 1e9)
@@ -70,7 +71,7 @@ class ImuBuffer:
 
     def add(self, sample: ImuSample) -> ImuOutcome:
         """Take a sample; the step that leads to it is then `latest`. A refused one leaves no trace: its stamp may be another writer's."""
-        last, imu, faults = self.last, self._imu, self._faults
+        last, imu = self.last, self._imu
         w, f = sample.w_B, sample.f_B
         if not is_sane(sample):
             return ImuOutcome.NOT_FINITE
@@ -93,9 +94,9 @@ class ImuBuffer:
             outcome = ImuOutcome.GAP
         s = sample
         if max(abs(s.w_B[0]), abs(s.w_B[1]), abs(s.w_B[2])) >= 0.99 * imu.gyro_range:
-            gyro, outcome = gyro + (faults.saturation * imu.gyro_range) ** 2, ImuOutcome.SATURATED
+            gyro, outcome = gyro + imu.gyro_range**2, ImuOutcome.SATURATED  # it may be off by as much again
         if max(abs(s.f_B[0]), abs(s.f_B[1]), abs(s.f_B[2])) >= 0.99 * imu.accel_range:
-            accel, outcome = accel + (faults.saturation * imu.accel_range) ** 2, ImuOutcome.SATURATED
+            accel, outcome = accel + imu.accel_range**2, ImuOutcome.SATURATED
         self._ends.append(sample.stamp)
         self._rows.append((dt, *w, *f, gyro, accel))
         if sample.stamp - self._ends[0] >= 2 * self._keep:
@@ -107,7 +108,7 @@ class ImuBuffer:
         """Whether samples are missing in an interval [ns]; it counts for the period from now on."""
         self._intervals.append(interval)
         period = sorted(self._intervals)[len(self._intervals) // 2]
-        return interval > self._faults.gap * period
+        return interval > _GAP * period
 
     @property
     def latest(self) -> tuple[float, ...]:

@@ -45,7 +45,7 @@ def from_pose(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:
         pose: VIO's pose; its velocity is taken where it has one.
         steps: IMU steps before the pose, shape (m, 9).
     """
-    at_rest = still(config.rest, steps) and (pose.v_B is None or np.linalg.norm(pose.v_B) < _STANDS)
+    at_rest = still(steps) and (pose.v_B is None or np.linalg.norm(pose.v_B) < _STANDS)
     R_WB = so3.quat_to_matrix(pose.q_WB)
     x = np.zeros(at.NOMINAL_SIZE)
     x[at.POSITION], x[at.QUATERNION] = pose.p_WB, pose.q_WB

@@ -18,10 +18,13 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core.vehicle import GRAVITY
-from perch_perception.ukf.config import RestConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.ukf.unscented import ACCEL, ACCEL_VARIANCE, DT, GYRO, GYRO_VARIANCE
 
+WINDOW = 0.2                       # IMU over which rest is judged [s]
+VELOCITY = 0.002                   # 1 sigma of the velocity at rest [m/s]
+GYRO_BIAS, ACCEL_BIAS = 0.35, 1.5  # largest turn-on biases of MEMS sensors: 20 deg/s, 150 mg [rad/s, m/s^2]
+_ENERGY = 1.8   # most of T / 6: 1 is rest
 _LEAST = 10     # samples
 _ENTIRE = 0.9   # share of the window that must be there
 _LATEST = 4     # part of the window, its last, that must look like rest as well: a departure has just begun
@@ -36,23 +39,22 @@ def energy(steps: np.ndarray) -> float:
     return float(T) / (6 * (len(steps) - 1))
 
 
-def still(config: RestConfig, steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndarray | None = None,
+def still(steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndarray | None = None,
           seen: bool = False) -> bool:
     """Whether IMU steps are those of a vehicle at rest.
 
     Args:
-        config: the limits.
         steps: as from `ImuBuffer.run`, shape (m, 9).
         biases: of gyro and accelerometer [rad/s, m/s^2], shape (6,); None: not known.
         variance: of the biases, shape (6,).
         seen: a camera sees that nothing moves: what shakes the vehicle then, be it its own rotors, does not move it.
     """
-    if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * config.window:
+    if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * WINDOW:
         return False
-    known = np.array([config.gyro_bias, config.accel_bias]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
+    known = np.array([GYRO_BIAS, ACCEL_BIAS]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
     sigma = np.sqrt(np.median(steps[:, [GYRO_VARIANCE, ACCEL_VARIANCE]], axis=0))  # of a whole sample: the first and last are cut
     off = _beyond(steps, biases, known)
-    if not seen and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > config.energy:
+    if not seen and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > _ENERGY:
         return False
     spread = np.maximum(sigma, steps[:, 1:7].std(axis=0).reshape(2, 3).max(axis=1))
     latest = steps[-max(len(steps) // _LATEST, 2):]
@@ -67,6 +69,6 @@ def _beyond(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> 
     return np.maximum(np.abs([np.linalg.norm(mean[:3]), np.linalg.norm(mean[3:]) - GRAVITY]) - known, 0.0)
 
 
-def window(config: RestConfig, imu: ImuBuffer, end: int) -> np.ndarray:
+def window(imu: ImuBuffer, end: int) -> np.ndarray:
     """The steps over which rest at a stamp `end` [ns] is judged, shape (m, 9)."""
-    return imu.run(max(imu.oldest, end - round(config.window * 1e9)), end)
+    return imu.run(max(imu.oldest, end - round(WINDOW * 1e9)), end)

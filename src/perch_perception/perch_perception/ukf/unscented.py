@@ -21,6 +21,8 @@ from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.measurement import VioPose
 
+# van der Merwe's spread of the sigma points: with alpha = 1 no weight is negative; beta = 2 is that of a Gaussian
+ALPHA, BETA, KAPPA = 1.0, 2.0, 0.0
 # columns of a run of IMU steps
 DT, GYRO, ACCEL, GYRO_VARIANCE, ACCEL_VARIANCE = 0, slice(1, 4), slice(4, 7), 7, 8
 
@@ -67,11 +69,11 @@ class UnscentedTransform:
     def __init__(self, config: UkfConfig) -> None:
         self.config = config
         n = at.ERROR_SIZE
-        spread = config.alpha**2 * (n + config.kappa) - n
+        spread = ALPHA**2 * (n + KAPPA) - n
         self.Wm = np.full(2 * n + 1, 0.5 / (n + spread))  # weights for the mean, and for the covariance
         self.Wc = self.Wm.copy()
         self.Wm[0] = spread / (n + spread)
-        self.Wc[0] = self.Wm[0] + (1.0 - config.alpha**2 + config.beta)
+        self.Wc[0] = self.Wm[0] + (1.0 - ALPHA**2 + BETA)
         self.scale = 0.5 / self.Wm[1]
 
     def predict(self, belief: Belief, run: np.ndarray, stamp: int) -> Belief:

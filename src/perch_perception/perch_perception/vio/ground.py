@@ -14,12 +14,14 @@ from perch_perception.vio.bearing import POINT, Bearings, residuals
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.msckf import Msckf
 
+SIGMA = 0.005         # of the ground about its plane: a level floor [m]
+_LEAST_HEIGHT = 0.08  # a camera that stands lower sees a blur [m]
 _STEEP = 0.35        # least sine of a ray below the horizon
 _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
 _POSE = np.r_[0:6]   # theta, p
 
 
-def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, sigma: float, least_height: float) -> int:
+def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float) -> int:
     """Take points of the ground into the state of a vehicle that stands on it.
 
     A point is where its ray meets the plane z = floor. Two rows of its bearing's residual and one of the plane determine it:
@@ -30,8 +32,6 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
         ids: numbers of the features, shape (n,).
         bearings: their bearings while it stood.
         floor: height of the ground in W [m].
-        sigma: of a point of the ground about that plane [m].
-        least_height: of the camera above the ground; below, nothing is taken in [m].
 
     Returns:
         How many points were taken in.
@@ -39,7 +39,7 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
     s, limits = filter.state, filter.config.filter
     centre = s.p_WB + s.R_WB @ s.p_BC
     height = float(centre[2] - floor)
-    if height < least_height or not len(ids):
+    if height < _LEAST_HEIGHT or not len(ids):
         return 0
     rays = bearings.b_C @ (s.R_WB @ s.R_BC).T
     spread, chosen = Spread({}, limits.landmarks), list[int]()
@@ -57,7 +57,7 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float, si
     noise = np.ones(n) if bearings.noise is None else bearings.noise[chosen]
     for k, i in enumerate(chosen):
         inverse = np.linalg.inv(np.vstack([linear.J[k, :, POINT], [0.0, 0.0, 1.0]]))
-        variance = np.diag([(noise[k] * filter.sigma) ** 2, (noise[k] * filter.sigma) ** 2, sigma**2])
+        variance = np.diag([(noise[k] * filter.sigma) ** 2, (noise[k] * filter.sigma) ** 2, SIGMA**2])
         J = -inverse[:, :2] @ linear.J[k, :, : POINT.start]
         cross = J @ s.P[columns]
         own = J @ s.P[np.ix_(columns, columns)] @ J.T + inverse @ variance @ inverse.T

@@ -33,6 +33,7 @@ from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Tracks
 from perch_perception.vio.triangulation import triangulate
 
+DURATION = 0.5       # of the frames after which a start is tried first [s]
 _TRACK_NOISE = 1.0  # 1 sigma of a track about its point over the frames of a start [px]
 _LEAST_FEATURES = 12
 _LEAST_FRAMES = 6
@@ -181,7 +182,7 @@ class MotionStart:
         self._tracks.take_ended(ids)
         self._tracks.observe(frame, ids, bearings)
         self._stamps[frame] = stamp
-        oldest = stamp - round(1e9 * _LONGEST * self._config.start.motion_time)
+        oldest = stamp - round(1e9 * _LONGEST * DURATION)
         self._stamps = {f: s for f, s in self._stamps.items() if s >= oldest}
         self._tracks.forget_before(min(self._stamps))
 
@@ -195,7 +196,7 @@ class MotionStart:
         if max(self._stamps.values()) < self._next:
             return None
         for stretch in (1.0, _LONGEST):  # as short as it can be: tracks end, and noise grows
-            frames = self._frames(imu, stretch * self._config.start.motion_time)
+            frames = self._frames(imu, stretch * DURATION)
             state = None if frames is None else self._solve(frames, imu, known)
             if state is not None:
                 return state
@@ -234,7 +235,7 @@ class MotionStart:
             dR @ self._mount.p_BC, all_rays, there, sigma, self._config.imu.accel_bias_init)
         steps = [imu.run(self._stamps[i], self._stamps[j]) for i, j in zip(frames[:-1], frames[1:])]
         refined: list[Refined] = []
-        self._next = self._stamps[frames[-1]] + round(1e9 * _PAUSE * self._config.start.motion_time)
+        self._next = self._stamps[frames[-1]] + round(1e9 * _PAUSE * DURATION)
         for end in ends:
             x = self._refined(end, parts, steps, place) if end.residual < 2 * sigma else None
             if x is not None and x.scale > 2.0 * _SCALE:

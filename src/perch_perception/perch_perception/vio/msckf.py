@@ -22,6 +22,7 @@ from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
 
+_GATE = 0.99  # chi2 of a track or landmark
 _PARALLAX = 1.0  # of a triangulated point [deg]
 _NEW_LANDMARKS = 5  # per frame, at most
 _MOST_TRACKS = 12  # ended tracks used per frame
@@ -58,7 +59,7 @@ class Msckf:
         self.tracks = Tracks()
         self.sigma = config.filter.pixel_noise / focal_length
         self.sliding = Sliding(config.filter, focal_length)
-        self._gate = ekf.Gate(config.filter.gate_probability)
+        self._gate = ekf.Gate(_GATE)
         self._used: set[int] = set()  # features whose information is in the state already
 
     def propagate(self, rows: np.ndarray, stamp: int) -> None:

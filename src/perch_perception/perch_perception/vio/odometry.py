@@ -14,7 +14,7 @@ from perch_core import so3
 from perch_core.camera import Camera, CameraMount
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
-from perch_perception.ukf.stillness import energy, still, window
+from perch_perception.ukf.stillness import ACCEL_BIAS, GYRO_BIAS, WINDOW, energy, still, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -35,6 +35,10 @@ _DARK = 0.15  # time without a visual update that is blindness where nothing is 
 _BLIND = 0.5  # the same whatever is tracked [s]
 _LEAVING = 1.0  # from rest on, in which a take-off may go on blind [s]
 _LEAVING_VELOCITY = 0.05  # 1 sigma up to which it may [m/s]
+_FATES = 15  # frames over which observations that are refused and used are counted
+_REFUSED = 20  # a run ends where more are refused than used, and than this
+_LOST_VELOCITY = 1.0  # 1 sigma that ends a run [m/s]
+_SPEED = 25.0  # faster flies no vehicle that this is for: the filter has diverged [m/s]
 _STANDS = 0.8  # what is seen not to move for so long stands, however it is shaken [s]
 _FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
@@ -59,8 +63,8 @@ class VisualInertialOdometry:
         self.config = config
         self.filter: Msckf | None = None
         self.restarts = 0
-        self._imu = ImuBuffer(config.imu, config.faults, 2.0 + config.start.motion_time)
-        self._known = start.told(config, p_WB, yaw)
+        self._imu = ImuBuffer(config.imu, 2.0 + motion_start.DURATION)
+        self._known = start.told(p_WB, yaw)
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposed, features) of frames at rest that the filter has not passed
         self._seen: deque[tuple[int, Features]] = deque()   # frames over which motion in view is judged
@@ -73,7 +77,7 @@ class VisualInertialOdometry:
         self._last_image = -1           # stamp of the last frame used, on the board's clock
         self._last_exposed: int | None = None
         self._informed = 0              # when vision or rest last updated the filter
-        self._fates: deque[tuple[int, int]] = deque(maxlen=self.config.loss.frames)  # observations used and refused
+        self._fates: deque[tuple[int, int]] = deque(maxlen=_FATES)  # observations used and refused
         self._look_through(mount)
 
     def _look_through(self, mount: CameraMount) -> None:
@@ -183,9 +187,9 @@ class VisualInertialOdometry:
 
     def _try_start(self, exposed: int, features: Features) -> VioResult:
         """Start at rest or, when the vehicle moves, from the frames of the last half second and more."""
-        steps = window(self.config.rest, self._imu, exposed)
+        steps = window(self._imu, exposed)
         biases, variance = self._biases or (None, None)
-        if self._quiet() is not False and still(self.config.rest, steps, biases, variance, bool(self._quiet(_STANDS))):
+        if self._quiet() is not False and still(steps, biases, variance, bool(self._quiet(_STANDS))):
             self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known_with(steps[:, GYRO].mean(axis=0))))
             return self._hold(exposed, features)
         self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
@@ -237,21 +241,20 @@ class VisualInertialOdometry:
             return False
         quiet = self._quiet()
         return (quiet is not False and (self._resting or rest.can_stand(state))
-                and still(self.config.rest, window(self.config.rest, self._imu, exposed), *_biases(state),
+                and still(window(self._imu, exposed), *_biases(state),
                           seen=bool(quiet) and (self._resting or bool(self._quiet(_STANDS)))))
 
-    def _quiet(self, duration: float | None = None) -> bool | None:
+    def _quiet(self, duration: float = WINDOW) -> bool | None:
         """Whether nothing has moved in the image for so long [s], whatever the gyro says; None where there is nothing in it.
 
         A hover, too, stands still for the duration in which rest is judged, which is the default: it is not for the image alone to say.
         """
-        span = duration or self.config.rest.window
         until, now = self._seen[-1]
-        since, then = next(((t, f) for t, f in reversed(self._seen) if t <= until - round(0.8e9 * span)), self._seen[0])
+        since, then = next(((t, f) for t, f in reversed(self._seen) if t <= until - round(0.8e9 * duration)), self._seen[0])
         if len(now.ids) < _LEAST_TRACKS:
             return None
         _, i, j = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
-        if len(i) < _LEAST_TRACKS or until - since < round(0.8e9 * span):
+        if len(i) < _LEAST_TRACKS or until - since < round(0.8e9 * duration):
             return False
         return float(np.median(np.linalg.norm(now.pixels[j] - then.pixels[i], axis=1))) < _REST_MOTION
 
@@ -270,7 +273,7 @@ class VisualInertialOdometry:
             self._views.clear()
         steps = self._imu.run(state.stamp, until)
         if len(steps):
-            shaken = max(1.0, energy(window(self.config.rest, self._imu, exposed)))
+            shaken = max(1.0, energy(window(self._imu, exposed)))
             rest.hold(filter, steps, until, shaken)
         self._informed = exposed
         self._views.append((exposed, features))
@@ -290,10 +293,7 @@ class VisualInertialOdometry:
             return
         known = np.isin(view.ids, features.ids)
         known[len(view.ids) - view.new:] = False
-        s = self.config.start
-        seen = self._observe(view)
-        ground.take_in(self._running, view.ids[known], seen.chosen(known), floor,
-                       s.ground_sigma, s.ground_least_height)
+        ground.take_in(self._running, view.ids[known], self._observe(view).chosen(known), floor)
 
     def _observe(self, features: Features) -> Bearings:
         """Bearings; 1 sigma of each is the declared `pixel_noise` or, where that is larger, what the image's noise makes of its patch."""
@@ -302,7 +302,7 @@ class VisualInertialOdometry:
 
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
         """Whether the filter still sees, or has to start again."""
-        loss, s = self.config.loss, self._running.state
+        s = self._running.state
         if report.used:
             self._informed = exposed
         self._fates.append((report.used, report.refused))
@@ -312,13 +312,13 @@ class VisualInertialOdometry:
         why = ""
         if not np.isfinite(s.P).all() or not np.isfinite(s.p_WB).all():
             why = "state is not finite"
-        elif refused > max(used, loss.refused):
+        elif refused > max(used, _REFUSED):
             why = f"{refused} observations refused and {used} used in {len(self._fates)} frames"
-        elif sigma[at.VELOCITY].max() > loss.restart_velocity:
+        elif sigma[at.VELOCITY].max() > _LOST_VELOCITY:
             why = f"velocity known only to {sigma[at.VELOCITY].max():.1f} m/s"
-        elif speed > loss.speed:
+        elif speed > _SPEED:
             why = f"a speed of {speed:.1f} m/s"
-        elif gyro > 2.0 * self.config.rest.gyro_bias or accel > 2.0 * self.config.rest.accel_bias:
+        elif gyro > 2.0 * GYRO_BIAS or accel > 2.0 * ACCEL_BIAS:
             why = f"biases of {gyro:.2f} rad/s and {accel:.1f} m/s^2: gravity and motion do not fit"
         if why:
             return self._lose(features, why)
@@ -338,8 +338,8 @@ class VisualInertialOdometry:
     def _forget_state(self) -> None:
         self._know()
         s = self._running.state
-        speed, most = float(np.linalg.norm(s.v_WB)), self.config.loss.speed
-        self._lost = s.stamp, speed if speed < most else most
+        speed = float(np.linalg.norm(s.v_WB))
+        self._lost = s.stamp, speed if speed < _SPEED else _SPEED
         self._await()
         self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
 

@@ -9,12 +9,16 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.vehicle import GRAVITY
 
-from perch_perception.ukf.stillness import energy
+from perch_perception.ukf.stillness import VELOCITY, energy
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.state import State
+
+
+# 1 sigma of (p, heading) as given: they define W, so hardly any; not none, which would make the covariance singular [m, rad]
+TOLD_SIGMA = (0.001, 0.001, 0.001, 0.001)
 
 
 @dataclass(frozen=True)
@@ -32,10 +36,9 @@ class KnownPose:
     covariance: np.ndarray
 
 
-def told(config: VioConfig, p_WB: np.ndarray, yaw: float) -> KnownPose:
+def told(p_WB: np.ndarray, yaw: float) -> KnownPose:
     """The pose at the start as somebody gives it: position [m], shape (3,), and yaw [rad]."""
-    s = config.start
-    return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag([s.position_sigma**2] * 3 + [s.yaw_sigma**2]))
+    return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag(np.square(TOLD_SIGMA)))
 
 
 def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
@@ -79,7 +82,7 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     imu, T = config.imu, steps[:, DT].sum()
     shaken = max(1.0, energy(steps))
     gyro_sigma = imu.gyro_noise_density * np.sqrt(shaken / T)
-    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, config.rest.velocity, gyro_sigma)
+    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, VELOCITY, gyro_sigma)
     # a bias that shows along g is, as far as anybody knows, no smaller across it
     accel_sigma = max(imu.accel_bias_init, abs(float(np.linalg.norm(accel)) - GRAVITY))
     state.P[at.ACCEL_BIAS, at.ACCEL_BIAS] = accel_sigma**2 * np.eye(3)

@@ -22,6 +22,15 @@ from perch_core.camera import Camera
 from perch_perception.vio.bearing import observe
 from perch_perception.vio.config import TrackerConfig
 
+_REFILL = 0.85  # new features are detected below this share of those to keep up
+_SPACING = 18.0  # least distance between features [px]
+_CROWDING = 0.6  # features nearer to an older one than this share of the spacing are let go
+_FLATTEN = 20.0  # sigma over which brightness is averaged and taken off (vignetting, shadows) [px]
+_QUALITY = 0.01  # least corner strength, share of the strongest
+_NOISE_FACTOR = 8.0  # the same, in corners that noise alone makes
+_WINDOW = 21  # side of the tracked patch [px]
+_LEVELS = 3  # pyramid levels above the image
+_REFERENCE_CHANGE = 8.0  # motion apart that asks for a new reference [px]
 _SMOOTHING = 1.5  # sigma of the smoothing before detection [px]
 _REACH = 1.5  # largest correction by the reference frame's patch [px]
 _RETURNS = 0.7  # tracking there and back ends this close [px]
@@ -46,10 +55,10 @@ def _noise(image: np.ndarray) -> float:
     return float(np.median(np.abs(second))) / (0.6745 * np.sqrt(6.0))
 
 
-def flattened(image: np.ndarray, scale: float) -> np.ndarray:
-    """An image less its brightness averaged over `scale` [px, 1 sigma], about mid-grey; uint8 (height, width)."""
+def flattened(image: np.ndarray) -> np.ndarray:
+    """An image less the average brightness of the surroundings, about mid-grey; uint8 (height, width)."""
     small = cv2.resize(image, None, fx=1 / _FLAT_STEP, fy=1 / _FLAT_STEP, interpolation=cv2.INTER_AREA)
-    surroundings = cv2.resize(cv2.GaussianBlur(small, (0, 0), scale / _FLAT_STEP), image.shape[::-1])
+    surroundings = cv2.resize(cv2.GaussianBlur(small, (0, 0), _FLATTEN / _FLAT_STEP), image.shape[::-1])
     return cv2.addWeighted(image, 1.0, surroundings, -1.0, _MID_GREY)
 
 
@@ -101,27 +110,26 @@ class Tracker:
             R_now_before: rotation of the camera since the frame before, takes rays of then into C of now, (3, 3).
             slack: what it may be wrong by [rad].
         """
-        if self.config.flatten > 0.0:
-            image = flattened(image, self.config.flatten)
+        image = flattened(image)
         if self._previous is not None and len(self._pixels):
             self._follow(self._previous, image, R_now_before, slack)
             self._return_to_reference(image)
             self._thin()
         self._previous = image
         new = 0
-        if len(self._pixels) < self.config.features * self.config.refill:
+        if len(self._pixels) < self.config.features * _REFILL:
             new = self._refill(image)
         self._choose_reference(image)
         self.latest = Features(self._ids, self._pixels.astype(float), new, self._fit_sigma(image))
         return self.latest
 
     def _follow(self, previous: np.ndarray, image: np.ndarray, R_now_before: np.ndarray, slack: float) -> None:
-        c, rays = self.config, observe(self.camera, self._pixels).b_C @ R_now_before.T
+        rays = observe(self.camera, self._pixels).b_C @ R_now_before.T
         guess, valid = self.camera.project(rays)
         # what has left the view would be searched for longest
-        kept = valid & self.camera.contains(guess, -c.window)
+        kept = valid & self.camera.contains(guess, -_WINDOW)
         before, ids, rays, guess = self._pixels[kept], self._ids[kept], rays[kept], guess[kept].astype(np.float32)
-        after, found = self._search(previous, image, before, guess, c.levels)
+        after, found = self._search(previous, image, before, guess, _LEVELS)
         place = np.clip(np.nan_to_num(np.rint(after), nan=-1.0, posinf=-1, neginf=-1), 0,
                         [image.shape[1] - 1, image.shape[0] - 1]).astype(int)
         good = found & self.camera.contains(after) & (self._view[place[:, 1], place[:, 0]] > 0)
@@ -136,7 +144,7 @@ class Tracker:
         if not len(pixels):
             return np.zeros((0, 2), np.float32), np.zeros(0, bool)
         found_at, found, _ = cv2.calcOpticalFlowPyrLK(
-            source, image, pixels.reshape(-1, 1, 2), guess.reshape(-1, 1, 2).copy(), winSize=(self.config.window,) * 2,
+            source, image, pixels.reshape(-1, 1, 2), guess.reshape(-1, 1, 2).copy(), winSize=(_WINDOW,) * 2,
             maxLevel=levels, criteria=stop, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
         return found_at.reshape(-1, 2), found.ravel() > 0
 
@@ -156,8 +164,8 @@ class Tracker:
         As the vehicle rises, those from the ground draw together under it: at 4 m all of them lay in a spot 15 deg wide, which
         knows height and heading hardly and is out of view at the first fast turn. What goes makes room for others elsewhere.
         """
-        least = self.config.crowding * self.config.spacing
-        if least <= 0.0 or len(self._pixels) < 2:
+        least = _CROWDING * _SPACING
+        if len(self._pixels) < 2:
             return
         between = np.linalg.norm(self._pixels[:, None] - self._pixels[None], axis=2)
         kept = np.ones(len(self._ids), bool)
@@ -171,7 +179,7 @@ class Tracker:
         if self._reference is not None and len(shared) > 0.6 * len(self._ids):
             moves = self._pixels[shared] - np.array([self._origins[self._ids[k]] for k in shared])
             # a common shift leaves the patches alike; spread means that they turn or change their size
-            if np.median(np.linalg.norm(moves - np.median(moves, axis=0), axis=1)) < self.config.reference_change:
+            if np.median(np.linalg.norm(moves - np.median(moves, axis=0), axis=1)) < _REFERENCE_CHANGE:
                 return
         self._reference = image
         self._origins = dict(zip(self._ids.tolist(), self._pixels.copy()))
@@ -204,9 +212,9 @@ class Tracker:
             return np.zeros(0)
         # KLT has the matrix; from an image to itself there is nothing to search for
         _, _, least = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
-            image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(self.config.window,) * 2, maxLevel=0,
+            image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(_WINDOW,) * 2, maxLevel=0,
             flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-        information = _KLT_EIGENVALUE * self.config.window**2 * least.ravel().astype(float)
+        information = _KLT_EIGENVALUE * _WINDOW**2 * least.ravel().astype(float)
         return _noise(image) / np.sqrt(np.maximum(information, np.finfo(np.float32).tiny))
 
     def _refill(self, image: np.ndarray) -> int:
@@ -214,16 +222,16 @@ class Tracker:
 
         At half the resolution: the smoothing leaves nothing that needs more, and it costs a quarter.
         """
-        c, mask, noise = self.config, self._view[::2, ::2].copy(), _noise(image)
+        mask, noise = self._view[::2, ::2].copy(), _noise(image)
         for x, y in self._pixels:
-            cv2.circle(mask, (round(x / 2), round(y / 2)), int(c.spacing / 2), 0, -1)
+            cv2.circle(mask, (round(x / 2), round(y / 2)), int(_SPACING / 2), 0, -1)
         half = cv2.pyrDown(image)
         half = cv2.GaussianBlur(half, (0, 0), 0.5 * np.sqrt(_SMOOTHING**2 - _HALVING**2))
         corners, strength = cv2.goodFeaturesToTrackWithQuality(
-            half, c.features - len(self._pixels), c.quality, c.spacing / 2, mask, blockSize=3)
+            half, self.config.features - len(self._pixels), _QUALITY, _SPACING / 2, mask, blockSize=3)
         if corners is None:
             return 0
-        strong = strength.ravel() > c.noise_factor * _NOISE_CORNER * noise**2
+        strong = strength.ravel() > _NOISE_FACTOR * _NOISE_CORNER * noise**2
         corners = 2.0 * corners.reshape(-1, 2)[strong].astype(np.float32)
         self._pixels = np.concatenate([self._pixels, corners])
         self._ids = np.concatenate([self._ids, np.arange(self._next, self._next + len(corners))])
