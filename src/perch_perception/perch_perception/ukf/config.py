@@ -43,7 +43,7 @@ class VioNoise:
 class UkfConfig:
     """The estimator's filter."""
 
-    sensors: str = text("", doc="sensor file, config/sensors/<name>.yaml or a path: noise and axes of the IMU; empty: an MPU-9250, x forward, z up")
+    sensors: str = text("", doc="sensor file, config/sensors/<name>.yaml or a path: noise and axes of the IMU; empty: noise of an MPU-9250")
     imu: ImuNoise = derived(ImuNoise())
     vio: VioNoise = part(VioNoise)
     gate_probability: float = quantity(0.999, above=0.0, high=0.999999, doc="chi2 gate of the innovation")

@@ -15,8 +15,8 @@ from perch_core import so3
 from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import layout as at
-from perch_perception.ukf import stillness
 from perch_perception.ukf.config import UkfConfig
+from perch_perception.ukf.stillness import REST_VELOCITY
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO, Belief, Innovation, UnscentedTransform
 
 
@@ -24,7 +24,7 @@ def stopped(belief: Belief, config: UkfConfig) -> Belief | None:
     """The belief of a vehicle that has come to rest; None: it knows that the vehicle moves, steadily."""
     H = np.zeros((3, at.ERROR_SIZE))
     H[:, at.D_VELOCITY] = np.eye(3)
-    innovation = _innovation(belief, H, -belief.x[at.VELOCITY], np.full(3, stillness.VELOCITY**2))
+    innovation = _innovation(belief, H, -belief.x[at.VELOCITY], np.full(3, REST_VELOCITY**2))
     return UnscentedTransform.correct(belief, innovation) if innovation.nis < chi2_quantile(config.gate_probability, 3) else None
 
 
@@ -34,7 +34,7 @@ def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> 
     T, d = float(steps[:, DT].sum()), np.arange(3)
     x[at.VELOCITY] = 0.0
     P[at.D_VELOCITY, :] = P[:, at.D_VELOCITY] = 0.0
-    P[at.D_VELOCITY, at.D_VELOCITY] = stillness.VELOCITY**2 * np.eye(3)  # how it trembles now says nothing of then
+    P[at.D_VELOCITY, at.D_VELOCITY] = REST_VELOCITY**2 * np.eye(3)  # how it trembles now says nothing of then
     P[9 + d, 9 + d] += imu.gyro_bias_walk**2 * T
     P[12 + d, 12 + d] += imu.accel_bias_walk**2 * T
     up_B = so3.quat_rotate(so3.quat_conjugate(x[at.QUATERNION]), np.array([0.0, 0.0, GRAVITY]))

@@ -21,9 +21,9 @@ from perch_core.vehicle import GRAVITY
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.ukf.unscented import ACCEL, ACCEL_VARIANCE, DT, GYRO, GYRO_VARIANCE
 
-WINDOW = 0.2                       # IMU over which rest is judged [s]
-VELOCITY = 0.002                   # 1 sigma of the velocity at rest [m/s]
-GYRO_BIAS, ACCEL_BIAS = 0.35, 1.5  # largest turn-on biases of MEMS sensors: 20 deg/s, 150 mg [rad/s, m/s^2]
+WINDOW = 0.2           # IMU over which rest is judged [s]
+REST_VELOCITY = 0.002  # 1 sigma of the velocity at rest [m/s]
+MOST_GYRO_BIAS, MOST_ACCEL_BIAS = 0.35, 1.5  # largest turn-on biases of MEMS sensors: 20 deg/s, 150 mg [rad/s, m/s^2]
 _ENERGY = 1.8   # most of T / 6: 1 is rest
 _LEAST = 10     # samples
 _ENTIRE = 0.9   # share of the window that must be there
@@ -51,7 +51,7 @@ def still(steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndar
     """
     if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * WINDOW:
         return False
-    known = np.array([GYRO_BIAS, ACCEL_BIAS]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
+    known = np.array([MOST_GYRO_BIAS, MOST_ACCEL_BIAS]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
     sigma = np.sqrt(np.median(steps[:, [GYRO_VARIANCE, ACCEL_VARIANCE]], axis=0))  # of a whole sample: the first and last are cut
     off = _beyond(steps, biases, known)
     if not seen and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > _ENERGY:

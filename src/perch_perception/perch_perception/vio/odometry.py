@@ -14,7 +14,7 @@ from perch_core import so3
 from perch_core.camera import Camera, CameraMount
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
-from perch_perception.ukf.stillness import ACCEL_BIAS, GYRO_BIAS, WINDOW, energy, still, window
+from perch_perception.ukf.stillness import MOST_ACCEL_BIAS, MOST_GYRO_BIAS, WINDOW, energy, still, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -318,7 +318,7 @@ class VisualInertialOdometry:
             why = f"velocity known only to {sigma[at.VELOCITY].max():.1f} m/s"
         elif speed > _SPEED:
             why = f"a speed of {speed:.1f} m/s"
-        elif gyro > 2.0 * GYRO_BIAS or accel > 2.0 * ACCEL_BIAS:
+        elif gyro > 2.0 * MOST_GYRO_BIAS or accel > 2.0 * MOST_ACCEL_BIAS:
             why = f"biases of {gyro:.2f} rad/s and {accel:.1f} m/s^2: gravity and motion do not fit"
         if why:
             return self._lose(features, why)

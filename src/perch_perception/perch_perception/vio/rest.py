@@ -11,7 +11,7 @@ from perch_core import so3
 from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 
-from perch_perception.ukf.stillness import VELOCITY
+from perch_perception.ukf.stillness import REST_VELOCITY
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import state as at
 from perch_perception.vio.msckf import Msckf
@@ -30,7 +30,7 @@ def stop(filter: Msckf) -> None:
     """The vehicle has come to rest at the state's stamp: what its velocity was wrong by, it was wrong by before."""
     s = filter.state
     s.drop_clones(list(range(len(s.clones))))
-    filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, VELOCITY**2)
+    filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, REST_VELOCITY**2)
 
 
 def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
@@ -42,7 +42,7 @@ def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
     T = float(steps[:, DT].sum())
     s.v_WB, s.w_WB_B = np.zeros(3), np.zeros(3)
     s.P[at.VELOCITY, :] = s.P[:, at.VELOCITY] = 0.0
-    s.P[at.VELOCITY, at.VELOCITY] = VELOCITY**2 * np.eye(3)
+    s.P[at.VELOCITY, at.VELOCITY] = REST_VELOCITY**2 * np.eye(3)
     s.P[_BIASES, _BIASES] += np.repeat([imu.gyro_bias_walk**2 * T, imu.accel_bias_walk**2 * T], 3)
     up_B = s.R_WB.T @ np.array([0.0, 0.0, GRAVITY])
     H = np.zeros((6, at.INERTIAL_SIZE))

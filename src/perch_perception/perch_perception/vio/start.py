@@ -9,7 +9,7 @@ from perch_core import so3
 from perch_core.camera import CameraMount
 from perch_core.vehicle import GRAVITY
 
-from perch_perception.ukf.stillness import VELOCITY, energy
+from perch_perception.ukf.stillness import REST_VELOCITY, energy
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
@@ -82,7 +82,7 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     imu, T = config.imu, steps[:, DT].sum()
     shaken = max(1.0, energy(steps))
     gyro_sigma = imu.gyro_noise_density * np.sqrt(shaken / T)
-    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, VELOCITY, gyro_sigma)
+    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, REST_VELOCITY, gyro_sigma)
     # a bias that shows along g is, as far as anybody knows, no smaller across it
     accel_sigma = max(imu.accel_bias_init, abs(float(np.linalg.norm(accel)) - GRAVITY))
     state.P[at.ACCEL_BIAS, at.ACCEL_BIAS] = accel_sigma**2 * np.eye(3)
