@@ -21,21 +21,20 @@ from perch_control.geometric import GeometricController  # noqa: E402
 from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings  # noqa: E402
 from perch_control.reference import FlatReference  # noqa: E402
 from perch_control.rotor_lag import RotorEstimate  # noqa: E402
-from perch_control.settings import GeometricGains  # noqa: E402
-from perch_core.vehicle import load_vehicle  # noqa: E402
+from perch_core.vehicle import ControlGains, load_vehicle  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 
 
 def _geometric() -> GeometricController:
-    return GeometricController(VEHICLE, GeometricGains())
+    return GeometricController(VEHICLE, ControlGains())
 
 
 def _nmpc(thrust_states: bool = False, lines: bool = False) -> NmpcController:
     if lines:
         vehicle, weights = load_vehicle("rpg"), LineWeights(perception=1500.0, visibility=200.0, collision=2000.0)
-        return NmpcController(vehicle, NmpcSettings(lines=weights), GeometricController(vehicle, GeometricGains()))
-    return NmpcController(VEHICLE, NmpcSettings(thrust_states=thrust_states), _geometric())
+        return NmpcController(vehicle, NmpcSettings(lines=weights), GeometricController(vehicle, ControlGains()))
+    return NmpcController(VEHICLE, NmpcSettings(), _geometric(), thrust_states)
 
 
 def _timed(law) -> tuple[list[float], list[float]]:

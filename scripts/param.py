@@ -11,8 +11,8 @@ from ros_graph.commands import add_spin_time, main, parser
 EXAMPLES = """examples:
   python3 scripts/param.py list /controller
   python3 scripts/param.py describe /controller
-  python3 scripts/param.py get /controller snapdragon.position
-  python3 scripts/param.py set /controller snapdragon.position '[8.0, 8.0, 10.0]'
+  python3 scripts/param.py get /controller gains.position
+  python3 scripts/param.py set /controller gains.position '[8.0, 8.0, 10.0]'
   python3 scripts/param.py dump /controller > controller.yaml
 """
 HANDLERS = {

@@ -22,10 +22,9 @@ from perch_control.nmpc import NmpcController, NmpcSettings
 from perch_control.parameters import ControllerChoice, ControllerParameters
 from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
-from perch_control.settings import GeometricGains
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import OdometryState, seconds
-from perch_core.vehicle import Vehicle, load_vehicle
+from perch_core.vehicle import ControlGains, Vehicle, load_vehicle
 from perch_eval.in_process import Loop as FlightLoop
 from closed_loop.truth import TruthEstimator
 from perch_sim.lockstep import Task
@@ -144,17 +143,17 @@ class Loop:
         return np.sqrt(np.mean((np.array(self.states)[:, :3] - np.array(self.references)) ** 2, axis=0))
 
 
-def predictive(vehicle: Vehicle | None = None, **settings: Any) -> NmpcController:
+def predictive(vehicle: Vehicle | None = None, thrust_states: bool = False, **settings: Any) -> NmpcController:
     """The predictive controller with some settings of its own; the Snapdragon vehicle by default."""
     vehicle = vehicle or load_vehicle("snapdragon")
-    return NmpcController(vehicle, NmpcSettings(**settings), GeometricController(vehicle, GeometricGains()))
+    return NmpcController(vehicle, NmpcSettings(**settings), GeometricController(vehicle, ControlGains()), thrust_states)
 
 
 def make_loop(vehicle: Vehicle | None = None, p=(0.0, 0.0, 0.0), disturbances: Disturbances | None = None,
               noise_seed: int | None = None, settings: FlightSettings | None = None, law=None, **plant) -> Loop:
     """A vehicle at rest on the ground with its controller."""
     vehicle = vehicle or load_vehicle("snapdragon")
-    gains = GeometricGains()
+    gains = ControlGains()
     component = Controller(ControllerParameters(vehicle=vehicle.name, controller=EVERY_STEP, flight=settings or FlightSettings()))
     if law is not None:
         component.flight.use(law, gains, settings or FlightSettings())

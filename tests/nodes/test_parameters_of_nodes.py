@@ -9,7 +9,7 @@ def test_a_parameter_is_described_before_and_after_a_refusal_alike(graph):
     def param(*arguments):
         return fork_script("param.py", *arguments, "--spin-time", "60")
 
-    name = "flight.odometry.timeout"
+    name = "flight.odometry_timeout"
     described = param("describe", "/controller", name).stdout
     assert "double, to 5, [s], > 0" in described
     refused = param("set", "/controller", name, "50.0")

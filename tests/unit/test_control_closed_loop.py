@@ -33,11 +33,10 @@ def test_perch_at_90_deg_holds_with_estimation_errors(seed):
 def test_without_rehearsal_the_vehicle_pushes_itself_off_the_wall():
     """Why the rehearsal is there: stopping the rotation takes thrust that points away from the wall."""
     from perch_control.geometric import GeometricController
-    from perch_control.settings import GeometricGains
-    from perch_core.vehicle import load_vehicle
+    from perch_core.vehicle import ControlGains, load_vehicle
 
     vehicle = load_vehicle("snapdragon")
-    plain = GeometricController(vehicle, GeometricGains(rehearse=False))
+    plain = GeometricController(vehicle, ControlGains(contact_speed=0.0))
     plan = perch("surface_90_1.7m")
     without, _ = fly_to_contact(plan, law=plain)
     rehearsed, _ = fly_to_contact(plan)

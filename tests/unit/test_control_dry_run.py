@@ -14,7 +14,7 @@ from perch_core.vehicle import load_vehicle
 
 def run_of(vehicle):
     params = ControllerParameters()
-    return dry_run(vehicle, params.gain_set(vehicle.name), params.flight, params.l1)
+    return dry_run(vehicle, params.gain_set, params.flight)
 
 
 @pytest.mark.parametrize("name", ["snapdragon", "rpg"])
@@ -35,7 +35,7 @@ def watched(self, signature):
     loaded.append(self.py_func.__name__)
     return compile(self, signature)
 dispatcher.Dispatcher.compile = watched
-args = vehicle, params.gain_set(vehicle.name), params.flight, params.l1
+args = vehicle, params.gain_set, params.flight
 dry_run(*args)
 first = len(loaded)
 dry_run(*args)

@@ -7,15 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perch_control.geometric import GeometricController, packed_vehicle
+from perch_control.geometric.controller import CONE_DEG
 from perch_control.geometric.law import attitude_error, geometric_step
 from perch_control.geometric.step import predicted
 from perch_control.reference import FlatReference, SampledReference, Setpoint, packed_many
 from perch_control.rotor_lag import RotorEstimate, leading_command, reachable, thrusts
-from perch_control.settings import GeometricGains
 from perch_core import rigid_body
 from perch_core.flatness import flat_to_state, heading_derivatives
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import ControlGains, load_vehicle
 
 VEHICLE = load_vehicle("snapdragon")
 J = tuple(VEHICLE.inertia)
@@ -122,20 +122,20 @@ def test_singular_cases_stay_finite(a, h, b3):
     q = Rotation.align_vectors([b3], [(0, 0, 1)])[0].as_quat()
     x = Setpoint((0.0, 0.0, 1.0), a=tuple(map(float, a)), j=(1.0, 2.0, 3.0), s=(5.0, 5.0, 5.0), h=tuple(map(float, h)))
     state = tuple(map(float, (0.1, -0.2, 1.1, 0.3, 0, -0.2, *q, 0.1, 0.2, 0.3)))
-    out = GeometricController(VEHICLE, GeometricGains()).step(state, x.packed, RotorEstimate((1000.0,) * 4, (1000.0,) * 4))
+    out = GeometricController(VEHICLE, ControlGains()).step(state, x.packed, RotorEstimate((1000.0,) * 4, (1000.0,) * 4))
     for value in (out.rotor_speed, out.wrench, out.q_C, out.w_C, out.dw_C):
         assert np.isfinite(value).all()
     assert all(VEHICLE.speed_min <= s <= VEHICLE.speed_max for s in out.rotor_speed)
 
 
 def test_feedback_never_turns_the_thrust_out_of_its_cone():
-    controller = GeometricController(VEHICLE, GeometricGains())
+    controller = GeometricController(VEHICLE, ControlGains())
     for seed in range(50):
         rng = np.random.default_rng(seed)
         state = tuple(float(v) for v in (*rng.normal(size=6) * 5, 0, 0, 0, 1, 0, 0, 0))
         out = controller.step(state, Setpoint((0.0, 0.0, 1.0)).packed, RotorEstimate((1260.0,) * 4, (1260.0,) * 4))
         tilt = np.degrees(np.arccos(Rotation.from_quat(out.q_C).as_matrix()[2, 2]))
-        assert tilt <= GeometricGains.cone_deg + 1e-6
+        assert tilt <= CONE_DEG + 1e-6
 
 
 def test_prediction_agrees_with_the_rigid_body_model():

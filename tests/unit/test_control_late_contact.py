@@ -24,7 +24,7 @@ def touch(name, farther):
     """
     plan, vehicle = perch(name), load_vehicle("snapdragon")
     params = NodeParameters(load_scenario("surface_90"), 1).of("controller", ControllerParameters)  # those that are flown
-    loop = make_loop(settings=params.flight, law=GeometricController(vehicle, params.snapdragon))
+    loop = make_loop(settings=params.flight, law=GeometricController(vehicle, params.gain_set))
     loop.begin_in_hover()
     loop.plant.floor = -10.0
     loop.follow(plan.trajectory, AtEnd.CONTACT)

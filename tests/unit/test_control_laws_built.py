@@ -12,7 +12,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.vehicle import load_vehicle
 
 PARAMETERS = ControllerParameters(controller=ControllerChoice(standby=False))
-CHANGED = replace(PARAMETERS, nmpc=replace(PARAMETERS.nmpc, nodes=10))
+CHANGED = replace(PARAMETERS, nmpc=replace(PARAMETERS.nmpc, horizon=0.5))
 
 
 def prepared() -> tuple[Assembly, list, list[str]]:

@@ -13,20 +13,20 @@ from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
-from perch_control.l1 import L1Augmentation, L1Settings
+from perch_control.l1 import L1Augmentation
 from perch_control.nmpc import LineWeights
+from perch_control.nmpc.controller import LINE_RAMP
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import StageLayout, stage
 from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
 from perch_control.reference import FlatReference, SampledReference
 from perch_control.rotor_lag import approached, lag_behind, leading_command
-from perch_control.settings import GeometricGains
 from perch_core import rigid_body, so3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
 from perch_core.timing import CONTROL_PERIOD
 from perch_core.trajectory import rest_to_rest
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import ControlGains, load_vehicle
 from perch_planner.powerline import problem
 from perch_sim.scenario import load_scenario
 
@@ -167,7 +167,7 @@ def test_perch_with_estimation_errors():
 
 
 def test_rotor_thrusts_and_body_rates_keep_their_limits():
-    law = predictive(rate_max=3.0)
+    law = predictive(replace(SNAPDRAGON, body_rate_max=2.5))
     loop = make_loop(law=law)
     loop.begin_in_hover()
     loop.plant.v = np.array([2.0, 0.0, 0.0])  # far from the reference: the limits act
@@ -191,7 +191,7 @@ def test_laws_switch_in_flight_without_a_jump():
     loop.follow(rest_to_rest(p, p + [2, 0, 0.5], 0, 0.4, 2.0))
     loop.run(0.8)
     flight, law = loop.controller, predictive()
-    for following in (law, GeometricController(SNAPDRAGON, GeometricGains()), law):
+    for following in (law, GeometricController(SNAPDRAGON, ControlGains()), law):
         before = np.array(flight.maneuvers.rotors.command)
         flight.use(following, flight.maneuvers.gains, flight.settings)
         loop.run(0.002)
@@ -207,10 +207,10 @@ def test_l1_cuts_the_error_under_wind_and_mass(law):
     """Issue 6: position RMSE under 5 m/s wind and +20 % mass at least 60 % smaller than without."""
     rmse = {}
     for adaptive in (False, True):
-        flown = predictive() if law == "nmpc" else GeometricController(SNAPDRAGON, GeometricGains())
+        flown = predictive() if law == "nmpc" else GeometricController(SNAPDRAGON, ControlGains())
         loop = make_loop(law=flown, disturbances=Disturbances(mass_factor=1.2, wind=(5.0, 0.0, 0.0)))
         if adaptive:
-            loop.controller.compensator = L1Augmentation(SNAPDRAGON, L1Settings())
+            loop.controller.compensator = L1Augmentation(SNAPDRAGON)
         rmse[adaptive] = loop.move_rmse()
     assert rmse[True] < 0.4 * rmse[False], rmse
 
@@ -218,7 +218,7 @@ def test_l1_cuts_the_error_under_wind_and_mass(law):
 def test_l1_finds_the_disturbance_that_acts():
     factors = (0.85, 1.0, 1.0, 1.0)
     loop = make_loop(disturbances=Disturbances(rotor_factor=factors, wind=(3.0, 0.0, 0.0)))
-    loop.controller.compensator = L1Augmentation(SNAPDRAGON, L1Settings())
+    loop.controller.compensator = L1Augmentation(SNAPDRAGON)
     loop.begin_in_hover()
     loop.run(2.0)
     k, vehicle = SNAPDRAGON.thrust_coefficient, SNAPDRAGON
@@ -234,10 +234,11 @@ def test_line_terms_lead_around_a_wire_that_the_reference_cuts():
     wire = Segment.between(np.array([1.5, -3.0, 1.25]), np.array([1.5, 3.0, 1.25]), 0.03)
     closest = {}
     for weight in (0.0, 2000.0):
-        law = predictive(RPG, lines=LineWeights(collision=weight, perception=1e-6, ramp_time=0.5), rate_max=5.0)
+        law = predictive(replace(RPG, body_rate_max=4.2), lines=LineWeights(collision=weight, perception=1e-6))
         law.lines(((*wire.centre, *wire.direction, wire.half_length, wire.radius),))
         loop = make_loop(vehicle=RPG, law=law)
         loop.begin_in_hover()
+        loop.run(LINE_RAMP)
         p = loop.plant.p.copy()
         loop.follow(rest_to_rest(p, p + [3.0, 0, 0], 0, 0, 4.0))
         loop.run(4.3)

@@ -8,7 +8,7 @@ import pytest
 from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd
-from perch_control.l1 import L1Augmentation, L1Settings
+from perch_control.l1 import L1Augmentation
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.comparison import fly
 
@@ -16,7 +16,7 @@ from perch_eval.control_flights.comparison import fly
 def hovering(adaptive):
     loop = make_loop(disturbances=Disturbances(mass_factor=1.2))
     if adaptive:
-        loop.controller.compensator = L1Augmentation(load_vehicle("snapdragon"), L1Settings())
+        loop.controller.compensator = L1Augmentation(load_vehicle("snapdragon"))
     loop.begin_in_hover()
     loop.run(3.0)
     return loop

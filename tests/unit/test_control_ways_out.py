@@ -9,11 +9,9 @@ from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.descent import BlindDescent
-from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
-from perch_control.settings import GeometricGains
 from perch_core.trajectory import rest_to_rest
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import ControlGains, load_vehicle
 from perch_eval.control_flights.comparison import fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
 from perch_eval.control_flights.way_out import search
@@ -51,7 +49,7 @@ def test_odometry_that_repeats_itself_ends_in_a_descent_that_brakes():
 
 def descent(v):
     vehicle = load_vehicle("snapdragon")
-    return BlindDescent(vehicle, GeometricGains(), FlightSettings(), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.0, v)
+    return BlindDescent(vehicle, ControlGains(), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.0, v)
 
 
 @pytest.mark.parametrize("blow, ends", [((60.0, 0.0, 9.0), False), ((0.0, 0.0, 60.0), True)])

@@ -10,10 +10,9 @@ import pytest
 from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, Order, TrajectoryRefused
-from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
 from perch_control.reference import FlatReference
-from perch_control.rotor_health import RotorHealth, RotorHealthSettings
+from perch_control.rotor_health import RotorHealth
 from perch_control.weak_landing import WeakLanding
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.vehicle import GRAVITY, load_vehicle
@@ -23,7 +22,7 @@ NOISE = 0.316  # of the accelerometer per sample [m/s^2]
 
 
 def health():
-    return RotorHealth(RotorHealthSettings(), 1.83)
+    return RotorHealth(1.83)
 
 
 def seen(loop, seed=0):
@@ -160,7 +159,7 @@ def test_one_rotor_that_is_far_weaker_refuses_a_perch(share, refused):
 def demand(v, height, left, tilt_deg=0.0):
     half = np.radians(tilt_deg) / 2
     state = (0.0, 0.0, height, *v, 0.0, float(np.sin(half)), 0.0, float(np.cos(half)), 0.0, 0.0, 0.0)
-    x = WeakLanding(FlightSettings().rotors, 0.35, state, 0.0)
+    x = WeakLanding(0.35, state, 0.0)
     x.update(state, left)
     return np.array(x.setpoint(0.0).a) + (0.0, 0.0, GRAVITY)
 

@@ -430,7 +430,7 @@ def test_laws_are_chosen_in_flight_when_they_are_built():
     built = job.function(*job.arguments)
     # Gains that change while it is being built are not lost.
     config = replace(component.config, nmpc=replace(component.config.nmpc, thrust=2.5),
-                     snapdragon=replace(component.config.snapdragon, position=(5.0, 5.0, 6.0)))
+                     gains=replace(component.config.gains, position=(5.0, 5.0, 6.0)))
     component.reconfigure(config)
     job.then(built)
     before = np.array(flight.motors[-1].rotor_speed)
@@ -447,12 +447,12 @@ def test_a_law_whose_settings_are_compiled_in_is_built_again_where_these_have_ch
     component = Controller(parameters(standby=True))
     component.work = jobs.append
     component.warm_up()
-    component.reconfigure(replace(component.config, nmpc=replace(component.config.nmpc, nodes=10)))
+    component.reconfigure(replace(component.config, nmpc=replace(component.config.nmpc, horizon=0.5)))
     first = jobs.pop()
     first.then(first.function(*first.arguments))
     assert ask(component, "set_controller", ChooseLaw("nmpc", False)).error_code == 2
     again = jobs.pop()
-    assert again.arguments[2].nmpc.nodes == 10
+    assert again.arguments[2].nmpc.horizon == 0.5
 
 
 def test_a_law_that_could_not_be_built_says_why():
@@ -470,7 +470,7 @@ def test_gains_change_in_flight_and_what_is_fixed_is_refused():
     flight = hovering()
     component = flight.component
     old = component.config
-    component.reconfigure(replace(old, snapdragon=replace(old.snapdragon, position=(5.0, 5.0, 6.0))))
+    component.reconfigure(replace(old, gains=replace(old.gains, position=(5.0, 5.0, 6.0))))
     assert component.flight.law.gains.position == (5.0, 5.0, 6.0)
     with pytest.raises(ConfigError, match="fixed"):
         component.reconfigure(replace(component.config, vehicle="rpg"))

@@ -61,7 +61,7 @@ vary:
   target.distance: {grid: [1.7, 3.0]}
   target.inclination_deg: {grid: [60.0, 90.0]}
   wind.steady.1: {uniform: [-1.0, 1.0]}
-  parameters.controller.snapdragon.lead: {choice: [0.02, 0.03]}
+  parameters.controller.gains.lead: {choice: [0.02, 0.03]}
 """))
     assert len(campaign.runs) == 12
     points = [(r.values["target.distance"], r.values["target.inclination_deg"]) for r in campaign.runs]
@@ -70,7 +70,7 @@ vary:
     scenario = scenario_of(campaign.mapping(run), "c")
     assert scenario.target.distance == run.values["target.distance"]
     assert scenario.wind.steady == (0.0, run.values["wind.steady.1"], 0.0)
-    assert scenario.parameters["controller"]["snapdragon.lead"] == run.values["parameters.controller.snapdragon.lead"]
+    assert scenario.parameters["controller"]["gains.lead"] == run.values["parameters.controller.gains.lead"]
     assert len({r.seed for r in campaign.runs}) == 12
 
 
@@ -100,8 +100,8 @@ def test_more_runs_keep_the_first_ones(tmp_path):
     ("target.distance: {normal: [1.7, 0.1], low: abc}", "vary.target.distance.low: 'abc' is not a number"),
     ("target.distance: {uniform: [.nan, 2.0]}", "vary.target.distance.uniform"), ("target.distance: {normal: [1.7, .inf]}", "normal"),
     (", ".join(f"parameters.vio.a{k}: {{grid: [{', '.join('1' * 100)}]}}" for k in range(4)), "runs: 10000000000 flights .* are more than 20000"),
-    ("parameters.controller.snapdragon.laed: {grid: [0.1]}", "parameters.controller.snapdragon.laed: unknown"),
-    ("parameters.controller.snapdragon.lead: {uniform: [0.01, 9.0]}", "parameters.controller.snapdragon.lead: .* is outside"),
+    ("parameters.controller.gains.laed: {grid: [0.1]}", "parameters.controller.gains.laed: unknown"),
+    ("parameters.controller.gains.lead: {uniform: [0.01, 9.0]}", "parameters.controller.gains.lead: .* is outside"),
     ("parameters.pilot.a: {grid: [1]}", "parameters.pilot"), ("vehicle: {grid: [nothing]}", "vehicle: 'nothing': unknown"),
 ])
 def test_what_no_scenario_accepts_is_refused_before_the_first_flight(tmp_path, vary, words):

@@ -131,8 +131,7 @@ def test_a_way_that_is_the_reference_is_judged_as_the_reference_and_drawn(tmp_pa
 def into_the_cable_and_back():
     """One waypoint in the cable, flown briskly: twelve seconds of flight instead of thirty."""
     waypoints = tuple(Waypoint(position=p) for p in ((2.4, -0.6, 2.2), (3.95, 0.0, 2.7), (2.4, 0.6, 2.2)))
-    parameters = {"controller": BASE.parameters["controller"] | {"nmpc.lines.ramp_time": 1.0}}
-    return dataclasses.replace(BASE, start=Start(position=(2.4, -0.6, 0.0)), parameters=parameters,
+    return dataclasses.replace(BASE, start=Start(position=(2.4, -0.6, 0.0)),
                                inspection=dataclasses.replace(BASE.inspection, waypoints=waypoints, speed=1.0))
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_control.flight_settings import FlightSettings
 from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_core import bernstein
 from perch_core.errors import PerchError
@@ -16,6 +15,10 @@ from perch_core.vehicle import Vehicle
 
 _LONGEST_PERCH = 120.0  # the way to a contact is rehearsed, period by period [s]
 _EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
+_LATEST = 0.5           # the oldest start that is flown: a plan is of the present [s]
+_START_GAP = 0.35       # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
+_START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
+_STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
 
 
 class TrajectoryRefused(PerchError):
@@ -91,12 +94,8 @@ def _check_size(name: str, values: np.ndarray, limit: float) -> None:
         raise TrajectoryRefused(f"{name} of {greatest:g} is beyond {limit:g}")
 
 
-def check_joints(trajectory: FlatTrajectory | SampledTrajectory, gap: float) -> None:
+def check_joints(trajectory: FlatTrajectory | SampledTrajectory) -> None:
     """Refuse a trajectory that is not continuous in position and velocity.
-
-    Args:
-        trajectory: what to check.
-        gap: largest step in position [m]; ten times this in velocity [m/s].
 
     Raises:
         TrajectoryRefused: with place and size of the step.
@@ -113,35 +112,34 @@ def check_joints(trajectory: FlatTrajectory | SampledTrajectory, gap: float) -> 
         steps = np.linalg.norm(np.diff(trajectory.p, axis=0) - mean * dt, axis=-1)
         kinks = np.linalg.norm(np.diff(trajectory.v, axis=0), axis=-1) - 60.0 * dt[:, 0]
         places = trajectory.times[1:]
-    if len(steps) and steps.max() > gap:
+    if len(steps) and steps.max() > _STEP:
         k = int(steps.argmax())
-        raise TrajectoryRefused(f"position jumps by {steps[k]:.3f} m at {places[k]:.3f} s; at most {gap:g} m is allowed")
-    if len(kinks) and kinks.max() > 10.0 * gap:
+        raise TrajectoryRefused(f"position jumps by {steps[k]:.3f} m at {places[k]:.3f} s; at most {_STEP:g} m is allowed")
+    if len(kinks) and kinks.max() > 10.0 * _STEP:
         k = int(kinks.argmax())
-        raise TrajectoryRefused(f"velocity jumps by {kinks[k]:.3f} m/s at {places[k]:.3f} s; at most {10 * gap:g} m/s is allowed")
+        raise TrajectoryRefused(f"velocity jumps by {kinks[k]:.3f} m/s at {places[k]:.3f} s; at most {10 * _STEP:g} m/s is allowed")
 
 
-def check_start(order: Order, now: float, present: Setpoint, settings: FlightSettings) -> None:
+def check_start(order: Order, now: float, present: Setpoint) -> None:
     """Refuse a trajectory that does not begin where and when the vehicle is.
 
     Args:
         order: what to check.
         now: time of the step [s].
         present: where the vehicle will be at the start: the running reference there, or the state.
-        settings: gaps that are allowed.
 
     Raises:
         TrajectoryRefused: with the gap and its limit.
     """
     late = now - order.start
-    if late > settings.start_late:
-        raise TrajectoryRefused(f"starts {late:.2f} s in the past; at most {settings.start_late:g} s is allowed")
+    if late > _LATEST:
+        raise TrajectoryRefused(f"starts {late:.2f} s in the past; at most {_LATEST:g} s is allowed")
     if -late > _EARLIEST:
         raise TrajectoryRefused(f"starts {-late:.2f} s in the future; at most {_EARLIEST:g} s is allowed")
     begin = order.source.setpoint(max(late, 0.0))
     gap = float(np.linalg.norm(np.subtract(begin.p, present.p)))
-    if gap > settings.start_gap:
-        raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {settings.start_gap:g} m is allowed")
+    if gap > _START_GAP:
+        raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {_START_GAP:g} m is allowed")
     speed = float(np.linalg.norm(np.subtract(begin.v, present.v)))
-    if speed > settings.start_speed_gap:
-        raise TrajectoryRefused(f"starts {speed:.2f} m/s from the vehicle's velocity; at most {settings.start_speed_gap:g} m/s is allowed")
+    if speed > _START_SPEED_GAP:
+        raise TrajectoryRefused(f"starts {speed:.2f} m/s from the vehicle's velocity; at most {_START_SPEED_GAP:g} m/s is allowed")

@@ -62,7 +62,7 @@ class Assembly:
         self._begin(self.flown, self.flight.compensator is not None)
 
     def _begin(self, law: str, adaptive: bool) -> None:
-        self.flight = FlightController(self.vehicle, self.laws[law], self._params.gain_set(self.vehicle.name), self._params.flight)
+        self.flight = FlightController(self.vehicle, self.laws[law], self._params.gain_set, self._params.flight)
         self.choose(law, adaptive)
 
     @property
@@ -120,8 +120,8 @@ class Assembly:
         if not adaptive:
             flight.compensator = None
         elif flight.compensator is None:
-            flight.compensator = L1Augmentation(flight.vehicle, self._params.l1)
-        flight.use(self.laws[type], self._params.gain_set(self.vehicle.name), self._params.flight)
+            flight.compensator = L1Augmentation(flight.vehicle, self._params.controller.l1_bandwidth)
+        flight.use(self.laws[type], self._params.gain_set, self._params.flight)
 
     def change(self, params: ControllerParameters) -> None:
         """New gains and limits from the next step on; another law or augmentation where these differ.
@@ -139,11 +139,11 @@ class Assembly:
         self._params = params
         self.laws = {name: law for name, law in changed.items() if law is not None}
         if flight.compensator is not None:
-            flight.compensator.settings = params.l1
+            flight.compensator.bandwidth = choice.l1_bandwidth
         if (choice.type, choice.adaptive) != (old.controller.type, old.controller.adaptive):
             self.choose(choice.type, choice.adaptive)
         else:
-            flight.use(self.laws[flown], params.gain_set(self.vehicle.name), params.flight)
+            flight.use(self.laws[flown], params.gain_set, params.flight)
         failed, self._failed = self._failed, {}
         for _, again in failed.values():
             again()

@@ -21,6 +21,7 @@ from perch_control.stamp_guard import Stamp, StampGuard
 STATUS_PERIOD = 20_000_000        # of controller/status [ns]
 DIAGNOSTICS_PERIOD = NANOSECONDS
 DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
+BLIND_AFTER = 0.08                # without odometry for so long, the IMU is answered; motors stop after 0.1 s without commands [s]
 LONGEST_PLAN = 60.0               # a way out that starts later is none out of what is flown [s]
 STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
 GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
@@ -103,7 +104,7 @@ class Controller(Component[ControllerParameters]):
             return
         stamp, answered = sample.stamp, self._answered
         self.flight.imu(seconds(stamp), sample.w_B, sample.f_B)
-        if answered is None or stamp <= answered or not (self._silent or stamp - answered >= nanoseconds(self.config.blind_after)):
+        if answered is None or stamp <= answered or not (self._silent or stamp - answered >= nanoseconds(BLIND_AFTER)):
             return
         if self.flight.state not in (State.DISARMED, State.FAILED, State.ATTACHED):
             self._answer_silence(stamp, "odometry has stopped: the IMU is answered")
@@ -148,7 +149,7 @@ class Controller(Component[ControllerParameters]):
             return
         silent = now - self._spoken
         self._gone = silent >= GONE
-        if self.flight.maneuvers.flying and silent >= nanoseconds(self.config.blind_after):
+        if self.flight.maneuvers.flying and silent >= nanoseconds(BLIND_AFTER):
             self._answer_silence(self._stamps.newest + silent, "neither odometry nor IMU: descending by the clock")
 
     def _answer_silence(self, stamp: int, why: str) -> None:
@@ -287,4 +288,4 @@ class Controller(Component[ControllerParameters]):
 def _rehearse(params: ControllerParameters) -> None:
     """`dry_run`, once in a process: it loads what all controllers share."""
     vehicle = load_vehicle(params.vehicle)
-    dry_run(vehicle, params.gain_set(vehicle.name), params.flight, params.l1)
+    dry_run(vehicle, params.gain_set, params.flight)

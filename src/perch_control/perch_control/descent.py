@@ -11,14 +11,17 @@ from dataclasses import dataclass
 from math import sqrt
 
 from perch_core.vector3 import axes_of, axpy, cross, dot, limited, norm, scale, turned
-from perch_core.vehicle import GRAVITY, Vehicle
-from perch_control.flight_settings import FlightSettings
+from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.law import moment
 from perch_control.geometric.step import rotors_for
 from perch_control.debounce import Debounce
-from perch_control.settings import GeometricGains
 
+_SHARE = 0.93       # thrust / weight, so that a measured 1 g means ground
+_SPEED = 0.6        # a faster fall is braked, as far as the velocity is known [m/s]
+_GAIN = 4.0         # braking per speed ... [1/s]
+_BRAKING = 5.0      # ... and at most so much [m/s^2]
+_IMPACT = 25.0      # specific force upwards that counts as hitting the ground: no thrust of this descent is near [m/s^2]
 _LEVELLING = 0.3    # rate at which the accelerometer corrects the attitude [1/s]
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]
 _SETTLE_TIME = 0.3  # the change of thrust at the beginning is over [s]
@@ -61,11 +64,11 @@ class AttitudeByImu:
 class BlindDescent:
     """The descent itself; owns the attitude and decides when the ground is felt."""
 
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, q: tuple[float, ...],
-                 w: tuple[float, ...], now: float, v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], now: float,
+                 v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
         """`q`, `w`, `v`: last attitude (xyzw), body rates [rad/s] and velocity in W [m/s] that could be trusted, zero where none
         could; `now`: time of the beginning [s]."""
-        self._gains, self._settings, self._constants = gains, settings, packed_vehicle(vehicle)
+        self._gains, self._constants = gains, packed_vehicle(vehicle)
         self._mass = vehicle.mass
         self.attitude = AttitudeByImu(tuple(q), tuple(w))
         self.v_W = tuple(v) if norm(v) < _KNOWN_SPEED else (0.0, 0.0, 0.0)
@@ -82,13 +85,13 @@ class BlindDescent:
         b1, b2, b3 = axes_of(self.attitude.q)
         f_W = axpy(accel[0], b1, axpy(accel[1], b2, scale(accel[2], b3)))
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))
-        # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `descent_share` of it.
-        middle = 0.5 * (1.0 + self._settings.descent_share) * GRAVITY
+        # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `_SHARE` of it.
+        middle = 0.5 * (1.0 + _SHARE) * GRAVITY
         self._force += dt / _MEAN_TIME * (norm(accel) - self._force)  # rotor vibration is ten times the difference
         calm = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
         resting = self._rest.update(calm and middle < self._force < 1.1 * GRAVITY, stamp)
         begun = stamp - self._start > _SETTLE_TIME
-        if begun and f_W[2] > self._settings.impact_acceleration:  # a wall pushes sideways, the ground upwards
+        if begun and f_W[2] > _IMPACT:  # a wall pushes sideways, the ground upwards
             self._touched = stamp
         elif self._touched is not None and stamp - self._touched > _BOUNCE and self._force < 0.7 * GRAVITY:
             self._touched = None  # nothing carries the vehicle
@@ -96,13 +99,13 @@ class BlindDescent:
 
     def _specific_thrust(self) -> tuple[float, float, float]:
         """Wanted thrust per mass in W [m/s^2]: speed across is braked, a climb and a fall are bounded."""
-        s, (vx, vy, vz) = self._settings, self.v_W
+        vx, vy, vz = self.v_W
         if self._touched is not None:  # held upright by the rotors until it has come to rest
             return 0.0, 0.0, _TOUCHED_SHARE * GRAVITY
-        across = limited((-s.descent_gain * vx, -s.descent_gain * vy, 0.0), s.descent_braking)
-        fall = min(s.descent_gain * max(-vz - s.descent_speed, 0.0), s.descent_braking)
-        climb = min(s.descent_gain * max(vz, 0.0), s.descent_braking)
-        return across[0], across[1], s.descent_share * GRAVITY + fall - climb
+        across = limited((-_GAIN * vx, -_GAIN * vy, 0.0), _BRAKING)
+        fall = min(_GAIN * max(-vz - _SPEED, 0.0), _BRAKING)
+        climb = min(_GAIN * max(vz, 0.0), _BRAKING)
+        return across[0], across[1], _SHARE * GRAVITY + fall - climb
 
     def wanted(self) -> tuple[float, float, float, float]:
         """Collective thrust [N] and moments in B [N m]."""

@@ -12,13 +12,12 @@ from perch_control.admission import AtEnd, Order
 from perch_control.flight import FlightController
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
-from perch_control.l1 import L1Augmentation, L1Settings
+from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, State
 from perch_control.period import NOMINAL_PERIOD
 from perch_control.reference import FlatReference, Vector
-from perch_control.settings import GeometricGains
 from perch_core.trajectory import rest_to_rest
-from perch_core.vehicle import GRAVITY, Vehicle
+from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 
 _RISE = 1.0  # [s]
 
@@ -51,14 +50,14 @@ class _DryRun:
         return at.p, at.v
 
 
-def dry_run(vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings, l1: L1Settings) -> list[State]:
+def dry_run(vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> list[State]:
     """Arm, rise, hover, begin a perch, recover, land, and descend without position, a few periods each.
 
     Returns:
         The states that it has been in.
     """
     flight = FlightController(vehicle, GeometricController(vehicle, gains), gains, settings)
-    flight.compensator = L1Augmentation(vehicle, l1)
+    flight.compensator = L1Augmentation(vehicle)
     run, seen = _DryRun(flight), []
     run.step()
     flight.command(Command.ARM)

@@ -7,7 +7,7 @@ from math import dist, inf
 import numpy as np
 
 from perch_core.vector3 import axes_of
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
@@ -19,12 +19,12 @@ from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
 from perch_control.maneuvers import Maneuvers
 from perch_control.modes import Command, CommandRefused, State, StepResult
+from perch_control.monitors import DOWN_TIME
 from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import thrusts
 from perch_control.schedule import Schedule
-from perch_control.settings import GeometricGains
 from perch_control.smooth_position import SmoothPosition
 from perch_control.supervisor import Supervisor
 from perch_control.thrust_belief import AIRBORNE, ThrustBelief
@@ -32,24 +32,26 @@ from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 _SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
 _NOWHERE = (0.0,) * 6        # position and velocity of a descent that knows neither
 _STILL = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
+_MARGIN_PERCH = 0.15         # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
+_IDLE_TIME = 10.0            # armed on the ground without a trajectory for so long: motors off [s]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
 
 
 class FlightController:
     """Takes orders, judges odometry, supervises, and asks the control law for rotor commands."""
 
-    def __init__(self, vehicle: Vehicle, law: Law, gains: GeometricGains, settings: FlightSettings) -> None:
+    def __init__(self, vehicle: Vehicle, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
         self.law = law
         self.maneuvers = Maneuvers(vehicle, gains, settings)
         self._schedule = Schedule(self.maneuvers)
         self.supervisor = Supervisor(self.maneuvers, self._leave)
-        self.gate = OdometryGate(settings.odometry)
+        self.gate = OdometryGate()
         self.odometry_age = inf
         self.margin = 1.0
         self._spare = 1.0            # mean margin in hover
         self.position_error = 0.0
         self.compensator: L1Augmentation | None = None
-        self._thrust = ThrustBelief(vehicle, self.maneuvers, settings.rotors)
+        self._thrust = ThrustBelief(vehicle, self.maneuvers)
         self._imu_stamp = -inf
         self._refused = ""
         self._smooth = SmoothPosition()
@@ -60,15 +62,13 @@ class FlightController:
         """Limits and speeds; may be replaced in flight."""
         return self.maneuvers.settings
 
-    def use(self, law: Law, gains: GeometricGains, settings: FlightSettings) -> None:
+    def use(self, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
         """Fly another law, or the same one with other gains and limits, from the next step on."""
         if law is not self.law:
             law.begin()
         self.law, self.maneuvers.gains, self.maneuvers.settings = law, gains, settings
-        self.health.settings = settings.rotors
         law.believe(self.vehicle)
         law.pace(self._period.value)
-        self.gate.limits = settings.odometry
         self.supervisor.restart()
 
     @property
@@ -137,7 +137,7 @@ class FlightController:
             return
         if m.state not in (State.DISARMED, State.ATTACHED):
             raise CommandRefused(f"arm is refused: {m.state.name.lower()}; disarm first")
-        if self.odometry_age > self.settings.odometry.timeout:
+        if self.odometry_age > self.settings.odometry_timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({self._refused})" if self._refused else ""))
         self._thrust.reset(self.law, self.compensator)
         if m.state is State.ATTACHED:
@@ -161,10 +161,10 @@ class FlightController:
             self._thrust.reset(self.law, self.compensator)
         elif m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {m.state.name.lower()}, not armed and ready")
-        if m.state is State.HOVERING and order.at_end is not AtEnd.HOLD and self._spare < self.settings.margin_perch:
-            raise TrajectoryRefused(f"the thrust margin in hover is {self._spare:.2f}; a perch needs {self.settings.margin_perch:g}")
-        check_joints(order.source.trajectory, self.settings.joint_gap)
-        check_start(order, m.now, m.expected(max(order.start, m.now)), self.settings)
+        if m.state is State.HOVERING and order.at_end is not AtEnd.HOLD and self._spare < _MARGIN_PERCH:
+            raise TrajectoryRefused(f"the thrust margin in hover is {self._spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
+        check_joints(order.source.trajectory)
+        check_start(order, m.now, m.expected(max(order.start, m.now)))
         if order.at_end is AtEnd.CONTACT and m.state is State.HOVERING and self.compensator is not None:
             self._thrust.adopt(self.law, self.compensator)
         running = Running(m.source, order.start - m.start) if m.state is State.TRACKING and order.start >= m.now else None
@@ -219,7 +219,7 @@ class FlightController:
         self._believe(verdict, sample, dt)
         self.odometry_age = m.now - self.gate.stamp if self.gate.stamp is not None else inf
         if m.flying and m.blind is None:
-            if self.odometry_age > self.settings.odometry.timeout:
+            if self.odometry_age > self.settings.odometry_timeout:
                 m.descend(self._refused or "no odometry")
             elif verdict.jumped:
                 m.stay(verdict.reason)
@@ -235,8 +235,8 @@ class FlightController:
         """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
         m = self.maneuvers
         self.odometry_age += self._advance(stamp)
-        if m.flying and stamp - self._imu_stamp > self.settings.down_time:
-            m.motors_off(State.FAILED, f"neither odometry nor IMU for {self.settings.down_time:g} s")
+        if m.flying and stamp - self._imu_stamp > DOWN_TIME:
+            m.motors_off(State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
         m.descend("no odometry")
         return self._descend(m.blind) if m.blind is not None else self._idle()
 
@@ -310,8 +310,8 @@ class FlightController:
 
     def _idle(self) -> StepResult:
         m = self.maneuvers
-        if m.state is State.ARMED and not self._schedule.waiting and m.elapsed > self.settings.idle_time:
-            m.motors_off(State.DISARMED, f"disarmed: no trajectory for {self.settings.idle_time:g} s")
+        if m.state is State.ARMED and not self._schedule.waiting and m.elapsed > _IDLE_TIME:
+            m.motors_off(State.DISARMED, f"disarmed: no trajectory for {_IDLE_TIME:g} s")
         armed = m.state is State.ARMED
         speed = (self.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
         m.rotors = m.rotors.following(speed, m.belief or _STILL, self.vehicle)

@@ -9,11 +9,8 @@ All on accelerations: force / mass in W [m/s^2], moment / inertia in B [rad/s^2]
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
 from math import exp
 
-from perch_core.config import quantity
 from perch_core.jit import compiled
 from perch_core.vector3 import axes_of, axpy, cross, limited, scale, times
 from perch_core.vehicle import GRAVITY, Vehicle
@@ -23,17 +20,9 @@ from perch_control.rotor_lag import thrusts
 
 _ZERO = (0.0,) * 6
 _LONGEST_GAP = 0.025  # a longer time between samples starts the predictor anew [s]
-
-
-@dataclass(frozen=True)
-class L1Settings:
-    """Bandwidths and bounds."""
-
-    predictor: ClassVar[float] = 10.0  # decay of the prediction error [1/s]
-    force_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0)
-    moment_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=200.0)
-    force_max: ClassVar[float] = 6.0  # largest acceleration that is made up for [m/s^2]
-    moment_max: ClassVar[float] = 60.0  # largest angular acceleration that is made up for [rad/s^2]
+_DECAY = 10.0         # of the prediction error: slow beside the adaptation, which removes it in each period [1/s]
+_FORCE_MAX = 6.0      # largest acceleration that is made up for, below the bound of the position feedback [m/s^2]
+_MOMENT_MAX = 60.0    # largest angular acceleration that is made up for, a quarter of what may be commanded [rad/s^2]
 
 
 @compiled
@@ -50,7 +39,7 @@ def model_rates(state, f, vehicle):
 
 
 @compiled
-def adapted(predicted, measured, filtered, decay, dt, bandwidths, bounds):
+def adapted(predicted, measured, filtered, decay, dt, bandwidth, bounds):
     """One adaptation: disturbance of the last period, and its filtered value, 6 floats each.
 
     Args:
@@ -58,7 +47,7 @@ def adapted(predicted, measured, filtered, decay, dt, bandwidths, bounds):
         filtered: of the last sample, 6 floats.
         decay: of the prediction error [1/s].
         dt: time since the last sample [s].
-        bandwidths: of force and moment [rad/s].
+        bandwidth: of the filter [rad/s].
         bounds: of the filtered force and moment [m/s^2, rad/s^2].
     """
     # sigma = -Phi^-1 e^(A dt) error, Phi = A^-1 (e^(A dt) - 1), A = -decay.
@@ -68,9 +57,9 @@ def adapted(predicted, measured, filtered, decay, dt, bandwidths, bounds):
         gain * (predicted[0] - measured[0]), gain * (predicted[1] - measured[1]), gain * (predicted[2] - measured[2]),
         gain * (predicted[3] - measured[3]), gain * (predicted[4] - measured[4]), gain * (predicted[5] - measured[5]),
     )
-    kf, km = 1.0 - exp(-bandwidths[0] * dt), 1.0 - exp(-bandwidths[1] * dt)
-    force = limited(axpy(kf, raw[0:3], scale(1.0 - kf, filtered[0:3])), bounds[0])
-    moment = limited(axpy(km, raw[3:6], scale(1.0 - km, filtered[3:6])), bounds[1])
+    k = 1.0 - exp(-bandwidth * dt)
+    force = limited(axpy(k, raw[0:3], scale(1.0 - k, filtered[0:3])), bounds[0])
+    moment = limited(axpy(k, raw[3:6], scale(1.0 - k, filtered[3:6])), bounds[1])
     return raw, (force[0], force[1], force[2], moment[0], moment[1], moment[2])
 
 
@@ -81,8 +70,9 @@ class L1Augmentation:
         disturbance: filtered estimate, acceleration in W and angular acceleration in B, 6 floats.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: L1Settings) -> None:
-        self.settings = settings
+    def __init__(self, vehicle: Vehicle, bandwidth: float = 15.0) -> None:
+        """`bandwidth`: of the filtered estimate, force and moment [rad/s]; it may change in flight."""
+        self.bandwidth = bandwidth
         self._vehicle = packed_vehicle(vehicle)
         self.disturbance: tuple[float, ...] = _ZERO
         self.reset()
@@ -119,7 +109,6 @@ class L1Augmentation:
             speed: of the rotors now [rad/s], 4 floats.
             now: [s].
         """
-        s = self.settings
         measured = (*state[3:6], *state[10:13])
         f = thrusts(speed, self._vehicle[1][0])
         if self._last is None or not 0.0 < now - self._last[0] < _LONGEST_GAP:
@@ -129,10 +118,10 @@ class L1Augmentation:
             dt = now - time
             mean = tuple(0.5 * (a + b) for a, b in zip(f0, f))
             rates = model_rates(state0, mean, self._vehicle)
-            predicted = tuple(z + dt * (r + d - s.predictor * (z - m))
+            predicted = tuple(z + dt * (r + d - _DECAY * (z - m))
                               for z, r, d, m in zip(predicted0, rates, raw, measured0))
-            raw, self.disturbance = adapted(predicted, measured, self.disturbance, s.predictor, dt,
-                                            (s.force_bandwidth, s.moment_bandwidth), (s.force_max, s.moment_max))
+            raw, self.disturbance = adapted(predicted, measured, self.disturbance, _DECAY, dt,
+                                            self.bandwidth, (_FORCE_MAX, _MOMENT_MAX))
             self._last = (now, state, f, predicted, measured, raw)
             return tuple(-x for x in self.disturbance)
         self._last = (now, state, f, predicted, measured, _ZERO)

@@ -7,19 +7,21 @@ from math import dist, inf
 from typing import Any
 
 from perch_core.vector3 import axes_of, axpy, dot, norm, scale
-from perch_core.vehicle import GRAVITY, Vehicle
+from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import BRAKE_PEAK, Hold, brake
 from perch_control.inner_loop import stopped
 from perch_control.modes import FLYING, State
-from perch_control.monitors import reference_tilt_deg
+from perch_control.monitors import TILT_MARGIN, reference_tilt_deg
 from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint, peak_thrust
-from perch_control.settings import GeometricGains
+from perch_control.rotor_health import HOVER_LEAST, RESERVE
 from perch_control.weak_landing import WeakLanding
 
+_BRAKE = 4.0          # deceleration of a brake: leans by 22 deg at most [m/s^2]
+_BRAKE_HARD = 8.0     # the same, at most, where the trajectory leads to a surface [m/s^2]
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
 _LEVEL = 0.8          # cosine of the tilt up to which a brake starts from the attitude as it is
@@ -49,7 +51,7 @@ class Maneuvers:
         ground: height at which the vehicle was armed [m].
     """
 
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains, settings: FlightSettings) -> None:
+    def __init__(self, vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> None:
         self.vehicle, self.gains, self.settings = vehicle, gains, settings
         self.state, self.message, self.flying = State.DISARMED, "disarmed", False
         self.now = 0.0
@@ -129,11 +131,11 @@ class Maneuvers:
         setpoint = self.setpoint()
         _, _, b3 = axes_of(self.belief[6:10])
         turning = b3[2] < _LEVEL or norm(self.belief[10:13]) > _TURNING
-        if turning or self._surface_normal() or reference_tilt_deg(self.belief, setpoint) > self.settings.tilt_margin_deg:
+        if turning or self._surface_normal() or reference_tilt_deg(self.belief, setpoint) > TILT_MARGIN:
             self.recover(message)
             return
         p, v, a = self._point_of_departure(setpoint)
-        deceleration = max(self.settings.brake_deceleration, min(self._needed_deceleration(), self.settings.brake_hard))
+        deceleration = max(_BRAKE, min(self._needed_deceleration(), _BRAKE_HARD))
         self.enter(State.HOVERING, message)
         self.run(brake(p, v, a, setpoint.h, deceleration=deceleration))
 
@@ -152,7 +154,7 @@ class Maneuvers:
         normal = self._surface_normal() or self.attached_to
         self.attached_to = None
         self.enter(State.RECOVERING, f"recovering: {message}")
-        self.run(Recovery(self.settings.recovery, self.specific_thrust_max, self.belief, normal))
+        self.run(Recovery(self.specific_thrust_max, self.belief, normal))
 
     def land(self, message: str) -> None:
         """Descend until the ground is felt."""
@@ -160,12 +162,12 @@ class Maneuvers:
         p, v, a = self._point_of_departure(setpoint)
         self.enter(State.LANDING, message)
         down = (0.0, 0.0, -self.settings.land_speed)
-        self.run(brake(p, v, a, setpoint.h, down, self.settings.brake_deceleration))
+        self.run(brake(p, v, a, setpoint.h, down, _BRAKE))
 
     def land_weak(self, message: str) -> None:
         """Land at once, with what thrust there is."""
         self.enter(State.LANDING, f"landing on weak rotors: {message}")
-        self.run(WeakLanding(self.settings.rotors, self.settings.land_speed, self.belief, self.ground))
+        self.run(WeakLanding(self.settings.land_speed, self.belief, self.ground))
         self.source.update(self.belief, self.specific_thrust_max)
 
     @property
@@ -175,18 +177,18 @@ class Maneuvers:
 
     def beyond_what_is_left(self) -> str:
         """Why weak rotors cannot go on with what is flown; empty: they can."""
-        left, s = self.specific_thrust_max, self.settings.rotors
+        left = self.specific_thrust_max
         said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
         upright = axes_of(self.belief[6:10])[2][2] >= _UPRIGHT
         if self.order is not None:
             if upright and self.order.at_end is AtEnd.CONTACT:
                 return f"{said}, too little to recover from a missed contact"
             if self._judged is None or self._judged[0] is not self.source or self._judged[1] is not self.vehicle:
-                self._judged = self.source, self.vehicle, peak_thrust(self.source, self.elapsed) > s.reserve * left
+                self._judged = self.source, self.vehicle, peak_thrust(self.source, self.elapsed) > RESERVE * left
             return f"{said}, less than the trajectory needs" if self._judged[2] else ""
         if self.state is State.RECOVERING and not upright:
             return ""
-        return said if left < s.hover_least * GRAVITY else ""
+        return said if left < HOVER_LEAST * GRAVITY else ""
 
     def descend(self, message: str, moving: bool = True) -> None:
         """Descend without position: level, with a little less thrust than the weight; `moving`: the velocity can be trusted."""
@@ -195,7 +197,7 @@ class Maneuvers:
         self.enter(State.LANDING, f"descent without position: {message}")
         # From the last sample that was accepted: the prediction since then knows less than the IMU.
         stamp, sure = self.seen
-        self.blind = BlindDescent(self.vehicle, self.gains, self.settings, sure[6:10], sure[10:13], stamp, sure[3:6] if moving else _ZERO)
+        self.blind = BlindDescent(self.vehicle, self.gains, sure[6:10], sure[10:13], stamp, sure[3:6] if moving else _ZERO)
         for sample in self.unseen:
             self.blind.imu(*sample)
         self.unseen.clear()
@@ -225,7 +227,7 @@ class Maneuvers:
     @property
     def committed(self) -> bool:
         """Even the hardest brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
-        return self._needed_deceleration() > self.settings.brake_hard
+        return self._needed_deceleration() > _BRAKE_HARD
 
     def _needed_deceleration(self) -> float:
         """What it takes to stop before the surface that the trajectory leads to [m/s^2], 0 in the open."""

@@ -10,6 +10,12 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.debounce import Debounce
 from perch_control.reference import Setpoint
 
+TILT_MARGIN = 45.0  # tilt away from the reference's thrust direction that nothing planned explains [deg]
+_RATE_FACTOR = 1.6  # the same for the body rate, over the vehicle's body_rate_max
+_FAULT_TIME = 0.12  # tilt, rate or position are out for so long before the supervisor acts [s]
+_MARGIN_LEAST = 0.02  # thrust margin that counts as none ...
+_MARGIN_TIME = 1.0  # ... for so long: the rotors are at their limit; a turn is shorter [s]
+DOWN_TIME = 1.2     # at rest and tilted for so long: something else carries the vehicle [s]
 _MEAN_TIME = 0.05  # of what the IMU says [s]
 _BALANCED = 0.15   # share of gravity by which the specific force of what is carried may be off it
 _TILTED = 0.5      # cosine of the tilt beyond which nothing hovers
@@ -39,19 +45,17 @@ class TrackingMonitor:
     _margin: Debounce = field(init=False)
 
     def __post_init__(self) -> None:
-        s = self.settings
-        self._tilt, self._rate, self._position = (Debounce(s.fault_time) for _ in range(3))
-        self._margin = Debounce(s.margin_time)
+        self._tilt, self._rate, self._position = (Debounce(_FAULT_TIME) for _ in range(3))
+        self._margin = Debounce(_MARGIN_TIME)
 
     def deviation(self, state: tuple[float, ...], setpoint: Setpoint, now: float) -> str:
         """What the vehicle does that was not planned; empty: nothing."""
-        s = self.settings
         tilt = reference_tilt_deg(state, setpoint)
         rate = hypot(*state[10:13])
         error = dist(setpoint.p, state[0:3])
-        tilted = self._tilt.update(tilt > s.tilt_margin_deg, now)
-        spinning = self._rate.update(rate > s.rate_factor * self.rate_max, now)
-        away = self._position.update(error > s.position_error_max, now)
+        tilted = self._tilt.update(tilt > TILT_MARGIN, now)
+        spinning = self._rate.update(rate > _RATE_FACTOR * self.rate_max, now)
+        away = self._position.update(error > self.settings.position_error_max, now)
         if tilted:
             return f"tilt {tilt:.0f} deg away from the plan's"
         if spinning:
@@ -60,7 +64,7 @@ class TrackingMonitor:
 
     def exhausted(self, margin: float, now: float) -> bool:
         """The rotors have been at their limit for too long."""
-        return self._margin.update(margin < self.settings.margin_min, now)
+        return self._margin.update(margin < _MARGIN_LEAST, now)
 
     def outside(self, p: tuple[float, ...]) -> float:
         """Distance by which a position is outside the geofence [m], 0 inside."""
@@ -81,8 +85,8 @@ class CarriedTilted:
         lasts: it has done so for long.
     """
 
-    def __init__(self, settings: FlightSettings) -> None:
-        self._settings, self._held = settings, Debounce(settings.down_time)
+    def __init__(self) -> None:
+        self._held = Debounce(DOWN_TIME)
         self._force, self._rate, self._stamp = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
         self.tilted = self.lasts = False
 

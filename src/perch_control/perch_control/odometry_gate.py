@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import acos, degrees, hypot, isfinite, radians, sqrt
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from perch_core.config import quantity
 from perch_core.covariance import largest_sigma
 from perch_core.jit import compiled
 
 
-_LARGEST = 1e6  # metres, m/s, rad/s: no vehicle is there
-
-
-@dataclass(frozen=True)
-class OdometryLimits:
-    """What counts as usable odometry."""
-
-    timeout: float = quantity(0.05, unit="s", above=0.0, high=5.0, doc="without usable odometry for longer: descent without position")
-    position_jump: float = quantity(0.25, unit="m", above=0.0, doc="largest step between two samples beyond the motion")
-    velocity_jump: ClassVar[float] = 1.5  # largest step between two samples [m/s]
-    attitude_jump_deg: ClassVar[float] = 20.0  # largest step beyond the rotation [deg]
-    confirm: float = quantity(0.03, unit="s", low=0.0, doc="a jump that stays for so long, and is as certain as what was before it to within the largest "
-                             "steps, is the new truth: hover there")
+_LARGEST = 1e6        # metres, m/s, rad/s: no vehicle is there
+_POSITION_JUMP = 0.25  # largest step between two samples beyond the motion: above a correction of VIO [m]
+_VELOCITY_JUMP = 1.5   # the same of the velocity, beyond what 4 g change in between [m/s]
+_ATTITUDE_JUMP = 20.0  # the same of the attitude beyond the rotation [deg]
+_CONFIRM = 0.03        # a jump that stays so long, and is as certain as what was before it to within these steps, is the new truth [s]
 
 
 class Verdict(NamedTuple):
@@ -39,8 +29,7 @@ class Verdict(NamedTuple):
 class OdometryGate:
     """Owns the last accepted sample and a candidate that jumped away from it."""
 
-    def __init__(self, limits: OdometryLimits) -> None:
-        self.limits = limits
+    def __init__(self) -> None:
         self.stamp: float | None = None     # of the last accepted sample [s]
         self.state: tuple[float, ...] = ()
         self._covariances: tuple[np.ndarray, np.ndarray] | None = None  # of the last accepted sample
@@ -71,7 +60,7 @@ class OdometryGate:
         if self._candidate is None or self._step(self._candidate[1], self._candidate[2], stamp, state):
             self._candidate = (stamp, stamp, state)
         self._candidate = (self._candidate[0], stamp, state)
-        if stamp - self._candidate[0] >= self.limits.confirm:
+        if stamp - self._candidate[0] >= _CONFIRM:
             if doubt := self._doubt(covariances):
                 return Verdict(False, reason=f"{problem}, {doubt}")
             return self._accept(stamp, state, covariances, problem)
@@ -89,10 +78,10 @@ class OdometryGate:
         """
         if covariances is None:
             return ""
-        before, limits = self._covariances or (np.zeros((6, 6)),) * 2, self.limits
-        parts = [("position", "m", 0, slice(0, 3), limits.position_jump), ("attitude", "rad", 0, slice(3, 6), radians(limits.attitude_jump_deg))]
+        before = self._covariances or (np.zeros((6, 6)),) * 2
+        parts = [("position", "m", 0, slice(0, 3), _POSITION_JUMP), ("attitude", "rad", 0, slice(3, 6), radians(_ATTITUDE_JUMP))]
         if covariances[1][0, 0] >= 0.0 and before[1][0, 0] >= 0.0:
-            parts.append(("velocity", "m/s", 1, slice(0, 3), limits.velocity_jump))
+            parts.append(("velocity", "m/s", 1, slice(0, 3), _VELOCITY_JUMP))
         for name, unit, k, s, limit in parts:
             sigma = largest_sigma((covariances[k] - before[k])[s, s])
             if sigma > limit:
@@ -102,13 +91,12 @@ class OdometryGate:
     def _step(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
         """What is wrong with the step from one sample to the next; empty: nothing."""
         dt = t1 - t0
-        limits = self.limits
         dp, dv, turn, spun = _changes(a, b, dt)
-        if dp > limits.position_jump:
+        if dp > _POSITION_JUMP:
             return f"odometry position jumped by {dp:.2f} m in {dt * 1e3:.0f} ms"
-        if dv > limits.velocity_jump + 40.0 * dt:
+        if dv > _VELOCITY_JUMP + 40.0 * dt:
             return f"odometry velocity jumped by {dv:.2f} m/s in {dt * 1e3:.0f} ms"
-        if degrees(turn - spun) > limits.attitude_jump_deg:
+        if degrees(turn - spun) > _ATTITUDE_JUMP:
             return f"odometry attitude jumped by {degrees(turn):.0f} deg in {dt * 1e3:.0f} ms"
         return ""
 

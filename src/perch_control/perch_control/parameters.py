@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from perch_control.flight_settings import FlightSettings
-from perch_control.l1 import L1Settings
 from perch_control.laws import check_law
 from perch_control.nmpc.settings import NmpcSettings
-from perch_control.settings import GeometricGains
-from perch_core.config import choice, part, quantity, text
+from perch_core.config import part, quantity, text
+from perch_core.errors import ConfigError
+from perch_core.vehicle import ControlGains, Vector3, load_vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +19,7 @@ class ControllerChoice:
 
     type: str = text("geometric", doc="control law, one of perch_control.laws (geometric, nmpc); service set_controller changes it, too")
     adaptive: bool = quantity(False, doc="L1 augmentation on force and moment")
+    l1_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0, doc="of what the augmentation makes up for, force and moment")
     standby: bool = quantity(True, doc="prepare laws that take long to build (nmpc), so that set_controller can choose them in flight")
     reference_period: float = quantity(0.01, unit="s", above=0.0, high=1.0, doc="of controller/reference")
 
@@ -25,23 +27,46 @@ class ControllerChoice:
         check_law(self.type)
 
 
+def _of_vehicle(name: str) -> Any:
+    """A parameter with unit and range of the vehicle file's gain, whose value it has where it is not set."""
+    meta = next(item for item in fields(ControlGains) if item.name == name).metadata
+    return field(default=None, metadata={**meta, "doc": f"{meta['doc']}; not set: the vehicle file's"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainParameters:
+    """Gains in the place of the vehicle file's; see `ControlGains`."""
+
+    position: Vector3 | None = _of_vehicle("position")
+    velocity: Vector3 | None = _of_vehicle("velocity")
+    attitude: Vector3 | None = _of_vehicle("attitude")
+    rate: Vector3 | None = _of_vehicle("rate")
+    lead: float | None = _of_vehicle("lead")
+    contact_speed: float | None = _of_vehicle("contact_speed")
+    contact_overshoot: float | None = _of_vehicle("contact_overshoot")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ControllerParameters:
-    """Parameters of the node `controller`: gain sets by vehicle, limits of the supervisor."""
+    """Parameters of the node `controller`. Gains that are not set become those of the vehicle file, so that `ros2 param get` shows them."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    gains: str = choice("vehicle", options=("vehicle", "snapdragon", "rpg"), doc="gain set; vehicle: the one whose name the vehicle's begins with")
-    blind_after: float = quantity(0.08, unit="s", above=0.0, high=1.0,
-                                  doc="without odometry for so long, descend on the IMU alone, by its stamps; without either, by the clock; "
-                                      "motors stop after 0.1 s without commands")
     controller: ControllerChoice = part(ControllerChoice)
-    snapdragon: GeometricGains = part(GeometricGains)
-    rpg: GeometricGains = part(GeometricGains)
+    gains: GainParameters = part(GainParameters)
     nmpc: NmpcSettings = part(NmpcSettings)
-    l1: L1Settings = part(L1Settings)
     flight: FlightSettings = part(FlightSettings)
 
-    def gain_set(self, vehicle_name: str) -> GeometricGains:
-        """The gains to fly a vehicle with; they are per unit of mass and inertia, so an unknown vehicle takes snapdragon's."""
-        name = self.gains if self.gains != "vehicle" else vehicle_name
-        return self.rpg if name.startswith("rpg") else self.snapdragon
+    def __post_init__(self) -> None:
+        given = {name: value for name, value in vars(self.gains).items() if value is not None}
+        if len(given) == len(fields(GainParameters)):
+            return
+        try:
+            gains = load_vehicle(self.vehicle).gains
+        except ConfigError as error:
+            raise ConfigError("", "vehicle", str(error)) from None
+        object.__setattr__(self, "gains", GainParameters(**{**vars(gains), **given}))
+
+    @property
+    def gain_set(self) -> ControlGains:
+        """The gains that are flown with."""
+        return ControlGains(**vars(self.gains))

@@ -8,35 +8,28 @@ direction leads the present one by a bounded angle, which keeps most of the thru
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
 from math import cos, radians, sin
 
-from perch_core.config import quantity
 from perch_core.vector3 import axes_of, axpy, dot, limited, norm, scale
 from perch_core.vehicle import GRAVITY
 from perch_control.guidance import horizontal
 from perch_control.reference import Setpoint, Vector
 
 
-@dataclass(frozen=True)
-class RecoverySettings:
-    """How a recovery flies."""
-
-    push_time: ClassVar[float] = 0.04  # longest push away from the surface [s]
-    push_clearance: ClassVar[float] = 0.10  # the push ends at this distance from where contact was missed [m]
-    thrust_share: ClassVar[float] = 0.95  # share of the greatest thrust while pushing and turning
-    turn_ahead_deg: ClassVar[float] = 50.0  # the commanded direction leads the present one by so much [deg]
-    away_speed: ClassVar[float] = 0.5  # speed away from the surface until the clearance is reached [m/s]
-    away_distance: float = quantity(0.5, unit="m", low=0.0, doc="distance from the surface at which to hover")
-    velocity_gain: ClassVar[float] = 6.0  # [1/s]
-    climb_gain: ClassVar[float] = 1.0  # vertical speed per height lost [1/s]
-    climb_speed_max: ClassVar[float] = 1.0  # [m/s]
-    acceleration_max: ClassVar[float] = 4.0  # horizontal [m/s^2]
-    level_deg: ClassVar[float] = 25.0  # hand-over to hover below this tilt ... [deg]
-    rate: ClassVar[float] = 3.0  # ... this body rate ... [rad/s]
-    speed: ClassVar[float] = 0.8  # ... and this speed [m/s]
-    timeout: ClassVar[float] = 6.0  # then descend [s]
+TIMEOUT = 6.0          # a recovery that has not come to rest by then descends [s]
+_PUSH_TIME = 0.04      # longest push away from the surface [s]
+_PUSH_CLEARANCE = 0.1  # the push ends at this distance from where contact was missed [m]
+_THRUST_SHARE = 0.95   # of the greatest thrust while pushing and turning: the rest is left to the moments
+_TURN_AHEAD = 50.0     # the commanded direction leads the present one by so much: enough to saturate the moment [deg]
+_AWAY_SPEED = 0.5      # away from the surface until the clearance is reached [m/s]
+_AWAY_DISTANCE = 0.5   # from the surface to the hover: three radii of the smaller vehicle [m]
+_VELOCITY_GAIN = 6.0   # [1/s]
+_CLIMB_GAIN = 1.0      # vertical speed per height lost [1/s]
+_CLIMB_SPEED = 1.0     # at most [m/s]
+_SIDE_MAX = 4.0        # horizontal acceleration: leans by 22 deg at most once upright [m/s^2]
+_LEVEL = 25.0          # hand-over to hover below this tilt ... [deg]
+_RATE = 3.0            # ... this body rate ... [rad/s]
+_SPEED = 0.8           # ... and this speed, from which a brake follows the vehicle [m/s]
 
 
 def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:
@@ -54,16 +47,14 @@ class Recovery:
     duration = float("inf")
     by_state = True  # a function of the state, with nothing to be previewed
 
-    def __init__(self, settings: RecoverySettings, specific_thrust_max: float, state: tuple[float, ...],
-                 normal: Vector | None) -> None:
+    def __init__(self, specific_thrust_max: float, state: tuple[float, ...], normal: Vector | None) -> None:
         """
         Args:
-            settings: how to fly.
             specific_thrust_max: greatest collective thrust / mass [m/s^2].
             state: where the recovery begins, 13 floats (p, v, q, w).
             normal: outward normal of the surface at `state`, None: in the open.
         """
-        self._settings, self._thrust_max = settings, specific_thrust_max
+        self._thrust_max = specific_thrust_max
         self._origin, self._normal = state[0:3], normal
         self._push = None if normal is None or normal[2] >= cos(radians(30.0)) else normal
         _, self._h, _ = axes_of(state[6:10])
@@ -72,34 +63,33 @@ class Recovery:
 
     def update(self, state: tuple[float, ...], elapsed: float) -> None:
         """Take the present state, `elapsed` seconds after the beginning."""
-        s = self._settings
         p, v, w = state[0:3], state[3:6], state[10:13]
         b1, b2, b3 = axes_of(state[6:10])
         moved = axpy(-1.0, self._origin, p)
-        clearance = dot(moved, self._normal) if self._normal is not None else s.away_distance
-        if elapsed > s.push_time or clearance > s.push_clearance:
+        clearance = dot(moved, self._normal) if self._normal is not None else _AWAY_DISTANCE
+        if elapsed > _PUSH_TIME or clearance > _PUSH_CLEARANCE:
             self._push = None
         if self._push is not None:
-            f = scale(s.thrust_share * self._thrust_max, self._push)
+            f = scale(_THRUST_SHARE * self._thrust_max, self._push)
             self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._h)
             return
-        climb = min(max(-s.climb_gain * moved[2], -s.climb_speed_max), s.climb_speed_max)
+        climb = min(max(-_CLIMB_GAIN * moved[2], -_CLIMB_SPEED), _CLIMB_SPEED)
         away: Vector = (0.0, 0.0, 0.0)
-        if self._normal is not None and clearance < s.away_distance:
+        if self._normal is not None and clearance < _AWAY_DISTANCE:
             nx, ny, _ = self._normal
-            away = scale(s.away_speed, (nx, ny, 0.0))
-        demand = axpy(-s.velocity_gain, v, scale(s.velocity_gain, (away[0], away[1], climb)))
-        side = limited((demand[0], demand[1], 0.0), s.acceleration_max)
-        up = min(max(demand[2], -0.4 * GRAVITY), s.thrust_share * self._thrust_max - GRAVITY)
+            away = scale(_AWAY_SPEED, (nx, ny, 0.0))
+        demand = axpy(-_VELOCITY_GAIN, v, scale(_VELOCITY_GAIN, (away[0], away[1], climb)))
+        side = limited((demand[0], demand[1], 0.0), _SIDE_MAX)
+        up = min(max(demand[2], -0.4 * GRAVITY), _THRUST_SHARE * self._thrust_max - GRAVITY)
         f = (side[0], side[1], up + GRAVITY)
-        direction = towards(f, b1, b3, radians(s.turn_ahead_deg))
+        direction = towards(f, b1, b3, radians(_TURN_AHEAD))
         if direction is not None:
-            f = scale(s.thrust_share * self._thrust_max, direction)
+            f = scale(_THRUST_SHARE * self._thrust_max, direction)
         # Turning upright, the heading can wait: b2 stays where it is.
         h = b2 if b3[2] < 0.5 else horizontal(b2)
         self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=h)
-        self.finished = (b3[2] > cos(radians(s.level_deg)) and norm(w) < s.rate and norm(v) < s.speed
-                         and clearance >= 0.5 * s.away_distance)
+        self.finished = (b3[2] > cos(radians(_LEVEL)) and norm(w) < _RATE and norm(v) < _SPEED
+                         and clearance >= 0.5 * _AWAY_DISTANCE)
 
     def setpoint(self, t: float) -> Setpoint:
         """The demand of the last `update`: an acceleration without position or velocity error."""

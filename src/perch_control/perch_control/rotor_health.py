@@ -7,35 +7,21 @@ for rotors that fail in flight, a slow one knows the ratio well enough to plan w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
 from math import exp
 
 from perch_control.debounce import Debounce
-from perch_core.config import quantity
 from perch_core.vehicle import GRAVITY
 
 _STEP = 0.02           # the believed ratio follows in steps of this size
 _MEAN_TIME = 0.5       # time constant of the mean [s]
 _GREATEST = 1.1        # a vehicle is believed to be no stronger than this
-
-
-@dataclass(frozen=True)
-class RotorHealthSettings:
-    """When rotors count as weak, and what is still flown then."""
-
-    time_constant: ClassVar[float] = 0.05  # of the filter; with 0.316 m/s^2 of noise at 500 Hz the ratio is good to 1 % [s]
-    weak: float = quantity(0.77, unit="-", low=0.0, high=1.0,
-                           doc="felt / promised thrust below which the rotors are weak; +20 % mass reads 0.83, -15 % on one rotor 0.96")
-    hold: ClassVar[float] = 0.02  # for so long [s]
-    thrust_least: ClassVar[float] = 0.5  # promised thrust / weight below which the ratio is not judged
-    rate_most: ClassVar[float] = 10.0  # body rate above which it is not judged [rad/s]
-    reserve: ClassVar[float] = 0.95  # a trajectory may ask for this share of what is left
-    hover_least: ClassVar[float] = 1.12  # greatest thrust / weight that is left, below which the vehicle lands at once
-    touch_speed: ClassVar[float] = 1.2  # such a landing does not lean where it would touch the ground faster than this [m/s]
-    # it leans so far to brake its speed across, or as far as the weight is still carried ... [deg]
-    lean_deg: ClassVar[float] = 15.0
-    lean_most_deg: ClassVar[float] = 30.0  # ... but no further than this [deg]
+_FILTER_TIME = 0.05    # time constant of the fast filter; with 0.316 m/s^2 of noise at 500 Hz the ratio is good to 1 % [s]
+_WEAK = 0.77           # felt / promised thrust below which the rotors are weak; +20 % mass reads 0.83, -15 % on one rotor 0.96
+_WEAK_TIME = 0.02      # for so long [s]
+_THRUST_LEAST = 0.5    # promised thrust / weight below which the ratio is not judged: its noise grows
+RATE_MOST = 10.0       # body rate above which it is not judged: what is felt is not the thrust alone [rad/s]
+RESERVE = 0.95         # a trajectory may ask for this share of what weak rotors have left
+HOVER_LEAST = 1.12     # greatest thrust / weight that is left, below which the vehicle lands at once
 
 
 class RotorHealth:
@@ -48,9 +34,9 @@ class RotorHealth:
         weak: the rotors were found weak since they were started.
     """
 
-    def __init__(self, settings: RotorHealthSettings, thrust_to_weight: float) -> None:
+    def __init__(self, thrust_to_weight: float) -> None:
         """`thrust_to_weight`: of the vehicle's file. Rotors are believed to just carry the weight even where they do not."""
-        self.settings, self._least = settings, 1.001 / thrust_to_weight
+        self._least = 1.001 / thrust_to_weight
         self.reset()
 
     def reset(self) -> None:
@@ -58,7 +44,7 @@ class RotorHealth:
         self.ratio = self.mean = self.believed = 1.0
         self.weak = False
         self._felt = self._promised = self._mean_felt = self._mean_promised = GRAVITY
-        self._low, self._last = Debounce(self.settings.hold), 0.0
+        self._low, self._last = Debounce(_WEAK_TIME), 0.0
 
     def pause(self, now: float) -> None:
         """Something else than air acts on the vehicle, or it turns too fast: what is felt now says nothing."""
@@ -76,18 +62,17 @@ class RotorHealth:
         Returns:
             Whether `believed` has changed.
         """
-        s = self.settings
-        if promised < s.thrust_least * GRAVITY:
+        if promised < _THRUST_LEAST * GRAVITY:
             self.pause(now)
             return False
         dt = min(max(now - self._last, 0.0), 0.02)
-        k, slow = 1.0 - exp(-dt / s.time_constant), 1.0 - exp(-dt / _MEAN_TIME)
+        k, slow = 1.0 - exp(-dt / _FILTER_TIME), 1.0 - exp(-dt / _MEAN_TIME)
         self._felt += k * (felt - self._felt)
         self._promised += k * (promised - self._promised)
         self._mean_felt += slow * (felt - self._mean_felt)
         self._mean_promised += slow * (promised - self._mean_promised)
         self._last, self.ratio, self.mean = now, self._felt / self._promised, self._mean_felt / self._mean_promised
-        self.weak = self._low.update(self.ratio < s.weak, now) or self.weak
+        self.weak = self._low.update(self.ratio < _WEAK, now) or self.weak
         return self.weak and self._believe(self.ratio)
 
     def adopt(self) -> bool:

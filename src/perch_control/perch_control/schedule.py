@@ -12,6 +12,7 @@ from perch_control.modes import State
 
 _EARLY = 0.01  # stamps that are nearer than this are the same [s]
 _MOST = 50     # ways out that are kept
+_LEAVE_TIME = 0.6  # an abort flies on for at most so long, to where a planned recovery begins [s]
 
 
 class Schedule:
@@ -42,14 +43,14 @@ class Schedule:
             TrajectoryRefused: it may not be flown.
         """
         m = self._maneuvers
-        check_joints(order.source.trajectory, m.settings.joint_gap)
+        check_joints(order.source.trajectory)
         known = (m.trajectory_id, order.id)  # the next trajectory has ways out before it is flown
         self._ways_out = [o for o in self._ways_out if o.id in known and o.start >= m.now][-_MOST:] + [order]
 
     def leave(self, reason: str, law: Any) -> bool:
         """Leave a trajectory by the next way out that was planned of it; False where none is near.
 
-        Until that recovery starts the trajectory is flown on, for `leave_time` at most: braking out of a tilted attitude at
+        Until that recovery starts the trajectory is flown on, for `_LEAVE_TIME` at most: braking out of a tilted attitude at
         speed needs more room than a planned way out.
         """
         m, order = self._maneuvers, self._maneuvers.order
@@ -61,7 +62,7 @@ class Schedule:
             return True
         ways = [o for o in self._ways_out if o.id == order.id and o.start >= m.now]
         start = min([o.start for o in ways] + [own])  # a plan may end in a recovery of its own
-        if start - m.now > m.settings.leave_time:
+        if start - m.now > _LEAVE_TIME:
             return False
         self._pending = next(((o, law.prepare(o.source, False), reason) for o in ways if o.start == start), None)
         m.message = f"{reason}; planned recovery in {start - m.now:.2f} s"

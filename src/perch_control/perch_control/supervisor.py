@@ -10,11 +10,17 @@ from perch_control.maneuvers import Maneuvers
 from perch_control.modes import State
 from perch_control.monitors import CarriedTilted, TrackingMonitor
 from perch_control.debounce import Debounce
-from perch_control.recovery import Recovery
+from perch_control.recovery import TIMEOUT, Recovery
 from perch_control.reference import Setpoint
 from perch_control.weak_landing import WeakLanding
 
 _COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
+_COASTING_HOVER = 1.0  # no VIO for so long: hover; the position drifts by centimetres until then [s]
+_COASTING_LAND = 3.0   # the same: descend without position [s]
+_FENCE_SLACK = 1.0     # so far outside the fence: land, since a hover has not come back [m]
+_MISSED_SPEED = 1.0    # faster than this after the planned contact: it was missed; a contact that may hold is slower [m/s]
+_GROUND_GAP = 0.12     # the descending reference is so far below the vehicle ... [m]
+_GROUND_TIME = 0.25    # ... for so long: on the ground [s]
 
 
 class Supervisor:
@@ -29,18 +35,18 @@ class Supervisor:
     def restart(self) -> None:
         """Forget what has been seen so far: the state or the settings have changed."""
         m = self._maneuvers
-        self._state, settings = m.state, m.settings
-        self._monitor = TrackingMonitor(settings, m.vehicle.body_rate_max)
-        self._ground = Debounce(settings.ground_time)
+        self._state = m.state
+        self._monitor = TrackingMonitor(m.settings, m.vehicle.body_rate_max)
+        self._ground = Debounce(_GROUND_TIME)
 
     def estimator(self, state: int, vio_age: float, message: str) -> None:
         """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
-        m, s = self._maneuvers, self._maneuvers.settings
+        m = self._maneuvers
         if state == _DIVERGED:
             m.descend(f"the estimator has diverged: {message}", moving=False)
-        elif state == _COASTING and vio_age > s.coasting_land_time:
+        elif state == _COASTING and vio_age > _COASTING_LAND:
             m.descend(f"no VIO for {vio_age:.1f} s")
-        elif state == _COASTING and vio_age > s.coasting_time:
+        elif state == _COASTING and vio_age > _COASTING_HOVER:
             self._give_up(f"no VIO for {vio_age:.1f} s")
 
     def _give_up(self, reason: str) -> None:
@@ -56,7 +62,7 @@ class Supervisor:
             self._carried = None
             return
         if self._carried is None:
-            self._carried = CarriedTilted(m.settings)
+            self._carried = CarriedTilted()
         self._carried.imu(stamp, gyro, accel)
         if self._carried.lasts:
             m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
@@ -72,7 +78,7 @@ class Supervisor:
         Args:
             margin: thrust margin of the last command.
         """
-        m, s = self._maneuvers, self._maneuvers.settings
+        m = self._maneuvers
         if m.state is not self._state:
             self.restart()
         if isinstance(m.source, WeakLanding):
@@ -86,7 +92,7 @@ class Supervisor:
             m.source.update(m.belief, m.elapsed)
             if m.source.finished:
                 m.settle("recovered: hovering")
-            elif m.elapsed > s.recovery.timeout:
+            elif m.elapsed > TIMEOUT:
                 m.land("landing: the recovery did not come to rest")
             return
         if m.state is State.LANDING:
@@ -95,7 +101,7 @@ class Supervisor:
         outside = self._monitor.outside(m.belief[0:3])
         if deviation:
             m.recover(deviation)
-        elif outside > s.fence_slack:
+        elif outside > _FENCE_SLACK:
             m.land(f"landing: {outside:.1f} m outside the geofence")
         elif outside > 0.0 and m.state is State.TRACKING and not m.committed:
             m.stop(f"hover: {outside:.1f} m outside the geofence")
@@ -103,15 +109,15 @@ class Supervisor:
             m.land("landing: the rotors are at their limit")
         elif m.order is not None:
             self._at_end(m.order, m.elapsed - m.order.source.duration)
-        elif m.elapsed > s.silence_time:
-            m.land(f"landing: no order for {s.silence_time:.0f} s")
+        elif m.elapsed > m.settings.silence_time:
+            m.land(f"landing: no order for {m.settings.silence_time:.0f} s")
 
     def _at_end(self, order: Order, over: float) -> None:
         if order.at_end is AtEnd.CONTACT:
             speed = norm(self._maneuvers.belief[3:6])
             if over > order.contact_time:
                 self._maneuvers.recover("contact was missed")
-            elif over > 0.0 and speed > self._maneuvers.settings.missed_speed:  # what holds does not fall
+            elif over > 0.0 and speed > _MISSED_SPEED:  # what holds does not fall
                 self._maneuvers.recover(f"contact was missed, falling with {speed:.1f} m/s")
         elif over >= 0.0:
             if order.at_end is AtEnd.LAND:
@@ -125,5 +131,5 @@ class Supervisor:
         if isinstance(m.source, WeakLanding):
             resting = m.source.resting(m.belief)
         else:
-            resting = abs(m.belief[5]) < 0.1 and m.belief[2] - setpoint.p[2] > m.settings.ground_gap
+            resting = abs(m.belief[5]) < 0.1 and m.belief[2] - setpoint.p[2] > _GROUND_GAP
         return m.state is State.LANDING and self._ground.update(resting, m.now)

@@ -7,7 +7,7 @@ from math import hypot
 from typing import Any
 
 from perch_control.maneuvers import Maneuvers
-from perch_control.rotor_health import RotorHealth, RotorHealthSettings
+from perch_control.rotor_health import RATE_MOST, RotorHealth
 from perch_control.rotor_lag import thrusts
 from perch_core.vector3 import axes_of, scale
 from perch_core.vehicle import Vehicle
@@ -25,9 +25,9 @@ class ThrustBelief:
         vehicle: as believed.
     """
 
-    def __init__(self, vehicle: Vehicle, maneuvers: Maneuvers, settings: RotorHealthSettings) -> None:
+    def __init__(self, vehicle: Vehicle, maneuvers: Maneuvers) -> None:
         self._nominal, self._maneuvers = vehicle, maneuvers
-        self.health = RotorHealth(settings, 4.0 * vehicle.thrust_max / vehicle.hover_thrust)
+        self.health = RotorHealth(4.0 * vehicle.thrust_max / vehicle.hover_thrust)
         self.vehicle, self.felt = vehicle, 0.0
 
     def reset(self, law: Any, compensator: Any) -> None:
@@ -38,7 +38,7 @@ class ThrustBelief:
     def judge(self, law: Any, compensator: Any) -> None:
         """Compare felt and promised thrust in free air; weak rotors are a weaker vehicle from now on."""
         m = self._maneuvers
-        if m.belief[2] - m.ground < AIRBORNE or m.may_touch(_TOUCHING) or hypot(*m.belief[10:13]) > self.health.settings.rate_most:
+        if m.belief[2] - m.ground < AIRBORNE or m.may_touch(_TOUCHING) or hypot(*m.belief[10:13]) > RATE_MOST:
             self.health.pause(m.now)
         elif self.health.update(self.felt, self._promised(), m.now):
             if not m.weak:

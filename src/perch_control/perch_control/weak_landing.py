@@ -11,7 +11,6 @@ from math import acos, radians, sin, sqrt
 from perch_control.guidance import horizontal
 from perch_control.recovery import towards
 from perch_control.reference import Setpoint
-from perch_control.rotor_health import RotorHealthSettings
 from perch_core.vector3 import axes_of, limited, scale
 from perch_core.vehicle import GRAVITY
 
@@ -23,6 +22,9 @@ _PER_HEIGHT = 1.5  # ... leaning by at most so much per height above it [rad/m]
 _LEAN_LEAST = radians(2.0)
 _NEARLY_UPRIGHT = 0.9
 _GENTLE = 0.08    # [rad]
+_LEAN = radians(15.0)       # it leans so far to brake its speed across, or as far as the weight is still carried ... [rad]
+_LEAN_MOST = radians(30.0)  # ... but no further than this [rad]
+_TOUCH_SPEED = 1.2          # it does not lean where it would touch the ground faster than this [m/s]
 _DELAY = 0.1       # until the rotors have answered [s]
 
 
@@ -32,24 +34,23 @@ class WeakLanding:
     duration = float("inf")
     by_state = True
 
-    def __init__(self, settings: RotorHealthSettings, speed: float, state: tuple[float, ...], ground: float) -> None:
+    def __init__(self, speed: float, state: tuple[float, ...], ground: float) -> None:
         """
         Args:
-            settings: how far to lean.
             speed: of the descent [m/s].
             state: where it begins, 13 floats (p, v, q, w).
             ground: height at which the vehicle was armed [m].
         """
-        self._settings, self._speed, self._ground = settings, speed, ground
+        self._speed, self._ground = speed, ground
         self._setpoint = Setpoint(state[0:3], state[3:6], h=horizontal(axes_of(state[6:10])[1]))
 
     def update(self, state: tuple[float, ...], specific_thrust_max: float) -> None:
         """Take the present state and the greatest collective thrust / mass that is left [m/s^2]."""
-        s, p, v, most = self._settings, state[0:3], state[3:6], specific_thrust_max
+        p, v, most = state[0:3], state[3:6], specific_thrust_max
         carried = acos(min(GRAVITY / most, 1.0))
-        lean = min(max(carried, radians(s.lean_deg)), radians(s.lean_most_deg))
+        lean = min(max(carried, _LEAN), _LEAN_MOST)
         height = p[2] - self._ground
-        fall = max(v[2] ** 2 - s.touch_speed**2, 0.0) if v[2] < 0.0 else 0.0
+        fall = max(v[2] ** 2 - _TOUCH_SPEED**2, 0.0) if v[2] < 0.0 else 0.0
         needed = (GRAVITY + 0.5 * fall / max(height + _DELAY * v[2], 0.05)) / most  # thrust that stops the fall, as a share
         lean = min(lean, acos(min(needed, 1.0))) if fall > 0.0 else lean
         lean = max(min(lean, _PER_HEIGHT * (height - _LEVEL)), _LEAN_LEAST)

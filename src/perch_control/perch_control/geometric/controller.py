@@ -14,13 +14,19 @@ from perch_control.guidance import Running
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.reference import Following
 from perch_control.rotor_lag import RotorEstimate
-from perch_control.settings import GeometricGains
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import ControlGains, Vehicle
 
 if TYPE_CHECKING:
     from perch_control.parameters import ControllerParameters
 
-_RATE_RESERVE = 1.3  # commanded rates may exceed what a plan may ask for by this factor, so that feedback has room
+RATE_RESERVE = 1.3        # commanded rates may exceed what a plan may ask for by this factor, so that feedback has room
+FEEDBACK_MAX = 8.0        # bound of the position feedback: what the weakest vehicle here has beside its weight [m/s^2]
+CONE_DEG = 40.0           # the feedback turns the thrust no further from the reference's: it cannot turn the vehicle over [deg]
+CONE_CONTACT_DEG = 5.0    # the same at a contact: at its thrust 10 cm of error would tilt the vehicle by 12 deg [deg]
+CONTACT_WINDOW = 0.3      # before the contact, over which the cone narrows to that: the thrust is low by then [s]
+THRUST_FLOOR = 0.8        # specific thrust below which a direction is noise [m/s^2]
+ACCELERATION_MAX = 250.0  # bound of the commanded angular acceleration: what the rotors of snapdragon.yaml can do [rad/s^2]
+FEEDBACK_RATE = 0.0       # share of the feedback's own derivative in the commanded rates: an estimated velocity is too noisy for it
 
 
 def packed_vehicle(vehicle: Vehicle) -> tuple:
@@ -41,19 +47,19 @@ class GeometricController(Law):
 
     name = "geometric"
 
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
+    def __init__(self, vehicle: Vehicle, gains: ControlGains) -> None:
         super().__init__(vehicle)
         self.gains = gains
         self._vehicle = packed_vehicle(vehicle)
         self._gains = (*gains.position, *gains.velocity, *gains.attitude, *gains.rate)
-        self._wide, self._narrow = tan(radians(gains.cone_deg)), tan(radians(gains.cone_contact_deg))
-        self._rate_max = _RATE_RESERVE * vehicle.body_rate_max
+        self._wide, self._narrow = tan(radians(CONE_DEG)), tan(radians(CONE_CONTACT_DEG))
+        self._rate_max = RATE_RESERVE * vehicle.body_rate_max
         self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 16, RotorEstimate.at_idle(vehicle))
 
     @classmethod
     def build(cls, vehicle: Vehicle, params: ControllerParameters) -> GeometricController:
-        """With the vehicle's gains."""
-        return cls(vehicle, params.gain_set(vehicle.name))
+        """With the gains of the parameters."""
+        return cls(vehicle, params.gain_set)
 
     @property
     def lead(self) -> float:
@@ -76,16 +82,14 @@ class GeometricController(Law):
             compensation: acceleration in W and angular acceleration in B that make up for disturbances, 6 floats.
             time_to_contact: [s]; near zero position feedback gives way to attitude.
         """
-        gains = self.gains
-        share = min(max(time_to_contact / gains.contact_window, 0.0), 1.0)
+        share = min(max(time_to_contact / CONTACT_WINDOW, 0.0), 1.0)
         cone = self._narrow + share * (self._wide - self._narrow)
         out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, self._limits(cone),
-                           gains.lead, self._vehicle)
+                           self.gains.lead, self._vehicle)
         return ControlOutput(*out[:6])
 
     def _limits(self, cone: float) -> tuple[float, ...]:
-        gains = self.gains
-        return (gains.feedback_max, cone, gains.thrust_floor, self._rate_max, gains.acceleration_max, gains.feedback_rate)
+        return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX, FEEDBACK_RATE)
 
     def believe(self, vehicle: Vehicle) -> None:
         """Fly a vehicle that differs from the one at the start in its thrust."""
@@ -100,7 +104,7 @@ class GeometricController(Law):
             running: reference from which it takes over; None: the vehicle is where the trajectory begins.
         """
         gains = self.gains
-        if not (contact and gains.rehearse):
+        if not (contact and gains.contact_speed):
             return source
         return rehearsed(source, self.vehicle, self, gains.contact_speed, gains.contact_overshoot, running)
 
@@ -118,6 +122,5 @@ class GeometricController(Law):
         Returns:
             State at `duration`, shape (13,).
         """
-        gains = self.gains
         return flown(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
-                     gains.contact_window, gains.lead, period, duration, self._vehicle)
+                     CONTACT_WINDOW, self.gains.lead, period, duration, self._vehicle)

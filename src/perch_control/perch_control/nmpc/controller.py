@@ -27,8 +27,13 @@ if TYPE_CHECKING:
     from perch_control.parameters import ControllerParameters
 
 _REFERENCE_FLOOR = 0.5   # specific thrust below which the reference's attitude is noise [m/s^2]
-_RATE_RESERVE = 1.2
+_RATE_RESERVE = 1.2      # soft limit of each body rate / what a plan may ask for: feedback has room
 _RATE_PRICE, _THRUST_PRICE = 1e5, 1e6  # of half the squared excess over a state's bound [s^2/rad^2, 1/N^2]: far above all weights
+_NODES = 20              # shooting intervals N of [P:VI]: 50 ms each over 1 s; what is solved in 2 ms
+_TERMINAL = 4.0          # factor of the state weights at the last node, for what comes after the horizon
+_THRUST_RATE_WEIGHT = 0.002  # of the rotor thrusts' rates where these are the inputs: keeps the QP strictly convex [s^2/N^2]
+_LINE_MARGIN = 0.3       # scaled clearance below which the collision term acts, so that it is felt before the line is met
+LINE_RAMP = 3.0          # line terms grow to their weights over so long: at once they would be a jump of the command [s]
 _ACTIVE_SETS = 12        # tried in one period before the dense QP is solved
 _FAR_LINE = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 1.0, 0.01)
 
@@ -40,10 +45,12 @@ class NmpcController(Law):
     name = "nmpc"
     slow = True
 
-    def __init__(self, vehicle: Vehicle, settings: NmpcSettings, fallback: GeometricController) -> None:
+    def __init__(self, vehicle: Vehicle, settings: NmpcSettings, fallback: GeometricController, thrust_states: bool = False) -> None:
+        """`thrust_states`: 17 states, with the rotor thrusts among them and their rates as inputs, instead of 13."""
         super().__init__(vehicle)
         self._nominal, self.settings, self.fallback = vehicle, settings, fallback
-        N, n = settings.nodes, 17 if settings.thrust_states else 13
+        self.thrust_states = thrust_states
+        N, n = _NODES, 17 if thrust_states else 13
         self._spacing = max(1, round(settings.horizon / N / self.period))
         self._dt = self._spacing * self.period
         self._layout = StageLayout(n, settings.lines.any)
@@ -82,9 +89,9 @@ class NmpcController(Law):
 
     def _weights(self) -> None:
         s, n = self.settings, self._layout.states
-        self._rate_max = s.rate_max or _RATE_RESERVE * self.vehicle.body_rate_max
-        self._thrust_rate_max = s.thrust_rate_max or _thrust_rate(self.vehicle)
-        self._lag = lag_behind(self.vehicle.motor_time_constant, s.lead, self.period)
+        self._lead = self.fallback.gains.lead
+        self._rate_max, self._thrust_rate_max = _RATE_RESERVE * self.vehicle.body_rate_max, _thrust_rate(self.vehicle)
+        self._lag = lag_behind(self.vehicle.motor_time_constant, self._lead, self.period)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
@@ -92,15 +99,14 @@ class NmpcController(Law):
         self._x_low[13:], self._x_high[13:], self._price[13:] = self.vehicle.thrust_min, self.vehicle.thrust_max, _THRUST_PRICE
 
     def retune(self, settings: NmpcSettings, fallback: GeometricController) -> None:
-        """New weights and limits from the next period on.
+        """New weights from the next period on.
 
         Raises:
-            ConfigError: nodes, horizon, thrust states or the presence of line terms differ: these are compiled in.
+            ConfigError: horizon or the presence of line terms differ: these are compiled in.
         """
         old = self.settings
-        for key in ("nodes", "horizon", "thrust_states"):
-            if getattr(settings, key) != getattr(old, key):
-                raise ConfigError("nmpc", key, "is fixed after the start")
+        if settings.horizon != old.horizon:
+            raise ConfigError("nmpc", "horizon", "is fixed after the start")
         if settings.lines.any != old.lines.any:
             raise ConfigError("nmpc", "lines", "line terms cannot be switched on or off after the start")
         self.settings, self.fallback = settings, fallback
@@ -133,7 +139,7 @@ class NmpcController(Law):
 
     def _new_rows(self) -> ReferenceRows:
         period = self.period if self.period == NOMINAL_PERIOD else self._dt / self._spacing
-        return ReferenceRows(self._constants, _REFERENCE_FLOOR, self.settings.nodes * self._spacing, period)
+        return ReferenceRows(self._constants, _REFERENCE_FLOOR, _NODES * self._spacing, period)
 
     def lines(self, lines: tuple[tuple[float, ...], ...]) -> None:
         """Powerlines for the soft terms: (centre, direction, half length, radius), 8 floats each; the first is watched."""
@@ -148,9 +154,9 @@ class NmpcController(Law):
             self._warm = False
             return self.fallback.control(state, reference, rotors, compensation, time_to_contact)
         # At a reference's end its thrusts jump.
-        left = reference.source.duration - reference.elapsed - self.settings.lead
-        ramps = self.settings.ramps and left >= self.settings.nodes * self._dt
-        ahead = 0.0 if self.settings.thrust_states else self._lag if ramps else self.settings.lead
+        left = reference.source.duration - reference.elapsed - self._lead
+        ramps = self.settings.ramps and left >= _NODES * self._dt
+        ahead = 0.0 if self.thrust_states else self._lag if ramps else self._lead
         self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
         try:
             speed, wrench, reached = self._iterate(state, rotors, compensation, ahead, ramps)
@@ -168,7 +174,7 @@ class NmpcController(Law):
         s, X, U, n = self.settings, self.X, self.U, self._layout.states
         if not self._warm:
             X[:, :13] = self._R[:, :13]
-            if s.thrust_states:
+            if self.thrust_states:
                 X[:, 13:], U[:] = self._R[:, 13:], 0.0
             else:
                 U[:] = self._R[:-1, 13:]
@@ -180,27 +186,27 @@ class NmpcController(Law):
         if self._layout.with_lines:
             self._fill_lines(z)
         stages = self._stages.evaluate()
-        weight = s.thrust_rate if s.thrust_states else s.thrust
-        input_bounds(rotors.speed, s.lead, self._constants, self._thrust_rate_max, n, self._low, self._high)
+        weight, lead = _THRUST_RATE_WEIGHT if self.thrust_states else s.thrust, self._lead
+        input_bounds(rotors.speed, lead, self._constants, self._thrust_rate_max, n, self._low, self._high)
         if COMPILED:
-            tried, out = finish(stages, X, U, self._start, weight, self._target, s.terminal, self._low, self._high, self._x_low,
-                                self._x_high, self._price, _ACTIVE_SETS, self._work.arrays, self._dx, self._du, rotors.speed, s.lead,
+            tried, out = finish(stages, X, U, self._start, weight, self._target, _TERMINAL, self._low, self._high, self._x_low,
+                                self._x_high, self._price, _ACTIVE_SETS, self._work.arrays, self._dx, self._du, rotors.speed, lead,
                                 self._constants)
             if tried:
                 return out
             self._work.clear()
-        apply(*solve_condensed(stages, X, U, self._start - X[0], weight, self._target, s.terminal, self._low, self._high, self._x_low,
+        apply(*solve_condensed(stages, X, U, self._start - X[0], weight, self._target, _TERMINAL, self._low, self._high, self._x_low,
                                self._x_high), X, U)
-        return answer(U, n, rotors.speed, s.lead, self._constants)
+        return answer(U, n, rotors.speed, lead, self._constants)
 
     def _fill_lines(self, z: np.ndarray) -> None:
         weights = self.settings.lines
         self._line_time += self.period if self._lines else 0.0
-        ramp = min(self._line_time / weights.ramp_time, 1.0) if weights.ramp_time > 0.0 else float(bool(self._lines))
+        ramp = min(self._line_time / LINE_RAMP, 1.0)
         flat = [v for k in range(LINES) for v in (self._lines[k] if k < len(self._lines) else _FAR_LINE)]
         watched = ramp if self._lines else 0.0
         z[:, -(LINES * LINE + 4):] = (*flat, watched * weights.perception, watched * weights.visibility,
-                                      ramp * weights.collision, weights.margin)
+                                      ramp * weights.collision, _LINE_MARGIN)
 
 
 def _thrust_rate(vehicle: Vehicle) -> float:

@@ -1,7 +1,7 @@
 """What a campaign is: a scenario, what varies in it, how often. One YAML file in `config/campaigns/` each.
 
 A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`), an entry of one of its vectors
-(`wind.steady.0`), or a node's parameter (`parameters.controller.snapdragon.lead`). `seed` can be varied by a grid, too.
+(`wind.steady.0`), or a node's parameter (`parameters.controller.gains.lead`). `seed` can be varied by a grid, too.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from perch_control.modes import State
+from perch_control.nmpc.controller import LINE_RAMP
 from perch_core.errors import PerchError
 from perch_core.trajectory import rest_to_rest
 from perch_eval.inspection.measures import Inspected, reference_of, recorded
@@ -41,7 +42,7 @@ def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
         raise PerchError(f"did not take off: {mission.message}")
     if with_lines:
         del loop.filters["controller", "powerlines"]
-    flight.run(flight.time + flight.controller.config.nmpc.lines.ramp_time + SETTLE)
+    flight.run(flight.time + LINE_RAMP + SETTLE)
     reference = reference_of(scenario, flight.time + LEAD)
     mission.follow(reference)
     flight.run(flight.time + LEAD + reference.duration)
