@@ -11,7 +11,6 @@ from perch_core.vehicle import GRAVITY
 from perch_control.mission.values import State, Target
 from perch_control.period import NOMINAL_PERIOD
 
-
 WINDOW = 0.06  # time over which the specific force is averaged [s]
 UNBALANCED = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
 SPEED = 0.5  # of a vehicle at rest, as estimated [m/s]
