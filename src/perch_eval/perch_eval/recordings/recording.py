@@ -53,7 +53,7 @@ class Reading(Progress):
 
     def line(self, now: float) -> str:
         """The bar, and the time that is left."""
-        share = min(1.0, self._done / max(self._total, 1))
+        share = min(1.0, self._done / (self._total or 1))
         left = span((1.0 - share) / share * (now - self._began)) if share > 0.0 else "?"
         return f"  [{'#' * round(30 * share):30}] {100 * share:3.0f} %, {self._done}/{self._total} {self._what}, {left} left"
 
