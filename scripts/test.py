@@ -7,12 +7,12 @@ Everything that is not an option of this script goes to pytest.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import fcntl
+import gc
 import os
-import subprocess
+import signal
 import sys
 import tempfile
+from typing import IO
 
 from perch_setup import EXTRAS, ROOT, enter
 
@@ -45,17 +45,16 @@ def main() -> int:
     )
     parser.add_argument("--quick", action="store_true", help="only the unit tests that fly, draw and start nothing")
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
-    parser.add_argument("--beside", help=argparse.SUPPRESS)  # the file of `Share`, for the other processes
     arguments, for_pytest = parser.parse_known_args()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as tests/conftest.py does, and says why
     os.environ.setdefault("PYTHONPYCACHEPREFIX", str(KEPT))
     enter(*EXTRAS)
     if arguments.quick:
         for_pytest = ["tests/unit", "-m", "quick", *for_pytest]
-    return run_tests(arguments.fast, for_pytest, arguments.beside)
+    return run_tests(arguments.fast, for_pytest)
 
 
-def run_tests(fast: bool, for_pytest: list[str], beside: str | None = None) -> int:
+def run_tests(fast: bool, for_pytest: list[str]) -> int:
     """Run pytest in this process, which keeps a ROS domain to itself meanwhile."""
     from perch_eval.domain import free_domain
 
@@ -63,10 +62,10 @@ def run_tests(fast: bool, for_pytest: list[str], beside: str | None = None) -> i
     # Before the first message class is imported: rclpy does not check fields by default.
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
     os.chdir(ROOT)
-    if beside is not None:
-        return run_share(beside, for_pytest)
     if not fast and not for_pytest and PROCESSES > 2:
-        return run_together()
+        print(f"{PROCESSES} processes share the tests; what the others print comes at the end", flush=True)
+        share = Share(parts(test_files()), PROCESSES)
+        return share.ended(run_pytest(["-o", "console_output_style=classic"], share))
     return run_pytest(["--ignore=tests/system", *for_pytest] if fast else for_pytest)
 
 
@@ -78,59 +77,34 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
     return {0: 0, 1: 1}.get(int(code), 2 if code == pytest.ExitCode.USAGE_ERROR else 1)
 
 
-def run_share(taken: str, arguments: list[str]) -> int:
-    """Run what no other process has taken, in this one."""
-    return run_pytest(["-o", "console_output_style=classic", *arguments], Share(taken, parts(test_files())))
-
-
-def run_together() -> int:
-    """All tests, in processes beside each other; what the others print comes at the end."""
-    with contextlib.ExitStack() as stack:
-        taken = stack.enter_context(tempfile.NamedTemporaryFile("w"))
-        outputs = [stack.enter_context(tempfile.TemporaryFile("w+", errors="replace")) for _ in range(PROCESSES - 1)]
-        others = [subprocess.Popen([sys.executable, __file__, "--beside", taken.name, "-o", f"cache_dir=.pytest_cache/{number}"],
-                                   stdout=output, stderr=subprocess.STDOUT) for number, output in enumerate(outputs)]
-        print(f"{PROCESSES} processes share the tests; what the others print comes at the end", flush=True)
-        try:
-            code = run_share(taken.name, [])
-            for other in others:
-                other.wait()
-        except KeyboardInterrupt:  # all have it
-            code = 1
-        finally:
-            for other, output in zip(others, outputs):
-                other.terminate()
-                other.wait()
-                output.seek(0)
-                print(output.read(), flush=True)
-    return max(code, *(1 if other.returncode else 0 for other in others))
-
-
 class Share:
-    """A plugin of pytest for one of several processes: whenever it is through with a part, it takes the next one, until nothing is left."""
+    """A plugin of pytest: when the tests are collected, processes are forked, each of which takes the next part whenever it is through with one."""
 
-    def __init__(self, taken: str, parts: list[tuple[str, ...]]) -> None:
-        """
-        Args:
-            taken: a file that all processes have, empty at first; it gets a letter for each part that one has taken.
-            parts: what there is to take, the same in all processes.
-        """
-        self._taken, self._parts = taken, parts
+    def __init__(self, parts: list[tuple[str, ...]], processes: int) -> None:
+        self._parts, self._processes = parts, processes
+        self._left, numbers = os.pipe()  # of the parts that nobody has taken
+        os.write(numbers, b"".join(number.to_bytes(2, "big") for number in range(len(parts))))
+        os.close(numbers)
+        self._others: list[tuple[int, IO[str]]] = []  # process ids, and what they print
 
     def take(self) -> tuple[str, ...] | None:
         """Files and folders of the next part; None where all are taken."""
-        with open(self._taken, "r+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            number = len(file.read())
-            if number == len(self._parts):
-                return None
-            file.write("x")
-        return self._parts[number]
+        number = os.read(self._left, 2)
+        return self._parts[int.from_bytes(number, "big")] if number else None
 
     def pytest_runtestloop(self, session) -> bool:
-        """In place of pytest's own. All processes have collected all tests: a session of pytest collects only once."""
+        """In place of pytest's own."""
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} files could not be collected")
+        sys.stdout.flush()
+        gc.freeze()  # what is not looked through is not copied
+        while len(self._others) < self._processes - 1:
+            output = tempfile.TemporaryFile("w+", errors="replace")
+            if (pid := os.fork()) == 0:
+                become_another(session.config, output)
+                self._others = []
+                break
+            self._others.append((pid, output))
         while (part := self.take()) is not None:
             items = [item for item in session.items if any(within(name, item.nodeid.split("::")[0]) for name in part)]
             for item, following in zip(items, [*items[1:], None]):
@@ -138,6 +112,31 @@ class Share:
                 if session.shouldstop:
                     raise session.Interrupted(session.shouldstop)
         return True
+
+    def ended(self, code: int) -> int:
+        """The exit code of all, when all have ended and what the others print is printed; in the others, their own."""
+        for pid, output in self._others:
+            with output:
+                code = max(code, 1 if os.waitpid(pid, 0)[1] else 0)
+                output.seek(0)
+                print(output.read(), flush=True)
+        return code
+
+
+def become_another(config, output: IO[str]) -> None:
+    """Be a process of tests of its own: domain, output, and what is left of pytest's cache when the first one has written it."""
+    from perch_core.processes import end_with_parent
+    from perch_eval.domain import free_domain
+
+    end_with_parent(signal.SIGTERM)
+    os.environ["ROS_DOMAIN_ID"] = str(free_domain())
+    capture = config.pluginmanager.getplugin("capturemanager")
+    capture.stop_global_capturing()
+    for number in (1, 2):
+        os.dup2(output.fileno(), number)
+    capture.start_global_capturing(), capture.suspend_global_capture()
+    for name in ("lfplugin", "nfplugin"):
+        config.pluginmanager.unregister(name=name)
 
 
 def within(name: str, file: str) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -28,17 +30,15 @@ def test_every_file_is_in_one_part_and_every_part_is_there():
     assert {Path(file).parent.name for file in files} >= {"unit", "property", "nodes", "recordings", "system", "fuzz"}
 
 
-@pytest.mark.parametrize("order", ["ab" * 3, "a" * 6, "aabbba"])
-def test_every_part_is_taken_once_whoever_is_faster(tmp_path: Path, order):
-    (tmp_path / "taken").touch()
-    sides = {letter: script.Share(str(tmp_path / "taken"), script.parts(FILES)) for letter in "ab"}
-    assert [sides[letter].take() for letter in order] == script.parts(FILES)
-    assert [side.take() for side in sides.values()] == [None, None]
+def test_every_part_is_taken_once():
+    share = script.Share(script.parts(FILES), 2)
+    assert [share.take() for _ in script.parts(FILES)] == script.parts(FILES) and share.take() is None
 
 
 PROGRAM = """
 import sys, pytest, test
-sys.exit(pytest.main(["-p", "no:cacheprovider", "--rootdir=.", "-c", "/dev/null", "-rA", "."], [test.Share("taken", PARTS)]))
+share = test.Share(PARTS, 2)
+sys.exit(share.ended(test.run_pytest(["--rootdir=.", "-c", "/dev/null", "-rA", "."], share)))
 """
 GOOD, BAD, BROKEN = "def test_{0}(one): assert one", "def test_{0}(): assert False", "import no_such_module"
 SHARED = "import pytest\n@pytest.fixture\ndef one(): return 1\n"
@@ -46,14 +46,17 @@ SKIPPED = "import pytest\npytest.skip('{0}', allow_module_level=True)"
 
 
 @pytest.mark.parametrize("contents, code, words", [
-    ((GOOD, GOOD), 0, "2 passed"), ((GOOD, SKIPPED), 0, "1 passed, 1 skipped"), ((BAD, GOOD), 1, "1 failed, 1 passed"),
-    ((GOOD, BROKEN, GOOD), 2, "1 error")])
-def test_parts_are_run_one_after_the_other_and_whatever_fails_is_told(contents, code, words, tmp_path):
+    ((GOOD,) * 9, 0, {"passed": 9}), ((GOOD, SKIPPED), 0, {"passed": 1, "skipped": 2}), ((BAD, GOOD), 1, {"failed": 1, "passed": 1}),
+    ((GOOD, BROKEN, GOOD), 1, {"error": 1})])
+def test_two_processes_run_each_part_once_and_whatever_fails_is_told(contents, code, words, tmp_path):
+    """Both have collected what is skipped as a file."""
     names = [f"test_{number}.py" for number in range(len(contents))]
     for name, content in zip(names, contents):
         (tmp_path / name).write_text(content.format(name[:-3]))
     (tmp_path / "conftest.py").write_text(SHARED)  # whose fixtures all parts have
-    (tmp_path / "taken").touch()
     done = subprocess.run([sys.executable, "-c", PROGRAM.replace("PARTS", repr([(name,) for name in names]))], cwd=tmp_path, capture_output=True, text=True,
                           env={**os.environ, "PYTHONPATH": os.pathsep.join([str(script.ROOT / "scripts"), os.environ.get("PYTHONPATH", "")])})
-    assert done.returncode == code and words in done.stdout.splitlines()[-1], done.stdout + done.stderr
+    told = Counter()
+    for line in re.findall(r"^=+ (.*) in [\d.]+s =+$", done.stdout, re.MULTILINE):
+        told.update({word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", line)})
+    assert (done.returncode, told) == (code, words), done.stdout + done.stderr
