@@ -27,36 +27,55 @@ class Disturbances:
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Vector product; numpy's own takes most of a step's time."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+Vector = tuple[float, float, float]
+Rows = tuple[Vector, Vector, Vector]
+"""Of a matrix. In three dimensions plain floats are faster than arrays."""
 
 
-def turn(phi: np.ndarray) -> np.ndarray:
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def times(A: Rows, x: Vector) -> Vector:
+    """A x."""
+    (a, b, c), (d, e, f), (g, h, i) = A
+    x, y, z = x
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
+
+
+def transposed(A: Rows) -> Rows:
+    """A^T."""
+    (a, b, c), (d, e, f), (g, h, i) = A
+    return (a, d, g), (b, e, h), (c, f, i)
+
+
+def turn(phi: Vector) -> Rows:
     """Rotation matrix of a small rotation vector (Rodrigues)."""
-    x, y, z = phi.tolist()
+    x, y, z = phi
     angle = math.sqrt(x * x + y * y + z * z)
     a, b = (1.0, 0.5) if angle < 1e-9 else (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2)
-    return np.array([[1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-                     [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
-                     [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)]])
+    return ((1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y),
+            (b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x),
+            (b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)))
 
 
-def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
+def quaternion(R: Rows) -> tuple[float, float, float, float]:
     """(x, y, z, w) of a rotation matrix, by its largest component (Shepperd); SciPy's takes longer than a step of the controller."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    k = max(range(4), key=(a, e, i, a + e + i).__getitem__)
-    q = ((1.0 + a - e - i, b + d, c + g, h - f), (b + d, 1.0 + e - a - i, f + h, c - g), (c + g, f + h, 1.0 + i - a - e, d - b),
-         (h - f, c - g, d - b, 1.0 + a + e + i))[k]
+    (a, b, c), (d, e, f), (g, h, i) = R
+    largest = max(a, e, i, a + e + i)
+    q = ((h - f, c - g, d - b, 1.0 + a + e + i) if largest == a + e + i else (1.0 + a - e - i, b + d, c + g, h - f) if largest == a else
+         (b + d, 1.0 + e - a - i, f + h, c - g) if largest == e else (c + g, f + h, 1.0 + i - a - e, d - b))
     n = math.hypot(*q)
     return q[0] / n, q[1] / n, q[2] / n, q[3] / n
 
 
-def rotation_vector(R: np.ndarray) -> np.ndarray:
-    """Of a rotation matrix, [rad], shape (3,)."""
+def rotation_vector(R: Rows) -> Vector:
+    """Of a rotation matrix, [rad]."""
     x, y, z, w = quaternion(R)
     sine = math.hypot(x, y, z)
-    return np.array([x, y, z]) * (2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, abs(w)) / sine) * math.copysign(1.0, w)
+    scale = (2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, abs(w)) / sine) * math.copysign(1.0, w)
+    return scale * x, scale * y, scale * z
 
 
 @dataclass
@@ -85,41 +104,44 @@ class Plant:
             self.speed = np.full(4, np.sqrt(vehicle.mass * 9.81 / 4 / vehicle.thrust_coefficient))
         self.p = np.array(self.p, float)
         # Torque of a unit thrust at each rotor: its lever, and its drag torque about b3.
-        self._levers = np.array([[y, -x, s * vehicle.torque_ratio]
-                                 for (x, y), s in zip(vehicle.rotor_xy, vehicle.rotor_yaw_sign)]).T
+        self._levers = tuple(zip(*((y, -x, s * vehicle.torque_ratio) for (x, y), s in zip(vehicle.rotor_xy, vehicle.rotor_yaw_sign))))
 
     def advance(self, command: np.ndarray, period: float = 0.002, substeps: int = 2) -> None:
         """Follow rotor speed commands [rad/s] for a control period [s]."""
         vehicle, dist = self.vehicle, self.disturbances
         dt = period / substeps
-        share = 1 - np.exp(-dt / (vehicle.motor_time_constant * dist.lag_factor))
-        mass = vehicle.mass * dist.mass_factor
-        J = np.array(vehicle.inertia) * dist.inertia_factor
-        command, wind, drag, factor = np.asarray(command), np.array(dist.wind), -np.array(vehicle.drag), np.array(dist.rotor_factor)
+        share = 1 - math.exp(-dt / (vehicle.motor_time_constant * dist.lag_factor))
+        mass, inertia = vehicle.mass * dist.mass_factor, [J * dist.inertia_factor for J in vehicle.inertia]
+        strength, drag, wind = [vehicle.thrust_coefficient * factor for factor in dist.rotor_factor], vehicle.drag, dist.wind
+        command, levers = np.asarray(command).tolist(), self._levers
+        p, v, w, R, a, speed = (x.tolist() for x in (self.p, self.v, self.w, self.R, self.acceleration, self.speed))
         for _ in range(substeps):
-            self.speed = self.speed + (command - self.speed) * share
-            thrust = vehicle.thrust_coefficient * self.speed**2 * factor
-            force = drag * (self.R.T @ (self.v - wind))
-            force[2] += thrust.sum()
-            a = self.R @ force / mass + G
-            dw = (self._levers @ thrust - cross(self.w, J * self.w)) / J
-            if self.p[2] <= self.floor + 1e-3 and self.v[2] + a[2] * dt <= 0.0:
-                self.impact_speed = max(self.impact_speed, -self.v[2])
-                a = np.array([0.0, 0.0, -self.v[2] / dt])
-                self.v[:2] = 0
-                tilt = rotation_vector(self.R) * (1, 1, 0)
-                self.w, dw = np.zeros(3), -tilt * 0.2 / dt
-            self.acceleration = a
-            self.w = self.w + dw * dt
-            self.p = self.p + self.v * dt + 0.5 * a * dt**2
-            self.v = self.v + a * dt
-            self.R = self.R @ turn(self.w * dt)
+            speed = [now + (wanted - now) * share for now, wanted in zip(speed, command)]
+            thrust = [k * now * now for k, now in zip(strength, speed)]
+            air = times(transposed(R), (v[0] - wind[0], v[1] - wind[1], v[2] - wind[2]))
+            ax, ay, az = times(R, (-drag[0] * air[0], -drag[1] * air[1], -drag[2] * air[2] + sum(thrust)))
+            a = [ax / mass, ay / mass, az / mass - 9.81]
+            gyroscopic = cross(w, (inertia[0] * w[0], inertia[1] * w[1], inertia[2] * w[2]))
+            dw = [(row[0] * thrust[0] + row[1] * thrust[1] + row[2] * thrust[2] + row[3] * thrust[3] - g) / J
+                  for row, g, J in zip(levers, gyroscopic, inertia)]
+            if p[2] <= self.floor + 1e-3 and v[2] + a[2] * dt <= 0.0:
+                self.impact_speed = max(self.impact_speed, -v[2])
+                a, v, w = [0.0, 0.0, -v[2] / dt], [0.0, 0.0, v[2]], [0.0, 0.0, 0.0]
+                x, y, _ = rotation_vector(R)
+                dw = [-x * 0.2 / dt, -y * 0.2 / dt, 0.0]
+            w = [w[0] + dw[0] * dt, w[1] + dw[1] * dt, w[2] + dw[2] * dt]
+            p = [x + y * dt + 0.5 * z * dt * dt for x, y, z in zip(p, v, a)]
+            v = [v[0] + a[0] * dt, v[1] + a[1] * dt, v[2] + a[2] * dt]
+            back = transposed(turn((w[0] * dt, w[1] * dt, w[2] * dt)))
+            R = [times(back, R[0]), times(back, R[1]), times(back, R[2])]
             if self.wall is not None:
-                point, normal = self.wall
-                depth = float((self.p - point) @ normal)
-                if depth < 0 and self.v @ normal < 0:
-                    self.p = self.p - depth * normal
-                    self.v = 0.8 * (self.v - (self.v @ normal) * normal)
+                point, normal = (x.tolist() for x in self.wall)
+                depth = sum((x - y) * n for x, y, n in zip(p, point, normal))
+                into = sum(x * n for x, n in zip(v, normal))
+                if depth < 0 and into < 0:
+                    p = [x - depth * n for x, n in zip(p, normal)]
+                    v = [0.8 * (x - into * n) for x, n in zip(v, normal)]
+        self.p, self.v, self.w, self.R, self.acceleration, self.speed = map(np.array, (p, v, w, R, a, speed))
 
     @property
     def specific_force_B(self) -> np.ndarray:
@@ -129,7 +151,7 @@ class Plant:
     @property
     def state(self) -> tuple[float, ...]:
         """p, v, q (xyzw), w as the controller takes them, 13 floats."""
-        return (*self.p.tolist(), *self.v.tolist(), *quaternion(self.R), *self.w.tolist())
+        return (*self.p.tolist(), *self.v.tolist(), *quaternion(self.R.tolist()), *self.w.tolist())
 
 
 @dataclass(frozen=True)
@@ -190,7 +212,7 @@ class EstimationError:
             part = slice(3 * i, 3 * i + 3)
             self._slow[part] = self._slow[part] * np.exp(-0.002 / tau) + rng.normal(size=3) * sigma * k * np.sqrt(
                 1 - np.exp(-0.004 / tau))
-        R = plant.R @ turn(self._slow[6:] + rng.normal(size=3) * 0.0009 * k)
+        R = plant.R @ turn((self._slow[6:] + rng.normal(size=3) * 0.0009 * k).tolist())
         return tuple(float(x) for x in (*(plant.p + self._slow[:3] + rng.normal(size=3) * 0.002 * k),
                                         *(plant.v + self._slow[3:6] + rng.normal(size=3) * 0.005 * k),
-                                        *quaternion(R), *(plant.w + rng.normal(size=3) * 0.01 * k)))
+                                        *quaternion(R.tolist()), *(plant.w + rng.normal(size=3) * 0.01 * k)))
