@@ -13,6 +13,7 @@ from perch_eval.flight import Flight
 from perch_eval.identification import command, page
 from perch_eval.identification.fit import Found, battery, identify, rates, thrust
 from perch_eval.identification.record import Record, record_of
+from scipy.signal import lfilter, lfiltic
 
 VEHICLE = load_vehicle("snapdragon_rates")
 LAG, GAIN, DELAY, THRUST_LAG, THRUST_GAIN, DRAG = (0.05, 0.04, 0.11), (1.0, 0.9, 1.05), 0.012, 0.07, 0.93, (0.05, 0.04, 0.03)
@@ -28,19 +29,17 @@ def record(size=2.5, seconds=20.0, seed=1, oscillation=0.0):
     u[:, 3] = 9.81 + u[:, 3]
     fine = PERIOD / FINE
     held = u[np.clip((np.arange(n * FINE) - round(DELAY / fine)) // FINE, 0, None)]
-    y, speed, x, dx = np.zeros((n, 4)), np.zeros((n, 3)), np.array([0.0, 0.0, 0.0, 9.81 * THRUST_GAIN]), np.zeros(4)
-    lag, gain = np.array([*LAG, THRUST_LAG]), np.array([*GAIN, THRUST_GAIN])
-    for k in range(n):
-        total = np.zeros(4)
-        for i in range(FINE):
-            wanted = gain * held[k * FINE + i]
-            if oscillation:
-                dx += fine * (oscillation**2 * (wanted - x) - 0.1 * oscillation * dx)
-                x = x + fine * dx
-            else:
-                x = x + fine * (wanted - x) / lag
-            total += x
-        y[k] = total / FINE
+    wanted, answer, speed = held * (*GAIN, THRUST_GAIN), np.zeros((n * FINE, 4)), np.zeros((n, 3))
+    start = np.array([0.0, 0.0, 0.0, 9.81 * THRUST_GAIN])
+    for i, lag in enumerate((*LAG, THRUST_LAG)):
+        if oscillation:  # dx += fine (w^2 (wanted - x) - 0.1 w dx), then x += fine dx
+            spring, damping = (fine * oscillation)**2, 0.1 * fine * oscillation
+            b, a = [spring], [1.0, spring + damping - 2.0, 1.0 - damping]
+        else:            # x += fine (wanted - x) / lag
+            b, a = [fine / lag], [1.0, fine / lag - 1.0]
+        at_rest = lfiltic(b, a, [start[i]] * (len(a) - 1))
+        answer[:, i] = lfilter(b, a, wanted[:, i], zi=at_rest)[0]
+    y = answer.reshape(n, FINE, 4).mean(axis=1)
     for i, T in enumerate((1.7, 2.3, 2.9)):
         speed[:, i] = 0.8 * np.sin(2 * np.pi * command_t / T)
     gyro = y[:, :3] + 0.01 * rng.standard_normal((n, 3)) + 0.004
@@ -97,12 +96,10 @@ def test_rotors_are_identified_from_their_speeds():
     n, tau, hover = 9000, 0.04, 1200.0
     t, scale = PERIOD * np.arange(n), 1.07
     speeds = hover + np.stack([150 * np.sin(2 * np.pi * f * t) + 40 * np.sin(9 * t) for f in (0.7, 1.1, 1.6, 2.3)], axis=1)
-    omega, felt = speeds[0].copy(), np.zeros(n)
-    vehicle = load_vehicle("snapdragon")
-    for k in range(n):
-        for _ in range(FINE):
-            omega += PERIOD / FINE * (speeds[k] - omega) / tau
-            felt[k] += scale * vehicle.thrust_coefficient * np.sum(omega**2) / vehicle.mass / FINE
+    vehicle, share = load_vehicle("snapdragon"), PERIOD / FINE / tau
+    held = np.repeat(speeds, FINE, axis=0)
+    omega = lfilter([share], [1.0, share - 1.0], held, axis=0, zi=(1.0 - share) * speeds[:1])[0]
+    felt = scale * vehicle.thrust_coefficient * np.sum(omega**2, axis=1).reshape(n, FINE).mean(axis=1) / vehicle.mass
     v = 0.5 * np.sin(3.0 * t)[:, None] * np.ones(3)
     noise = 0.3 * np.random.default_rng(4).standard_normal((n, 3))
     accel = np.stack([0 * felt, 0 * felt, felt], axis=1) + noise - 0.2 * v
@@ -121,6 +118,7 @@ def test_the_program_flies_and_writes_a_vehicle_file(tmp_path, monkeypatch, caps
     """On a vehicle whose loop is 1.3 times as slow as its file says, and 4 % heavier."""
     (tmp_path / "slow.yaml").write_text("name: slow\nextends: surface_90\ndisturbance: {loop_lag_factor: 1.3, mass_factor: 1.04}\n")
     monkeypatch.setattr(command.flight, "ROUNDS", 1)
+    monkeypatch.setattr(command.flight, "MOVES", command.flight.MOVES[:4])
     monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", "--scenario", str(tmp_path / "slow.yaml"), "--out",
                                      str(tmp_path)])
     assert command.main() in (0, 1), capsys.readouterr().err  # drag needs a longer flight
