@@ -236,11 +236,17 @@ def play(flight: str, name: str, sent: Sequence[Spoilt], strict: bool, last: int
 
 
 @lru_cache(maxsize=None)
+def _undisturbed(flight: str, name: str) -> tuple[_Played, list[int]]:
+    """A game in which nothing is sent, as far as it was played, and how many outputs there were after so many events."""
+    return _Played(flight, name), [0]
+
+
 def _untouched(flight: str, name: str, last: int) -> list[Any]:
-    one = _Played(flight, name)
-    for event in recorded(flight)[name][:last]:
+    one, counts = _undisturbed(flight, name)
+    for event in recorded(flight)[name][len(counts) - 1:last]:
         one.call(event.method, _handed(event))
-    return one.outputs
+        counts.append(len(one.outputs))
+    return one.outputs[:counts[last]]
 
 
 def drawn(flight: str, name: str, seed: int) -> tuple[list[Spoilt], bool, int]:
