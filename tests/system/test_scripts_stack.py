@@ -11,7 +11,7 @@ from contextlib import suppress
 import psutil
 import pytest
 from perch_eval.domain import reserved_domain
-from system.scripts import PATIENCE, call_script, run_script, start_script
+from system.scripts import PATIENCE, call_script, fork_script, run_script, start_script
 
 NODES = ("estimator", "controller")  # they wait for a vehicle that does not come: no flight is needed here
 
@@ -54,17 +54,24 @@ def children(process: subprocess.Popen) -> dict[str, psutil.Process]:
     return found
 
 
-@pytest.mark.parametrize("mode, number", [([], signal.SIGINT), (["--composed", "--namespace", "/quad1"], signal.SIGTERM)],
-                         ids=["processes", "composed in a namespace"])
-def test_ready_then_stopped_without_leftovers(start, tmp_path, mode, number):
-    process = start(*mode)
+@pytest.mark.parametrize("composed, number", [(False, signal.SIGINT), (True, signal.SIGTERM)], ids=["processes with a live view", "composed in a namespace"])
+def test_ready_then_stopped_without_leftovers(start, tmp_path, composed, number):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = start("--composed", "--namespace", "/quad1") if composed else start("--view", str(port))
     started = children(process)
-    assert set(started) == ({"composed"} if mode else set(NODES))
+    assert set(started) == ({"composed"} if composed else {*NODES, "viewer"})
+    if not composed:
+        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as client:
+            client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                           b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n")
+            assert client.recv(200).startswith(b"HTTP/1.1 101")
     process.send_signal(number)
     out, error = process.communicate(timeout=PATIENCE)
     assert (process.returncode, error) == (0, "") and out.endswith("stopped\n")
     assert not any(child.is_running() for child in started.values())
-    assert {file.name for file in tmp_path.glob("*.yaml")} == {f"{node}.yaml" for node in NODES}
+    assert {file.name for file in tmp_path.glob("*.yaml")} == {f"{node}.yaml" for node in (NODES if composed else (*NODES, "viewer"))}
     logs = "".join(file.read_text() for file in tmp_path.glob("*.log"))
     assert "Traceback" not in logs
 
@@ -110,26 +117,11 @@ def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, tmp_path):
     assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
 
 
-@pytest.mark.parametrize("parameter, words", [("no_such_gain:=1", "no_such_gain"), ("gate_probability:=7.0", "gate_probability: 7 is outside")])
-def test_a_parameter_that_a_node_refuses_is_the_callers_mistake(parameter, words, domain, tmp_path):
-    result = run_script("start_stack.py", "--only", "estimator", "-p", f"estimator.{parameter}", "--domain", domain, "--log-dir", str(tmp_path))
+def test_a_parameter_that_a_node_refuses_is_the_callers_mistake(domain, tmp_path):
+    """What each node refuses is shown in test_bad_input.py."""
+    result = run_script("start_stack.py", "--only", "estimator", "-p", "estimator.gate_probability:=7.0", "--domain", domain, "--log-dir", str(tmp_path))
     assert result.returncode == 2
-    assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
-
-
-def test_the_live_view_is_served_until_the_stack_is_stopped(start):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    process = start("--view", str(port))
-    assert set(children(process)) == {*NODES, "viewer"}
-    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as client:
-        client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-                       b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n")
-        assert client.recv(200).startswith(b"HTTP/1.1 101")
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, error) == (0, "")
+    assert "gate_probability: 7 is outside" in result.stderr and "Traceback" not in result.stderr + result.stdout
 
 
 def test_a_port_in_use_is_the_callers_mistake(domain, tmp_path):
@@ -145,11 +137,11 @@ def test_a_port_in_use_is_the_callers_mistake(domain, tmp_path):
 def test_a_single_node(domain):
     process = start_script("run_node.py", "estimator", "--ros-args", "-p", "gate_probability:=0.5", ROS_DOMAIN_ID=domain)
     try:
-        answer = run_script("param.py", "get", "/estimator", "gate_probability", "--spin-time", str(PATIENCE), ROS_DOMAIN_ID=domain)
+        answer = fork_script("param.py", "get", "/estimator", "gate_probability", "--spin-time", str(PATIENCE), ROS_DOMAIN_ID=domain)
         assert (answer.returncode, answer.stdout) == (0, "0.5\n")
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0 and "Traceback" not in error
     finally:
         process.kill()
-    assert "'ghost' is not one of vehicle" in run_script("run_node.py", "ghost").stderr
+    assert "'ghost' is not one of vehicle" in call_script("run_node.py", "ghost").stderr
