@@ -60,7 +60,7 @@ def test_dynamics_of_a_stage_are_the_rigid_bodys(states):
     following = np.array(stage(SNAPDRAGON, step, layout)(z)[0]).ravel()
     p, R, v, w = z[0:3], Rotation.from_quat(z[3:7]), z[7:10], z[10:13]
     u, change, d = z[states:states + 4], z[states + 17:states + 21], z[states + 21:states + 27]
-    n = 4000
+    n = 1000
     for k in range(n):
         h = step / n
         f = z[13:17] + u * step * (k + 0.5) / n if states == 17 else u + change * (k + 0.5) / n

@@ -42,5 +42,9 @@ def test_without_l1_nothing_is_made_of_it():
 
 def test_a_heavy_vehicle_perches_in_the_wind():
     """The plan is made for the file's mass: one of four may touch too fast."""
-    flights = [fly("geometric + L1", "wind 5 m/s, mass +20 %", "perch", seed) for seed in (1, 2, 3, 4)]
-    assert sum(flown.outcome == "perched" for flown in flights) >= 3
+    outcomes = []
+    for seed in (1, 2, 3, 4):
+        outcomes.append(fly("geometric + L1", "wind 5 m/s, mass +20 %", "perch", seed).outcome)
+        if outcomes.count("perched") == 3:
+            return
+    pytest.fail(f"{outcomes}")
