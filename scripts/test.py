@@ -20,6 +20,7 @@ PARTS = (
     ("tests/system/test_restart.py", "tests/system/test_stopping.py", "tests/nodes/"),
     ("tests/system/test_flight_surface.py",), ("tests/system/test_campaign.py",), ("tests/system/test_bad_input.py",),
     ("tests/unit/test_goals_in_a_row.py",), ("tests/unit/test_autopilot_firmware.py",), ("tests/recordings/",),
+    ("tests/fuzz/test_messages.py",), ("tests/unit/test_vio_filter.py",),
 )
 """What takes longest, so it begins first; files and folders of one part share what is dear to make. Each other file is a part."""
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
@@ -128,7 +129,7 @@ def become_another(config, output: IO[str]) -> None:
     from perch_core.processes import end_with_parent
     from perch_eval.domain import free_domain
 
-    end_with_parent(signal.SIGTERM)
+    end_with_parent(signal.SIGKILL)
     os.environ["ROS_DOMAIN_ID"] = str(free_domain())
     capture = config.pluginmanager.getplugin("capturemanager")
     capture.stop_global_capturing()
