@@ -17,6 +17,7 @@ from perch_control.flight import FlightController
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.guidance import Hold
+from perch_control.maneuvers import entered, following
 from perch_control.modes import Command, State
 from perch_control.nmpc import NmpcController, NmpcSettings
 from perch_control.parameters import ControllerChoice, ControllerParameters
@@ -109,14 +110,14 @@ class Loop:
 
     def begin_in_hover(self, p=(0.0, 0.0, 1.2)) -> None:
         """Put the vehicle into a hover at `p` without flying there."""
-        plant, maneuvers = self.plant, self.controller.maneuvers
+        plant, flight = self.plant, self.controller
         plant.p, hover = np.array(p, float), plant.vehicle.mass * 9.81 / 4 / plant.vehicle.thrust_coefficient
         plant.speed = np.full(4, np.sqrt(hover))
         self.run(PERIOD)
         self.flight.vehicle.command = None
-        maneuvers.enter(State.HOVERING, "in the air")
-        maneuvers.rotors = RotorEstimate(tuple(plant.speed.tolist()), tuple(plant.speed.tolist()))
-        maneuvers.run(Hold.at(plant.p, (0.0, 1.0, 0.0)))
+        rotors = RotorEstimate(tuple(plant.speed.tolist()), tuple(plant.speed.tolist()))
+        hovering = entered(flight.flown, State.HOVERING, "in the air")._replace(rotors=rotors)
+        flight.flown = following(hovering, Hold.at(plant.p, (0.0, 1.0, 0.0)))
         self.run(0.3)
 
     def take_off(self, height: float = 1.2) -> None:

@@ -192,10 +192,10 @@ def test_laws_switch_in_flight_without_a_jump():
     loop.run(0.8)
     flight, law = loop.controller, predictive()
     for following in (law, GeometricController(SNAPDRAGON, ControlGains()), law):
-        before = np.array(flight.maneuvers.rotors.command)
-        flight.use(following, flight.maneuvers.gains, flight.settings)
+        before = np.array(flight.flown.rotors.command)
+        flight.use(following, flight.gains, flight.settings)
         loop.run(0.002)
-        after = np.array(flight.maneuvers.rotors.command)
+        after = np.array(flight.flown.rotors.command)
         assert np.abs(after - before).max() < 0.15 * before.max()
         loop.run(0.2)
     loop.run(1.5)
@@ -258,5 +258,5 @@ def test_interpreted_linearisation_flies_the_same(monkeypatch):
     for law in (slow, fast):
         loop = make_loop(law=law)
         loop.begin_in_hover()
-        speeds.append(loop.controller.maneuvers.rotors.command)
+        speeds.append(loop.controller.flown.rotors.command)
     np.testing.assert_allclose(speeds[0], speeds[1], rtol=1e-6)

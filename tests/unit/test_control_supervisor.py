@@ -10,6 +10,7 @@ from perch_control import monitors
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
+from perch_control.maneuvers import following
 from perch_control.modes import Command, CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
 from perch_control.reference import FlatReference, SampledReference
@@ -112,7 +113,7 @@ def test_motors_that_idle_without_an_order_are_stopped():
     loop.run(9.95)
     assert loop.controller.state is State.ARMED
     loop.run(0.1)
-    assert loop.controller.state is State.DISARMED and "no trajectory for 10 s" in loop.controller.maneuvers.message
+    assert loop.controller.state is State.DISARMED and "no trajectory for 10 s" in loop.controller.flown.message
     loop.controller.command(Command.ARM)
     loop.follow(rest_to_rest(np.zeros(3), np.array([0, 0, 1.0]), 0, 0, 2.0))
     loop.run(0.9)
@@ -134,7 +135,7 @@ def test_attached_stops_the_motors_and_arming_again_recovers():
     loop.run(plan.trajectory.duration + 0.04)
     loop.controller.command(Command.ATTACHED, "test")
     loop.run(0.05)
-    assert loop.controller.state is State.ATTACHED and np.all(np.array(loop.controller.maneuvers.rotors.command) == 0)
+    assert loop.controller.state is State.ATTACHED and np.all(np.array(loop.controller.flown.rotors.command) == 0)
     loop.controller.command(Command.ARM)
     assert loop.controller.state is State.RECOVERING
     assert loop.run(4.0, until=lambda x: x.controller.state is State.HOVERING), loop.events
@@ -181,7 +182,7 @@ def test_replacing_a_trajectory_keeps_the_reference_continuous():
     p = loop.plant.p.copy()
     loop.follow(rest_to_rest(p, p + [2, 0, 0], 0, 0, 2.0), id=1)
     loop.run(1.0)
-    x = loop.controller.maneuvers.setpoint(0.04)
+    x = loop.controller.flown.setpoint(0.04)
     # The new plan starts a little beside the running reference, as a re-plan on an estimate does.
     c = brake(np.array(x.p) + [0.05, 0.1, 0], x.v, x.a, x.h)._trajectory
     loop.references.clear()
@@ -190,7 +191,7 @@ def test_replacing_a_trajectory_keeps_the_reference_continuous():
     r = np.array(loop.references)
     velocity = np.diff(r, axis=0) / 0.002
     assert np.abs(np.diff(velocity, axis=0) / 0.002).max() < 12.0
-    assert loop.controller.maneuvers.trajectory_id == 2
+    assert loop.controller.flown.trajectory_id == 2
 
 
 def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
@@ -237,32 +238,32 @@ def test_brake_meets_state_and_rest():
 def test_each_fault_leads_to_its_answer(fault, expected, word, monkeypatch):
     settings = FlightSettings(fence_high=(1.0, 20.0, 20.0), silence_time=0.5 if fault == "silence" else 60.0)
     loop = hovering(settings=settings)
-    m, p = loop.controller.maneuvers, loop.plant.p.copy()
+    flight, p = loop.controller, loop.plant.p.copy()
     if fault in ("fence", "coasting", "lost"):
         loop.follow(rest_to_rest(p, p + [3, 0, 0], 0, 0, 3.0))
         loop.run(0.5)
     if fault == "far":
-        loop.controller.use(loop.controller.law, m.gains, FlightSettings(fence_high=(p[0] - 1.2, 20.0, 20.0)))
+        flight.use(flight.law, flight.gains, FlightSettings(fence_high=(p[0] - 1.2, 20.0, 20.0)))
     elif fault == "tilt":
         loop.plant.w = np.array([0.0, 18.0, 0.0])
     elif fault == "rate":
         loop.plant.w = np.array([0.0, 0.0, 60.0])
     elif fault == "error":
-        m.run(Hold.at(p + [1.5, 0, 0], (0, 1, 0)))
+        flight.flown = following(flight.flown, Hold.at(p + [1.5, 0, 0], (0, 1, 0)))
     elif fault == "margin":
         monkeypatch.setattr(monitors, "_MARGIN_LEAST", 0.45)
         loop.plant.disturbances.mass_factor = 1.25
     elif fault == "heavy":
         loop.plant.disturbances.mass_factor = 1.7
     elif fault == "coasting":
-        loop.controller.supervisor.estimator(2, 1.2, "")
+        loop.controller.estimator(2, 1.2, "")
     elif fault == "lost":
-        loop.controller.supervisor.estimator(2, 3.2, "")
+        loop.controller.estimator(2, 3.2, "")
     elif fault == "diverged":
-        loop.controller.supervisor.estimator(3, 0.1, "covariance")
-    reached = loop.controller.state is expected and word in m.message
-    reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in m.message)
-    assert reached, (loop.controller.state, m.message, loop.events)
+        loop.controller.estimator(3, 0.1, "covariance")
+    reached = loop.controller.state is expected and word in flight.flown.message
+    reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in flight.flown.message)
+    assert reached, (loop.controller.state, flight.flown.message, loop.events)
 
 
 @pytest.mark.parametrize("tilt", [70.0, 135.0, 180.0])
@@ -298,7 +299,7 @@ def along_x(start: float, p: float, v: float, duration: float, brakes: bool = Fa
 def leaving(recovery_start: float = 1.6):
     """A hovering vehicle that has just begun to track a plan with an appended recovery."""
     loop = hovering()
-    now, mass = loop.controller.maneuvers.now, loop.controller.vehicle.mass
+    now, mass = loop.controller.flown.now, loop.controller.vehicle.mass
     plan = along_x(now, 0.0, 0.4, 2.5)
     loop.controller.follow(Order(7, SampledReference(plan, mass), now, AtEnd.RECOVER, 0.25, recovery_start))
     loop.run(0.1)
@@ -319,13 +320,13 @@ def test_an_abort_leaves_by_the_next_planned_recovery():
     message = loop.controller.abort("stop it")
     assert "stop it" in message and "planned recovery in 0.2" in message
     loop.run(0.15)
-    assert loop.controller.maneuvers.order.start == start, "flown on until it begins"
+    assert loop.controller.flown.order.start == start, "flown on until it begins"
     loop.run(0.15)
-    assert loop.controller.maneuvers.order.start == pytest.approx(start + 0.6)
+    assert loop.controller.flown.order.start == pytest.approx(start + 0.6)
     assert loop.controller.state is State.RECOVERING and "recovering as planned: stop it" in loop.controller.abort()
     loop.run(1.2)
     assert loop.controller.state is State.HOVERING
-    assert np.linalg.norm(loop.controller.maneuvers.belief[3:6]) < 0.1
+    assert np.linalg.norm(loop.controller.flown.belief[3:6]) < 0.1
 
 
 @pytest.mark.parametrize("others", [(), (("id", 6), 0.5), (("id", 7), 1.4)])
@@ -342,7 +343,7 @@ def test_near_the_wire_the_plans_own_recovery_is_the_way_out():
     loop, start = leaving(recovery_start=0.5)
     loop.run(0.1)
     loop.controller.command(Command.HOVER, "cancelled")
-    assert loop.controller.state is State.TRACKING and "planned recovery in 0.3" in loop.controller.maneuvers.message
+    assert loop.controller.state is State.TRACKING and "planned recovery in 0.3" in loop.controller.flown.message
 
 
 def test_a_recovery_from_the_present_state_takes_the_place_of_the_appended_one():
@@ -350,9 +351,9 @@ def test_a_recovery_from_the_present_state_takes_the_place_of_the_appended_one()
     ready(loop, start, start + 0.2)
     ready(loop, start, start + 0.5)
     loop.run(0.35)
-    assert loop.controller.maneuvers.order.start == start, "nobody aborts: the plan is flown to the wire"
+    assert loop.controller.flown.order.start == start, "nobody aborts: the plan is flown to the wire"
     loop.run(0.1)
-    assert loop.controller.maneuvers.order.start == pytest.approx(start + 0.5)
+    assert loop.controller.flown.order.start == pytest.approx(start + 0.5)
     loop.run(1.5)
     assert loop.controller.state is State.HOVERING
 
@@ -361,4 +362,4 @@ def test_without_one_the_appended_recovery_is_flown():
     loop, start = leaving(recovery_start=0.5)
     ready(loop, start, start + 0.2)
     loop.run(0.6)
-    assert loop.controller.maneuvers.order.start == start
+    assert loop.controller.flown.order.start == start

@@ -75,7 +75,7 @@ def test_lost_vio_does_not_brake_into_the_wall():
         loop.begin_in_hover()
         loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
         loop.run(0.04 + plan.trajectory.duration - before)
-        loop.controller.supervisor.estimator(2, 1.5, "")
+        loop.controller.estimator(2, 1.5, "")
         return loop.controller.state
 
     assert flown(0.4) is State.TRACKING, "no brake ends before the wall"

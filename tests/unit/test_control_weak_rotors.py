@@ -126,7 +126,7 @@ def test_weak_rotors_hover_on_what_is_left():
     assert loop.controller.state is State.HOVERING and np.all(loop.rmse < 0.03)
     nominal = load_vehicle("snapdragon").thrust_max
     assert loop.controller.vehicle.thrust_max == pytest.approx(0.7 * nominal, rel=0.03)
-    assert loop.controller.maneuvers.vehicle is loop.controller.vehicle is loop.controller.law.vehicle
+    assert loop.controller.flown.vehicle is loop.controller.vehicle is loop.controller.law.vehicle
 
 
 @pytest.mark.parametrize("before, state", [(0.45, State.LANDING), (0.25, State.TRACKING)])

@@ -215,7 +215,7 @@ def test_odometry_that_jumps_and_does_not_know_where_it_is_is_not_followed(varia
     flight = hovering()
     flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=variance * np.eye(6))
     assert flight.state is state and "position jumped" in flight.said
-    assert (flight.component.flight.maneuvers.belief[0] > 0.9) == (state is State.HOVERING)
+    assert (flight.component.flight.flown.belief[0] > 0.9) == (state is State.HOVERING)
 
 
 def test_odometry_in_another_frame_is_ignored():
@@ -361,7 +361,7 @@ def test_samples_are_flown_by_their_normalised_quaternions():
     flight.follow(samples(flight, q=q), at_end=AtEnd.HOLD)
     flight.step(0.1)
     assert flight.state is State.TRACKING
-    assert np.linalg.norm(flight.component.flight.maneuvers.order.source.trajectory.q, axis=1) == pytest.approx(1.0, abs=1e-12)
+    assert np.linalg.norm(flight.component.flight.flown.order.source.trajectory.q, axis=1) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_attached_before_any_odometry_is_refused():

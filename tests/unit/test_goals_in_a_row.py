@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from perch_control.maneuvers import recovered
 from perch_control.modes import State
 from perch_core.values import Ask, ImuSample
 from perch_eval.goal import goal_of
@@ -51,7 +52,7 @@ def test_perch_depart_and_perch_again(name):
         while given_up and not plant.hold.active and loop.time < begun + 40.0:
             loop.step()
         if given_up:
-            flight.maneuvers.recover("test")
+            flight.flown = recovered(flight.flown, "test")
         while sent.result is None and loop.time < begun + 60.0:
             loop.step()
         assert sent.result is not None and sent.result.success, (sent.result, loop.trace.phases[-3:])

@@ -59,4 +59,4 @@ def test_upside_down_on_the_ground_is_failed_within_one_and_a_half_seconds(fault
     while flight.state is not State.FAILED and loop.time < lying + 1.6:
         loop.step()
     loop.close()
-    assert flight.state is State.FAILED and loop.time < lying + 1.5, (flight.state, flight.maneuvers.message)
+    assert flight.state is State.FAILED and loop.time < lying + 1.5, (flight.state, flight.flown.message)

@@ -89,7 +89,7 @@ def test_the_supervisor_leaves_by_a_way_out_where_vio_is_lost(left):
     loop.run(t)
     found = way_out(t).trajectory
     loop.controller.keep_ready(Order(1, FlatReference(replace(found, start_time=start + t)), start + t))
-    loop.controller.supervisor.estimator(2, LOST_FOR, "")
+    loop.controller.estimator(2, LOST_FOR, "")
     assert loop.run(0.1, until=lambda x: x.controller.state is State.RECOVERING)
     loop.controller.command(Command.HOVER)
     assert loop.controller.state is State.RECOVERING, "it is not cut short"

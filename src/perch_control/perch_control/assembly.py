@@ -179,6 +179,6 @@ class Assembly:
             self._show_lines(law)
 
     def _show_lines(self, law: Law) -> None:
-        belief = self.flight.maneuvers.belief
+        belief = self.flight.flown.belief
         if self._params.nmpc.lines.any and belief:
             law.lines(chosen_lines(self._segments, np.array(belief[0:3]), self._params.nmpc.lines.watched))

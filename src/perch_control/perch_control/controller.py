@@ -122,7 +122,7 @@ class Controller(Component[ControllerParameters]):
 
     def _believed(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is of the present; a time that has evidently begun anew is a new flight."""
-        verdict = self._stamps.judge(stamp, may_restart=not self.flight.maneuvers.flying or self._gone)
+        verdict = self._stamps.judge(stamp, may_restart=not self.flight.flown.flying or self._gone)
         if verdict is Stamp.PRESENT:
             self._spoke = True
             return True
@@ -136,7 +136,7 @@ class Controller(Component[ControllerParameters]):
             self._begin()
         else:
             self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s")
-            self.flight.maneuvers.descend("time has jumped ahead")
+            self.flight.descend("time has jumped ahead")
         self._spoke = True
         return True
 
@@ -149,7 +149,7 @@ class Controller(Component[ControllerParameters]):
             return
         silent = now - self._spoken
         self._gone = silent >= GONE
-        if self.flight.maneuvers.flying and silent >= nanoseconds(BLIND_AFTER):
+        if self.flight.flown.flying and silent >= nanoseconds(BLIND_AFTER):
             self._answer_silence(self._stamps.newest + silent, "neither odometry nor IMU: descending by the clock")
 
     def _answer_silence(self, stamp: int, why: str) -> None:
@@ -165,8 +165,8 @@ class Controller(Component[ControllerParameters]):
         try:
             self.flight.follow(self._assembly.order(order))
         except PerchError as error:
-            self.flight.maneuvers.message = f"trajectory {order.id} refused: {error}"
-            self.warn(self.flight.maneuvers.message)
+            self.flight.refused(f"trajectory {order.id} refused: {error}")
+            self.warn(self.flight.flown.message)
 
     def on_recovery(self, order: TrajectoryOrder) -> None:
         """Keep a way out of the trajectory with the same id."""
@@ -186,7 +186,7 @@ class Controller(Component[ControllerParameters]):
         try:
             self.flight.command(Command(command.command), command.reason[:_WORDS])
         except ValueError as error:  # CommandRefused, or no such command
-            self.flight.maneuvers.message = str(error)
+            self.flight.refused(str(error))
             self.warn(f"command: {error}")
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
@@ -208,7 +208,7 @@ class Controller(Component[ControllerParameters]):
         if self._stamps.begun and abs(newest - health.stamp) > STALE:
             self.warn(f"estimator/status: of {seconds(health.stamp):.3f} s, not of the present ({seconds(newest):.3f} s): ignored", every=1.0)
             return
-        self.flight.supervisor.estimator(health.state, float(health.vio_age), health.message[:_WORDS])
+        self.flight.estimator(health.state, float(health.vio_age), health.message[:_WORDS])
 
     # -- services ----------------------------------------------------------------------------------------------------
 
@@ -263,17 +263,16 @@ class Controller(Component[ControllerParameters]):
         self._due = min(self._statuses * STATUS_PERIOD, self._references * period, self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE)
 
     def _emit_status(self, stamp: int) -> None:
-        flight, maneuvers = self.flight, self.flight.maneuvers
-        running = maneuvers.order
+        flight, x = self.flight, self.flight.flown
         self.status(ControllerStatus(
-            stamp=stamp, state=int(flight.state), controller=flight.law_name, trajectory_id=maneuvers.trajectory_id,
-            trajectory_time=float(flight.trajectory_time), trajectory_duration=float(running.source.duration) if running else 0.0,
-            position_error=float(flight.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
-            thrust_margin=float(flight.margin), message=maneuvers.message))
+            stamp=stamp, state=int(flight.state), controller=flight.law_name, trajectory_id=x.trajectory_id,
+            trajectory_time=float(flight.trajectory_time), trajectory_duration=float(x.order.source.duration) if x.order else 0.0,
+            position_error=float(x.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
+            thrust_margin=float(x.margin), message=x.message))
 
     def _emit_reference(self, stamp: int, x: Setpoint, result: StepResult) -> None:
         self.reference(ControlReference(
-            stamp, self.flight.maneuvers.trajectory_id, p=x.p, q=result.q_C, v=x.v, a=x.a, w=result.w_C, dw=result.dw_C,
+            stamp, self.flight.flown.trajectory_id, p=x.p, q=result.q_C, v=x.v, a=x.a, w=result.w_C, dw=result.dw_C,
             thrust=float(result.wrench[0]), moment=tuple(result.wrench[1:4])))
 
     def _diagnose(self, stamp: int) -> None:
@@ -281,7 +280,7 @@ class Controller(Component[ControllerParameters]):
         values = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
                   "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio}
         level = 2 if flight.state is State.FAILED else 1 if flight.health.weak or flight.state in (State.RECOVERING, State.LANDING) else 0
-        self.diagnostics(Diagnostics(stamp, values, level, flight.maneuvers.message))
+        self.diagnostics(Diagnostics(stamp, values, level, flight.flown.message))
 
 
 @lru_cache(maxsize=4)

@@ -13,6 +13,7 @@ from perch_control.flight import FlightController
 from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.l1 import L1Augmentation
+from perch_control.maneuvers import recovered
 from perch_control.modes import Command, State
 from perch_control.period import NOMINAL_PERIOD
 from perch_control.reference import FlatReference, Vector
@@ -44,9 +45,9 @@ class _DryRun:
 
     def _expected(self) -> tuple[Vector, Vector]:
         """Position [m] and velocity [m/s]; at rest on the ground before the first order."""
-        if not self.flight.maneuvers.flying:
+        if not self.flight.flown.flying:
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        at = self.flight.maneuvers.expected(self.time)
+        at = self.flight.flown.expected(self.time)
         return at.p, at.v
 
 
@@ -68,7 +69,7 @@ def dry_run(vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> 
     run.follow(2, 0.4, AtEnd.CONTACT)
     run.step()
     seen.append(flight.state)
-    flight.maneuvers.recover("dry run")
+    flight.flown = recovered(flight.flown, "dry run")
     run.step()
     seen.append(flight.state)
     flight.command(Command.LAND)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
 from math import dist, inf
 
 import numpy as np
@@ -11,13 +13,14 @@ from perch_core.vehicle import ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
+from perch_control.flight_state import FlightState
 from perch_control.geometric import packed_vehicle
 from perch_control.geometric.step import predicted
 from perch_control.guidance import Running
 from perch_control.inner_loop import Later
 from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
-from perch_control.maneuvers import Maneuvers
+from perch_control.maneuvers import attached, descending, entered, landing, motors_off, recovered, stayed, stopped
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.odometry_gate import OdometryGate, Verdict
@@ -26,7 +29,7 @@ from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import thrusts
 from perch_control.schedule import Schedule
 from perch_control.smooth_position import SmoothPosition
-from perch_control.supervisor import Supervisor
+from perch_control.supervisor import Supervisor, committed
 from perch_control.thrust_belief import AIRBORNE, ThrustBelief
 
 _SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
@@ -35,51 +38,55 @@ _STILL = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
 _MARGIN_PERCH = 0.15         # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
 _IDLE_TIME = 10.0            # armed on the ground without a trajectory for so long: motors off [s]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
+_COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
+_COASTING_HOVER = 1.0        # no VIO for so long: hover; the position drifts by centimetres until then [s]
+_COASTING_LAND = 3.0         # the same: descend without position [s]
 
 
 class FlightController:
-    """Takes orders, judges odometry, supervises, and asks the control law for rotor commands."""
+    """Takes orders, judges odometry, supervises, and asks the control law for rotor commands.
+
+    Attributes:
+        flown: the state of the flight; each input and each step makes the next one of it.
+        law, compensator: that fly; no compensator: without L1.
+        gains, settings: that count; `use` replaces them.
+        odometry_age: of the last sample that was accepted [s].
+    """
 
     def __init__(self, vehicle: Vehicle, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
-        self.law = law
-        self.maneuvers = Maneuvers(vehicle, gains, settings)
-        self._schedule = Schedule(self.maneuvers)
-        self.supervisor = Supervisor(self.maneuvers, self._leave)
+        self.law, self.gains, self.settings = law, gains, settings
+        self.flown = FlightState.disarmed(vehicle)
+        self.supervisor = Supervisor(vehicle, settings)
         self.gate = OdometryGate()
         self.odometry_age = inf
-        self.margin = 1.0
-        self._spare = 1.0            # mean margin in hover
-        self.position_error = 0.0
         self.compensator: L1Augmentation | None = None
-        self._thrust = ThrustBelief(vehicle, self.maneuvers)
+        self._schedule = Schedule()
+        self._thrust = ThrustBelief(vehicle)
         self._imu_stamp = -inf
+        self._unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=250)  # IMU samples since the last odometry
         self._refused = ""
         self._smooth = SmoothPosition()
         self._period = MeasuredPeriod()
-
-    @property
-    def settings(self) -> FlightSettings:
-        """Limits and speeds; may be replaced in flight."""
-        return self.maneuvers.settings
 
     def use(self, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
         """Fly another law, or the same one with other gains and limits, from the next step on."""
         if law is not self.law:
             law.begin()
-        self.law, self.maneuvers.gains, self.maneuvers.settings = law, gains, settings
+        self.law, self.gains, self.settings = law, gains, settings
         law.believe(self.vehicle)
         law.pace(self._period.value)
-        self.supervisor.restart()
+        self.supervisor.settings = settings
+        self.supervisor.restart(self.state)
 
     @property
     def state(self) -> State:
         """As published."""
-        return self.maneuvers.state
+        return self.flown.mode
 
     @property
     def vehicle(self) -> Vehicle:
         """As it is believed to be."""
-        return self._thrust.vehicle
+        return self.flown.vehicle
 
     @property
     def health(self) -> RotorHealth:
@@ -89,7 +96,7 @@ class FlightController:
     @property
     def blind(self) -> bool:
         """A descent without position is under way."""
-        return self.maneuvers.blind is not None
+        return self.flown.blind is not None
 
     @property
     def law_name(self) -> str:
@@ -99,7 +106,7 @@ class FlightController:
     @property
     def trajectory_time(self) -> float:
         """Time since the start of the running trajectory [s], 0 without one."""
-        return self.maneuvers.elapsed if self.maneuvers.order is not None else 0.0
+        return self.flown.elapsed if self.flown.order is not None else 0.0
 
     # -- orders ------------------------------------------------------------------------------------------------------
 
@@ -109,46 +116,44 @@ class FlightController:
         Raises:
             CommandRefused: it is not possible in the present state.
         """
-        m, why = self.maneuvers, f": {reason}" if reason else ""
-        if command is Command.KILL:
-            m.motors_off(State.FAILED, f"killed{why}")
-        elif command is Command.ATTACHED:
-            if not m.belief:
-                raise CommandRefused("attached is refused: no usable odometry yet")
-            m.attach(f"attached, motors off{why}")
-        elif command is Command.DISARM:
-            if m.flying:
-                raise CommandRefused(f"disarm is refused in flight ({m.state.name.lower()}); land first, or kill")
-            m.motors_off(State.DISARMED, f"disarmed{why}")
-        elif command is Command.ARM:
-            self._arm()
-        elif not m.flying:
-            raise CommandRefused(f"{command.name.lower()} is refused: not flying ({m.state.name.lower()})")
-        elif m.blind is not None:
-            raise CommandRefused(f"{command.name.lower()} is refused: {m.message}")
-        elif command is Command.LAND:
-            m.land(f"landing{why}")
-        elif m.state is not State.RECOVERING and not self._schedule.leave(f"hover{why}", self.law):  # a recovery ends in a hover, and must not be cut short
-            m.stop(f"hover{why}")
+        self.flown = COMMANDS[command](self, self.flown, f": {reason}" if reason else "")
 
-    def _arm(self) -> None:
-        m = self.maneuvers
-        if m.state is State.ARMED or m.flying:
-            return
-        if m.state not in (State.DISARMED, State.ATTACHED):
-            raise CommandRefused(f"arm is refused: {m.state.name.lower()}; disarm first")
+    def _kill(self, x: FlightState, why: str) -> FlightState:
+        return motors_off(x, State.FAILED, f"killed{why}")
+
+    def _attach(self, x: FlightState, why: str) -> FlightState:
+        if not x.belief:
+            raise CommandRefused("attached is refused: no usable odometry yet")
+        return attached(x, f"attached, motors off{why}")
+
+    def _disarm(self, x: FlightState, why: str) -> FlightState:
+        if x.flying:
+            raise CommandRefused(f"disarm is refused in flight ({x.mode.name.lower()}); land first, or kill")
+        return motors_off(x, State.DISARMED, f"disarmed{why}")
+
+    def _land(self, x: FlightState, why: str) -> FlightState:
+        _check_flying(x, "land")
+        return landing(x, f"landing{why}", self.settings.land_speed)
+
+    def _hover(self, x: FlightState, why: str) -> FlightState:
+        _check_flying(x, "hover")
+        if x.mode is State.RECOVERING:  # it ends in a hover, and must not be cut short
+            return x
+        return self._schedule.leave(x, f"hover{why}", self.law) or stopped(x, f"hover{why}")
+
+    def _arm(self, x: FlightState, why: str) -> FlightState:
+        if x.mode is State.ARMED or x.flying:
+            return x
+        if x.mode not in (State.DISARMED, State.ATTACHED):
+            raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry_timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({self._refused})" if self._refused else ""))
-        self._thrust.reset(self.law, self.compensator)
-        if m.state is State.ATTACHED:
-            m.recover("leaving what carries the vehicle")
-            return
-        if axes_of(m.belief[6:10])[2][2] < _ARM_TILT:
+        if x.mode is State.DISARMED and axes_of(x.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
-        m.enter(State.ARMED, "armed")
-        m.start = m.now
-        m.rotors = m.rotors.turning(self.vehicle.speed_min)
-        m.ground = m.belief[2]
+        x = self._thrust.reset(x, self.law, self.compensator)
+        if x.mode is State.ATTACHED:
+            return recovered(x, "leaving what carries the vehicle")
+        return entered(x, State.ARMED, "armed")._replace(start=x.now, rotors=x.rotors.turning(x.vehicle.speed_min), ground=x.belief[2])
 
     def follow(self, order: Order) -> None:
         """Take a trajectory; it starts at its stamp and replaces the running one there.
@@ -156,18 +161,18 @@ class FlightController:
         Raises:
             TrajectoryRefused: it may not be flown.
         """
-        m = self.maneuvers
-        if m.state is State.ATTACHED:
-            self._thrust.reset(self.law, self.compensator)
-        elif m.state not in (State.ARMED, State.TRACKING, State.HOVERING):
-            raise TrajectoryRefused(f"the vehicle is {m.state.name.lower()}, not armed and ready")
-        if m.state is State.HOVERING and order.at_end is not AtEnd.HOLD and self._spare < _MARGIN_PERCH:
-            raise TrajectoryRefused(f"the thrust margin in hover is {self._spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
+        x = self.flown
+        if x.mode is State.ATTACHED:
+            x = self.flown = self._thrust.reset(x, self.law, self.compensator)
+        elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):
+            raise TrajectoryRefused(f"the vehicle is {x.mode.name.lower()}, not armed and ready")
+        if x.mode is State.HOVERING and order.at_end is not AtEnd.HOLD and x.spare < _MARGIN_PERCH:
+            raise TrajectoryRefused(f"the thrust margin in hover is {x.spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
         check_joints(order.source.trajectory)
-        check_start(order, m.now, m.expected(max(order.start, m.now)))
-        if order.at_end is AtEnd.CONTACT and m.state is State.HOVERING and self.compensator is not None:
-            self._thrust.adopt(self.law, self.compensator)
-        running = Running(m.source, order.start - m.start) if m.state is State.TRACKING and order.start >= m.now else None
+        check_start(order, x.now, x.expected(max(order.start, x.now)))
+        if order.at_end is AtEnd.CONTACT and x.mode is State.HOVERING and self.compensator is not None:
+            x = self.flown = self._thrust.adopted(x, self.law, self.compensator)
+        running = Running(x.source, order.start - x.start) if x.mode is State.TRACKING and order.start >= x.now else None
         self._schedule.put(order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT, running))
 
     def keep_ready(self, order: Order) -> None:
@@ -176,17 +181,48 @@ class FlightController:
         Raises:
             TrajectoryRefused: it may not be flown.
         """
-        self._schedule.keep_ready(order)
+        self._schedule.keep_ready(self.flown, order)
 
     def abort(self, reason: str = "abort was requested") -> str:
         """End whatever is flown in a hover, through a recovery where the vehicle is tilted. Returns what is done."""
-        if self.state in (State.TRACKING, State.HOVERING) and not self._schedule.leave(reason, self.law):
-            self._schedule.drop()
-            self.maneuvers.stop(reason)
-        return self.maneuvers.message
+        x = self.flown
+        if x.mode in (State.TRACKING, State.HOVERING):
+            left = self._schedule.leave(x, reason, self.law)
+            if left is None:
+                self._schedule.drop()
+            self.flown = left or stopped(x, reason)
+        return self.flown.message
 
-    def _leave(self, reason: str) -> bool:
-        return self._schedule.leave(reason, self.law)
+    def refused(self, message: str) -> None:
+        """Publish why an order was not taken."""
+        self.flown = self.flown._replace(message=message)
+
+    # -- sensors -----------------------------------------------------------------------------------------------------
+
+    def estimator(self, state: int, vio_age: float, message: str) -> None:
+        """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
+        if state == _DIVERGED:
+            self.descend(f"the estimator has diverged: {message}", moving=False)
+        elif state == _COASTING and vio_age > _COASTING_LAND:
+            self.descend(f"no VIO for {vio_age:.1f} s")
+        elif state == _COASTING and vio_age > _COASTING_HOVER:
+            self.flown = self._given_up(self.flown, f"no VIO for {vio_age:.1f} s")
+
+    def _given_up(self, x: FlightState, reason: str) -> FlightState:
+        """Leave a trajectory by a planned way out, or brake; where even the hardest brake would end in the surface, go on."""
+        if x.mode is not State.TRACKING:
+            return x
+        return self._schedule.leave(x, reason, self.law) or (x if committed(x) else stopped(x, f"hover: {reason}"))
+
+    def descend(self, message: str, moving: bool = True) -> None:
+        """Descend without position from now on; `moving`: the velocity can be trusted."""
+        self.flown = self._descending(self.flown, message, moving)
+
+    def _descending(self, x: FlightState, message: str, moving: bool = True) -> FlightState:
+        after = descending(x, message, self.gains, self._unseen, moving)
+        if after is not x:
+            self._unseen.clear()
+        return after
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample; used in a descent without position, and kept for its beginning. Time [s], in B [rad/s, m/s^2].
@@ -194,11 +230,11 @@ class FlightController:
         Its time also shows that odometry with an old stamp is late.
         """
         self._imu_stamp, self._thrust.felt = stamp, accel[2]
-        self.supervisor.imu(stamp, gyro, accel)
-        if self.maneuvers.blind is not None:
-            self.maneuvers.blind.imu(stamp, gyro, accel)
+        self.flown = self.supervisor.imu(self.flown, stamp, gyro, accel)
+        if self.flown.blind is not None:
+            self.flown.blind.imu(stamp, gyro, accel)
         else:
-            self.maneuvers.unseen.append((stamp, gyro, accel))
+            self._unseen.append((stamp, gyro, accel))
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -210,118 +246,124 @@ class FlightController:
             sample: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
             covariances: its own, as `OdometryGate.check` takes them.
         """
-        m = self.maneuvers
         if self._period.update(stamp):
             self.law.pace(self._period.value)
-        # Odometry that repeats itself does not stop the time.
-        dt = self._advance(stamp if stamp > m.now else max(m.now, self._imu_stamp))
         verdict = self.gate.check(stamp, sample, covariances)
-        self._believe(verdict, sample, dt)
-        self.odometry_age = m.now - self.gate.stamp if self.gate.stamp is not None else inf
-        if m.flying and m.blind is None:
+        # Odometry that repeats itself does not stop the time.
+        x = self._believed(self.flown, stamp if stamp > self.flown.now else max(self.flown.now, self._imu_stamp), verdict, sample)
+        self.odometry_age = x.now - self.gate.stamp if self.gate.stamp is not None else inf
+        if x.blind is None and x.flying:
             if self.odometry_age > self.settings.odometry_timeout:
-                m.descend(self._refused or "no odometry")
+                x = self._descending(x, self._refused or "no odometry")
             elif verdict.jumped:
-                m.stay(verdict.reason)
-        if m.blind is not None:
-            return self._descend(m.blind)
-        self._schedule.activate(self.law)
-        if m.flying:
-            self._thrust.judge(self.law, self.compensator)
-            self.supervisor.act(self.margin)
-        return self._fly() if m.flying else self._idle()
+                x = stayed(x, verdict.reason)
+        if x.blind is None:
+            x = self._schedule.activated(x, self.law)
+            if x.flying:
+                x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator))
+        return self._answered(x)
 
     def step_blind(self, stamp: float) -> StepResult:
         """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
-        m = self.maneuvers
-        self.odometry_age += self._advance(stamp)
-        if m.flying and stamp - self._imu_stamp > DOWN_TIME:
-            m.motors_off(State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
-        m.descend("no odometry")
-        return self._descend(m.blind) if m.blind is not None else self._idle()
+        dt, rotors = _later(self.flown, stamp)
+        x = self.flown.sensed(stamp, self.flown.belief, self.flown.seen, rotors)
+        self.odometry_age += dt
+        if x.flying and stamp - self._imu_stamp > DOWN_TIME:
+            x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
+        return self._answered(self._descending(x, "no odometry"))
 
-    def _advance(self, stamp: float) -> float:
-        m = self.maneuvers
-        dt = min(max(stamp - m.now, 0.0), 0.1)
-        m.now = stamp
-        m.rotors = m.rotors.after(dt, self.vehicle.motor_time_constant)
-        return dt
+    def _answered(self, x: FlightState) -> StepResult:
+        """The command that follows from the state, and the state after it."""
+        x, result = self._descent(x, x.blind) if x.blind is not None else self._fly(x) if x.flying else self._idle(x)
+        self.flown = x._replace(events=()) if x.events else x
+        return result
 
-    def _believe(self, verdict: Verdict, sample: tuple[float, ...], dt: float) -> None:
-        m = self.maneuvers
+    def _believed(self, x: FlightState, now: float, verdict: Verdict, sample: tuple[float, ...]) -> FlightState:
+        """The state at a time [s], with a sample that is usable, or predicted."""
+        dt, rotors = _later(x, now)
         if verdict.usable:
-            m.belief, self._refused = self._smooth.of(m.now, sample, m.order), ""
-            m.seen = m.now, sample
-            m.unseen.clear()
-            return
+            self._refused = ""
+            self._unseen.clear()
+            return x.sensed(now, self._smooth.of(now, sample, x.order), (now, sample), rotors)
         if verdict.reason and not self._refused:
-            m.events.append(f"refused: {verdict.reason}")
-        self._refused = verdict.reason
-        if m.belief and m.flying:
-            body, _, forward, *_ = packed_vehicle(self.vehicle)
-            f = thrusts(m.rotors.speed, self.vehicle.thrust_coefficient)
-            m.belief = predicted(m.belief, f, NO_COMPENSATION, dt, body[0], body[1:4], forward)
+            x = x._replace(events=(*x.events, f"refused: {verdict.reason}"))
+        self._refused, belief = verdict.reason, x.belief
+        if belief and x.flying:
+            body, _, forward, *_ = packed_vehicle(x.vehicle)
+            f = thrusts(rotors.speed, x.vehicle.thrust_coefficient)
+            belief = predicted(belief, f, NO_COMPENSATION, dt, body[0], body[1:4], forward)
+        return x.sensed(now, belief, x.seen, rotors)
 
-    def _fly(self) -> StepResult:
-        m = self.maneuvers
-        setpoint = m.setpoint()
-        self.position_error = dist(setpoint.p, m.belief[0:3])
-        contact = m.time_to_contact
-        state, delay = m.rotors.ahead(m.belief, self.vehicle), m.rotors.delay
-        reference = Later(m, delay) if delay > 0.0 else m
-        out = self.law.control(state, reference, m.rotors.led, self._compensation(contact), max(contact - delay, 0.0))
-        m.rotors = m.rotors.following(out.rotor_speed, state, self.vehicle, out.w_C)
-        top = self.vehicle.thrust_max
-        self.margin = (top - max(out.rotor_thrust)) / top
-        if m.state is State.HOVERING:
-            self._spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (self.margin - self._spare)
-        if self.supervisor.landed(setpoint):
-            m.motors_off(self._lying, "landed, motors off")
-            return self._idle()
-        return StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, self.margin, self._event(),
-                          m.rotors.sent)
+    def _fly(self, x: FlightState) -> tuple[FlightState, StepResult]:
+        setpoint = self.supervisor.wanted(x)
+        contact = x.time_to_contact
+        state, delay = x.rotors.ahead(x.belief, x.vehicle), x.rotors.delay
+        reference = Later(x, delay) if delay > 0.0 else x
+        out = self.law.control(state, reference, x.rotors.led, self._compensation(x, contact), max(contact - delay, 0.0))
+        rotors = x.rotors.following(out.rotor_speed, state, x.vehicle, out.w_C)
+        top = x.vehicle.thrust_max
+        margin, spare = (top - max(out.rotor_thrust)) / top, x.spare
+        if x.mode is State.HOVERING:
+            spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (margin - spare)
+        x = x.commanded(rotors, margin, spare, dist(setpoint.p, x.belief[0:3]))
+        if self.supervisor.landed(x, setpoint):
+            return self._idle(motors_off(x, self._lying, "landed, motors off"))
+        return x, StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, margin, "; ".join(x.events), rotors.sent)
 
-    def _compensation(self, contact: float) -> tuple[float, ...]:
+    def _compensation(self, x: FlightState, contact: float) -> tuple[float, ...]:
         """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
-        m = self.maneuvers
         if self.compensator is None:
             return NO_COMPENSATION
-        if m.belief[2] - m.ground < AIRBORNE:
+        if x.belief[2] - x.ground < AIRBORNE:
             self.compensator.reset()
             return NO_COMPENSATION
-        if m.state in (State.LANDING, State.RECOVERING) or contact <= 0.0 or m.may_touch(0.0):
+        if x.mode in (State.LANDING, State.RECOVERING) or contact <= 0.0 or x.may_touch(0.0):
             return self.compensator.hold()
-        return self.compensator.update(m.belief, m.rotors.speed, m.now)
+        return self.compensator.update(x.belief, x.rotors.speed, x.now)
 
-    def _descend(self, blind: BlindDescent) -> StepResult:
-        m = self.maneuvers
+    def _descent(self, x: FlightState, blind: BlindDescent) -> tuple[FlightState, StepResult]:
         if blind.landed:
-            m.motors_off(self._lying, "landed without position, motors off")
-            return self._idle()
-        speed, thrust = blind.rotors(m.rotors.led.speed)
-        m.rotors = m.rotors.following(speed, (*_NOWHERE, *blind.attitude.q, *blind.attitude.w), self.vehicle)
-        self.margin = (self.vehicle.thrust_max - max(thrust)) / self.vehicle.thrust_max
-        return StepResult(True, speed, wrench=blind.wanted(), margin=self.margin, event=self._event(), loop=m.rotors.sent)
+            return self._idle(motors_off(x, self._lying, "landed without position, motors off"))
+        speed, thrust = blind.rotors(x.rotors.led.speed)
+        rotors = x.rotors.following(speed, (*_NOWHERE, *blind.attitude.q, *blind.attitude.w), x.vehicle)
+        x = x.commanded(rotors, (x.vehicle.thrust_max - max(thrust)) / x.vehicle.thrust_max, x.spare, x.position_error)
+        return x, StepResult(True, speed, wrench=blind.wanted(), margin=x.margin, event="; ".join(x.events), loop=rotors.sent)
 
     @property
     def _lying(self) -> State:
         """What the state is on the ground, as the vehicle lies there."""
         return State.FAILED if self.supervisor.tilted else State.DISARMED
 
-    def _idle(self) -> StepResult:
-        m = self.maneuvers
-        if m.state is State.ARMED and not self._schedule.waiting and m.elapsed > _IDLE_TIME:
-            m.motors_off(State.DISARMED, f"disarmed: no trajectory for {_IDLE_TIME:g} s")
-        armed = m.state is State.ARMED
-        speed = (self.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
-        m.rotors = m.rotors.following(speed, m.belief or _STILL, self.vehicle)
-        self.margin, self.position_error = 1.0, 0.0
-        return StepResult(armed, speed, event=self._event(), loop=m.rotors.sent)
+    def _idle(self, x: FlightState) -> tuple[FlightState, StepResult]:
+        if x.mode is State.ARMED and not self._schedule.waiting and x.elapsed > _IDLE_TIME:
+            x = motors_off(x, State.DISARMED, f"disarmed: no trajectory for {_IDLE_TIME:g} s")
+        armed = x.mode is State.ARMED
+        speed = (x.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
+        rotors = x.rotors.following(speed, x.belief or _STILL, x.vehicle)
+        return (x.commanded(rotors, 1.0, x.spare, 0.0),
+                StepResult(armed, speed, event="; ".join(x.events), loop=rotors.sent))
 
-    def _event(self) -> str:
-        events = self.maneuvers.events
-        if not events:
-            return ""
-        text = "; ".join(events)
-        events.clear()
-        return text
+
+def _later(x: FlightState, now: float) -> tuple:
+    """Time that has passed until `now` [s], at most 0.1 s, and the rotors then."""
+    dt = min(max(now - x.now, 0.0), 0.1)
+    return dt, x.rotors.after(dt, x.vehicle.motor_time_constant)
+
+
+def _check_flying(x: FlightState, name: str) -> None:
+    """Refuse a command that makes sense on a reference in flight only."""
+    if not x.flying:
+        raise CommandRefused(f"{name} is refused: not flying ({x.mode.name.lower()})")
+    if x.blind is not None:
+        raise CommandRefused(f"{name} is refused: {x.message}")
+
+
+COMMANDS: dict[Command, Callable[[FlightController, FlightState, str], FlightState]] = {
+    Command.DISARM: FlightController._disarm,
+    Command.ARM: FlightController._arm,
+    Command.HOVER: FlightController._hover,
+    Command.LAND: FlightController._land,
+    Command.ATTACHED: FlightController._attach,
+    Command.KILL: FlightController._kill,
+}
+"""What carries out each command: the state after it, from the present one and the reason."""

@@ -13,7 +13,7 @@ from math import cos, radians, sin
 from perch_core.vector3 import axes_of, axpy, dot, limited, norm, scale
 from perch_core.vehicle import GRAVITY
 from perch_control.guidance import horizontal
-from perch_control.reference import Setpoint, Vector
+from perch_control.reference import ByState, Setpoint, Vector
 
 
 TIMEOUT = 6.0          # a recovery that has not come to rest by then descends [s]
@@ -41,11 +41,8 @@ def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:
     return axpy(sin(ahead), across, scale(cos(ahead), b3))
 
 
-class Recovery:
+class Recovery(ByState):
     """Guidance from the present state; `update` first in each period, then `setpoint`."""
-
-    duration = float("inf")
-    by_state = True  # a function of the state, with nothing to be previewed
 
     def __init__(self, specific_thrust_max: float, state: tuple[float, ...], normal: Vector | None) -> None:
         """

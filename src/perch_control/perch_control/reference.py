@@ -87,6 +87,12 @@ class Following(Protocol):
         """Setpoint `ahead` seconds from now."""
 
 
+class ByState:
+    """A reference that is guidance by the state: a function of the state that it was given last, with nothing to be previewed."""
+
+    duration = float("inf")
+
+
 class Resting:
     """Hover at the origin: a reference for warming up."""
 

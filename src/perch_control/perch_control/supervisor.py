@@ -4,132 +4,161 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from perch_core.vector3 import norm
+from perch_core.vector3 import axes_of, norm
+from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.admission import AtEnd, Order
-from perch_control.maneuvers import Maneuvers
+from perch_control.debounce import Debounce
+from perch_control.flight_settings import FlightSettings
+from perch_control.flight_state import FlightState
+from perch_control.maneuvers import BRAKE_HARD, landing, landing_weak, motors_off, recovered, settled, stopped
 from perch_control.modes import State
 from perch_control.monitors import CarriedTilted, TrackingMonitor
-from perch_control.debounce import Debounce
 from perch_control.recovery import TIMEOUT, Recovery
-from perch_control.reference import Setpoint
+from perch_control.reference import ByState, Setpoint, Source, peak_thrust
+from perch_control.rotor_health import HOVER_LEAST, RESERVE
 from perch_control.weak_landing import WeakLanding
 
-_COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
-_COASTING_HOVER = 1.0  # no VIO for so long: hover; the position drifts by centimetres until then [s]
-_COASTING_LAND = 3.0   # the same: descend without position [s]
-_FENCE_SLACK = 1.0     # so far outside the fence: land, since a hover has not come back [m]
-_MISSED_SPEED = 1.0    # faster than this after the planned contact: it was missed; a contact that may hold is slower [m/s]
-_GROUND_GAP = 0.12     # the descending reference is so far below the vehicle ... [m]
-_GROUND_TIME = 0.25    # ... for so long: on the ground [s]
+_FENCE_SLACK = 1.0   # so far outside the fence: land, since a hover has not come back [m]
+_MISSED_SPEED = 1.0  # faster than this after the planned contact: it was missed; a contact that may hold is slower [m/s]
+_GROUND_GAP = 0.12   # the descending reference is so far below the vehicle ... [m]
+_GROUND_TIME = 0.25  # ... for so long: on the ground [s]
+_UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
+
+
+def committed(x: FlightState) -> bool:
+    """Even the hardest brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
+    return x.needed_deceleration > BRAKE_HARD
 
 
 class Supervisor:
-    """Watches a flight and acts on it through its manoeuvres. Owns the monitors, which start anew with each state."""
+    """Watches a flight, by its mode, and says how it goes on. Owns the monitors, which start anew with each mode.
 
-    def __init__(self, maneuvers: Maneuvers, leave: Callable[[str], bool]) -> None:
-        """`leave`: takes the reason for which a trajectory is left by a planned way out, and returns whether there is one."""
-        self._maneuvers, self._leave = maneuvers, leave
+    Attributes:
+        settings: its limits; `restart` after a change.
+    """
+
+    def __init__(self, vehicle: Vehicle, settings: FlightSettings) -> None:
+        self.settings, self._rate_max = settings, vehicle.body_rate_max
         self._carried: CarriedTilted | None = None  # while motors run
-        self.restart()
+        self._judged: tuple[Source, Vehicle, bool] | None = None  # whether this reference is too much for this vehicle
+        self._wanted: tuple[Source | None, float, Setpoint] = None, 0.0, Setpoint((0.0, 0.0, 0.0))
+        self.restart(State.DISARMED)
 
-    def restart(self) -> None:
-        """Forget what has been seen so far: the state or the settings have changed."""
-        m = self._maneuvers
-        self._state = m.state
-        self._monitor = TrackingMonitor(m.settings, m.vehicle.body_rate_max)
+    def restart(self, mode: State) -> None:
+        """Forget what has been seen so far: the mode or the settings have changed."""
+        self._mode = mode
+        self._monitor = TrackingMonitor(self.settings, self._rate_max)
         self._ground = Debounce(_GROUND_TIME)
 
-    def estimator(self, state: int, vio_age: float, message: str) -> None:
-        """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
-        m = self._maneuvers
-        if state == _DIVERGED:
-            m.descend(f"the estimator has diverged: {message}", moving=False)
-        elif state == _COASTING and vio_age > _COASTING_LAND:
-            m.descend(f"no VIO for {vio_age:.1f} s")
-        elif state == _COASTING and vio_age > _COASTING_HOVER:
-            self._give_up(f"no VIO for {vio_age:.1f} s")
+    def wanted(self, x: FlightState) -> Setpoint:
+        """The running reference now; supervisor and step ask for the same one, which is worked out once."""
+        source, t = x.source, x.now - x.start
+        if self._wanted[0] is not source or self._wanted[1] != t or isinstance(source, ByState):
+            self._wanted = source, t, source.setpoint(t)
+        return self._wanted[2]
 
-    def _give_up(self, reason: str) -> None:
-        """Leave a trajectory by a planned way out, or brake; where even the hardest brake would end in the surface, go on."""
-        m = self._maneuvers
-        if m.state is State.TRACKING and not self._leave(reason) and not m.committed:
-            m.stop(f"hover: {reason}")
-
-    def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
+    def imu(self, x: FlightState, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> FlightState:
         """Take an IMU sample: time [s], in B [rad/s, m/s^2]. Running motors that only press the vehicle onto something are stopped."""
-        m = self._maneuvers
-        if not m.flying:
+        if not x.flying:
             self._carried = None
-            return
+            return x
         if self._carried is None:
             self._carried = CarriedTilted()
         self._carried.imu(stamp, gyro, accel)
         if self._carried.lasts:
-            m.motors_off(State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
+            return motors_off(x, State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
+        return x
 
     @property
     def tilted(self) -> bool:
         """What carries the vehicle, by the IMU, does not push along b3."""
         return self._carried is not None and self._carried.tilted
 
-    def act(self, margin: float) -> None:
-        """Watch one step of a flight.
+    def act(self, x: FlightState) -> FlightState:
+        """Watch one step of a flight, and how it goes on."""
+        if x.mode is not self._mode:
+            self.restart(x.mode)
+        if x.weak and not isinstance(x.source, WeakLanding) and (asked := self._beyond_what_is_left(x)):
+            return landing_weak(x, asked, self.settings.land_speed)
+        return WATCH[x.mode](self, x)
 
-        Args:
-            margin: thrust margin of the last command.
-        """
-        m = self._maneuvers
-        if m.state is not self._state:
-            self.restart()
-        if isinstance(m.source, WeakLanding):
-            m.source.update(m.belief, m.specific_thrust_max)
-            return
-        asked = m.beyond_what_is_left() if m.weak else ""
-        if asked:
-            m.land_weak(asked)
-            return
-        if isinstance(m.source, Recovery):
-            m.source.update(m.belief, m.elapsed)
-            if m.source.finished:
-                m.settle("recovered: hovering")
-            elif m.elapsed > TIMEOUT:
-                m.land("landing: the recovery did not come to rest")
-            return
-        if m.state is State.LANDING:
-            return
-        deviation = self._monitor.deviation(m.belief, m.setpoint(), m.now)
-        outside = self._monitor.outside(m.belief[0:3])
+    def _landing(self, x: FlightState) -> FlightState:
+        if isinstance(x.source, WeakLanding):
+            x.source.update(x.belief, x.specific_thrust_max)
+        return x
+
+    def _recovering(self, x: FlightState) -> FlightState:
+        source = x.source
+        if not isinstance(source, Recovery):
+            return self._on_reference(x)  # a planned way out
+        source.update(x.belief, x.elapsed)
+        if source.finished:
+            return settled(x, "recovered: hovering")
+        if x.elapsed > TIMEOUT:
+            return landing(x, "landing: the recovery did not come to rest", self.settings.land_speed)
+        return x
+
+    def _on_reference(self, x: FlightState) -> FlightState:
+        s, speed = self.settings, self.settings.land_speed
+        deviation = self._monitor.deviation(x.belief, self.wanted(x), x.now)
+        outside = self._monitor.outside(x.belief[0:3])
         if deviation:
-            m.recover(deviation)
-        elif outside > _FENCE_SLACK:
-            m.land(f"landing: {outside:.1f} m outside the geofence")
-        elif outside > 0.0 and m.state is State.TRACKING and not m.committed:
-            m.stop(f"hover: {outside:.1f} m outside the geofence")
-        elif self._monitor.exhausted(margin, m.now):
-            m.land("landing: the rotors are at their limit")
-        elif m.order is not None:
-            self._at_end(m.order, m.elapsed - m.order.source.duration)
-        elif m.elapsed > m.settings.silence_time:
-            m.land(f"landing: no order for {m.settings.silence_time:.0f} s")
+            return recovered(x, deviation)
+        if outside > _FENCE_SLACK:
+            return landing(x, f"landing: {outside:.1f} m outside the geofence", speed)
+        if outside > 0.0 and x.mode is State.TRACKING and not committed(x):
+            return stopped(x, f"hover: {outside:.1f} m outside the geofence")
+        if self._monitor.exhausted(x.margin, x.now):
+            return landing(x, "landing: the rotors are at their limit", speed)
+        if x.order is not None:
+            return self._at_end(x, x.order, x.elapsed - x.order.source.duration)
+        if x.elapsed > s.silence_time:
+            return landing(x, f"landing: no order for {s.silence_time:.0f} s", speed)
+        return x
 
-    def _at_end(self, order: Order, over: float) -> None:
+    def _at_end(self, x: FlightState, order: Order, over: float) -> FlightState:
         if order.at_end is AtEnd.CONTACT:
-            speed = norm(self._maneuvers.belief[3:6])
+            speed = norm(x.belief[3:6])
             if over > order.contact_time:
-                self._maneuvers.recover("contact was missed")
-            elif over > 0.0 and speed > _MISSED_SPEED:  # what holds does not fall
-                self._maneuvers.recover(f"contact was missed, falling with {speed:.1f} m/s")
+                return recovered(x, "contact was missed")
+            if over > 0.0 and speed > _MISSED_SPEED:  # what holds does not fall
+                return recovered(x, f"contact was missed, falling with {speed:.1f} m/s")
         elif over >= 0.0:
             if order.at_end is AtEnd.LAND:
-                self._maneuvers.land(f"landing after trajectory {order.id}")
-            else:
-                self._maneuvers.stop(f"hovering at the end of trajectory {order.id}")
+                return landing(x, f"landing after trajectory {order.id}", self.settings.land_speed)
+            return stopped(x, f"hovering at the end of trajectory {order.id}")
+        return x
 
-    def landed(self, setpoint: Setpoint) -> bool:
+    def _beyond_what_is_left(self, x: FlightState) -> str:
+        """Why weak rotors cannot go on with what is flown; empty: they can."""
+        left = x.specific_thrust_max
+        said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
+        upright = axes_of(x.belief[6:10])[2][2] >= _UPRIGHT
+        if x.order is not None:
+            if upright and x.order.at_end is AtEnd.CONTACT:
+                return f"{said}, too little to recover from a missed contact"
+            if self._judged is None or self._judged[0] is not x.source or self._judged[1] is not x.vehicle:
+                self._judged = x.source, x.vehicle, peak_thrust(x.source, x.elapsed) > RESERVE * left
+            return f"{said}, less than the trajectory needs" if self._judged[2] else ""
+        if x.mode is State.RECOVERING and not upright:
+            return ""
+        return said if left < HOVER_LEAST * GRAVITY else ""
+
+    def landed(self, x: FlightState, setpoint: Setpoint) -> bool:
         """The reference has descended away from under the vehicle for a while: the ground carries it."""
-        m = self._maneuvers
-        if isinstance(m.source, WeakLanding):
-            resting = m.source.resting(m.belief)
+        if x.mode is not State.LANDING:
+            return False
+        if isinstance(x.source, WeakLanding):
+            resting = x.source.resting(x.belief)
         else:
-            resting = abs(m.belief[5]) < 0.1 and m.belief[2] - setpoint.p[2] > _GROUND_GAP
-        return m.state is State.LANDING and self._ground.update(resting, m.now)
+            resting = abs(x.belief[5]) < 0.1 and x.belief[2] - setpoint.p[2] > _GROUND_GAP
+        return self._ground.update(resting, x.now)
+
+
+WATCH: dict[State, Callable[[Supervisor, FlightState], FlightState]] = {
+    State.TRACKING: Supervisor._on_reference,
+    State.HOVERING: Supervisor._on_reference,
+    State.RECOVERING: Supervisor._recovering,
+    State.LANDING: Supervisor._landing,
+}
+"""How each mode of flight is watched."""

@@ -10,7 +10,7 @@ from math import acos, radians, sin, sqrt
 
 from perch_control.guidance import horizontal
 from perch_control.recovery import towards
-from perch_control.reference import Setpoint
+from perch_control.reference import ByState, Setpoint
 from perch_core.vector3 import axes_of, limited, scale
 from perch_core.vehicle import GRAVITY
 
@@ -28,11 +28,8 @@ _TOUCH_SPEED = 1.2          # it does not lean where it would touch the ground f
 _DELAY = 0.1       # until the rotors have answered [s]
 
 
-class WeakLanding:
+class WeakLanding(ByState):
     """Guidance from the present state; `update` first in each period, then `setpoint`."""
-
-    duration = float("inf")
-    by_state = True
 
     def __init__(self, speed: float, state: tuple[float, ...], ground: float) -> None:
         """

@@ -17,7 +17,7 @@ from perch_control.nmpc.reference_rows import ReferenceRows
 from perch_control.nmpc.riccati import Workspace
 from perch_control.nmpc.settings import NmpcSettings
 from perch_control.period import NOMINAL_PERIOD
-from perch_control.reference import Following, Resting
+from perch_control.reference import ByState, Following, Resting
 from perch_control.rotor_lag import RotorEstimate, lag_behind
 from perch_core.errors import ConfigError
 from perch_core.jit import COMPILED
@@ -150,7 +150,7 @@ class NmpcController(Law):
     def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
                 compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
         """Rotor commands for one period; arguments as in `GeometricController.control`."""
-        if getattr(reference.source, "by_state", False):
+        if isinstance(reference.source, ByState):
             self._warm = False
             return self.fallback.control(state, reference, rotors, compensation, time_to_contact)
         # At a reference's end its thrusts jump.

@@ -34,7 +34,7 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
         PerchError: the vehicle does not fly with this file.
     """
     flight = ScriptedFlight(replace(scenario, vehicle=vehicle), seed, without=("powerline_mapper", "perching_planner", "powerline_planner"))
-    mission, state = flight.mission, flight.controller.flight.maneuvers
+    mission, controller = flight.mission, flight.controller.flight
     try:
         flight.run(flight.arm() + 0.1)
         place, yaw = mission.p_WB, 0.0
@@ -43,8 +43,8 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
             mission.follow(rest_to_rest(place, place + offset, yaw, yaw + turn, duration, mission.time + LEAD))
             place, yaw = place + offset, yaw + turn
             flight.run(flight.time + duration + LEAD + PAUSE)
-            if state.state is not State.HOVERING:
-                raise PerchError(f"the vehicle does not fly by its file: {state.message}; correct its mass or its lags")
+            if controller.state is not State.HOVERING:
+                raise PerchError(f"the vehicle does not fly by its file: {controller.flown.message}; correct its mass or its lags")
     finally:
         flight.loop.close()
     return flight.loop.trace.flight
