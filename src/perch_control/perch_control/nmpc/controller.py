@@ -90,7 +90,7 @@ class NmpcController(Law):
     def _weights(self) -> None:
         s, n = self.settings, self._layout.states
         self._lead = self.fallback.gains.lead
-        self._rate_max, self._thrust_rate_max = _RATE_RESERVE * self.vehicle.body_rate_max, _thrust_rate(self.vehicle)
+        self._rate_max, self._thrust_rate_max = _RATE_RESERVE * self._nominal.body_rate_max, _thrust_rate(self.vehicle)
         self._lag = lag_behind(self.vehicle.motor_time_constant, self._lead, self.period)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
