@@ -71,11 +71,11 @@ class FlightState(NamedTuple):
 
     def sensed(self, now: float, belief: tuple[float, ...], seen: tuple[float, tuple[float, ...]],
                rotors: RotorEstimate | InnerLoopEstimate) -> FlightState:
-        """As `_replace`, which takes four times as long."""
+        """As `_replace`, in less time: every step does it."""
         return FlightState._make(self[:-7] + (now, belief, seen, rotors) + self[-3:])
 
     def commanded(self, rotors: RotorEstimate | InnerLoopEstimate, margin: float, spare: float, position_error: float) -> FlightState:
-        """As `_replace`, which takes four times as long."""
+        """As `_replace`, in less time: every step does it."""
         return FlightState._make(self[:-4] + (rotors, margin, spare, position_error))
 
     @property
