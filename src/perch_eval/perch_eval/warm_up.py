@@ -2,58 +2,38 @@
 
     python -m perch_eval.warm_up
 
-All nodes of a scenario are run in one process on the ground for a moment of simulated time, and beside them its perch is planned: half
-of the work is the planner's. Then its flight is flown in process, which finds most of it compiled.
+All nodes of a scenario are run in one process on the ground for a moment of simulated time; then its flight is flown in process.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import sys
 import tempfile
 from pathlib import Path
 
-from perch_core import config
 from perch_eval.domain import reserved_domain
 from perch_eval.goal import SUCCESSES
 from perch_eval.in_process import Sensing, fly
 from perch_eval.nodes import ALL_NODES, programs
 from perch_eval.ros.mission_client import MissionClient
 from perch_eval.stack import Stack
-from perch_planner.planner import plan
-from perch_planner.problem_file import read_problem
-from perch_sim.scenario import Scenario, load_scenario
+from perch_sim.scenario import load_scenario
 
-SCENARIO = "surface_90"
 SIMULATED = 1.5   # [s] long enough for VIO to start and the filter to take its poses
 CLOCK_BEGINS = 1.0  # [s] the vehicle's
 PATIENCE = 600.0  # [s] wall clock
 
 
 def warm_up() -> bool:
-    """Plan a scenario's perch beside its nodes on the ground, then fly it in process; whether all got as far as they should.
+    """Run a scenario's nodes on the ground, then its flight in process; whether both got as far as they should.
 
     A kernel that is left to be compiled in flight keeps its node silent for so long that the vehicle may drop it.
 
     Raises:
         PerchError: a node ended, or did not come up.
     """
-    planning = multiprocessing.get_context("spawn").Process(target=_plan, args=(SCENARIO,), daemon=True)
-    planning.start()
-    reached = _on_the_ground(scenario := load_scenario(SCENARIO))
-    planning.join()
-    return reached and planning.exitcode == 0 and fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
-
-
-def _plan(problem: str) -> None:
-    """Plan the problem of this name in config/problems."""
-    source = config.find("problems", problem)
-    plan(*read_problem(config.read_yaml(source), str(source)))
-
-
-def _on_the_ground(scenario: Scenario) -> bool:
-    """Run a scenario's nodes until the filter has taken poses of VIO; whether they got there."""
+    scenario = load_scenario("surface_90")
     with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         folder = Path(name)
@@ -64,9 +44,10 @@ def _on_the_ground(scenario: Scenario) -> bool:
             try:
                 stack.wait_until_ready(client.visible_nodes, PATIENCE)
                 client.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
-                return client.time >= CLOCK_BEGINS + SIMULATED
+                reached = client.time >= CLOCK_BEGINS + SIMULATED
             finally:
                 client.close()
+    return reached and fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
 
 
 if __name__ == "__main__":
