@@ -112,7 +112,7 @@ def test_every_node_refuses_a_parameter_that_it_does_not_have(node, context):
 @pytest.mark.parametrize("arguments, words", [
     (["-p", "gate_probability:=7.0"], "estimator: gate_probability: 7 is outside (0, 0.999999]"),
     (["-p", "gate_probability:=often"], "estimator: gate_probability: 'often' is not of type float"),
-    (["-p", "gate_probabilty:=0.9"], "did you mean gate_probability"),
+    (["-p", "gate_probabilty:=0.9"], "estimator: gate_probabilty: unknown parameter; allowed: sensors, vio.position, vio.attitude, gate_probability"),
     (["--params-file", "/nowhere/gains.yaml"], "--params-file: /nowhere/gains.yaml: no such file"),
 ])
 def test_an_executable_ends_with_one_line_and_exit_code_2(arguments, words, ros_domain):
