@@ -42,7 +42,7 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            if not vacant(candidate):
+            if not clear(candidate):
                 continue
             _given.append(candidate)
             yield candidate
@@ -56,8 +56,9 @@ def participants(domain: int) -> list[int]:
     return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + PORTS})
 
 
-def vacant(domain: int) -> bool:
-    """Whether nobody takes part in a domain; if so, what killed nodes have left in it is removed: new ones would wait for it without end."""
+def clear(domain: int) -> bool:
+    """Remove what killed nodes have left in a domain, for which new ones would wait without end, unless somebody takes part in it; whether
+    nobody does."""
     if participants(domain):
         return False
     clean_ports(domain)
