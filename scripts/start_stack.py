@@ -101,7 +101,6 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_core import config
     from perch_sim.scenario import load_scenario
     from perch_eval.arguments import open_network, output_folder
-    from perch_eval.domain import clear
     from perch_eval.flyable import check_names
     from perch_eval.node_launch import choose_nodes, node_launches, parse_overrides
     from perch_eval.nodes import node_programs, sharing
@@ -109,7 +108,6 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_eval.view.gate import check_free
     from ros_graph.connection import visit
 
-    clear(int(os.environ["ROS_DOMAIN_ID"]))
     open_network(arguments.network)
     source = config.find("scenarios", arguments.scenario).resolve()
     scenario = load_scenario(source)

@@ -7,12 +7,13 @@ Everything that is not an option of this script goes to pytest.
 from __future__ import annotations
 
 import argparse
+import atexit
 import gc
 import os
 import signal
 import sys
 import tempfile
-from typing import IO
+from typing import IO, NoReturn
 
 from perch_setup import EXTRAS, ROOT, enter
 
@@ -66,7 +67,7 @@ def run_tests(fast: bool, for_pytest: list[str]) -> int:
     if not fast and not for_pytest and PROCESSES > 2:
         print(f"{PROCESSES} processes share the tests; what the others print comes at the end", flush=True)
         share = Share(parts(test_files()), PROCESSES)
-        return share.ended(run_pytest(["-o", "console_output_style=classic"], share))
+        share.end(run_pytest(["-o", "console_output_style=classic"], share))
     return run_pytest(["--ignore=tests/system", *for_pytest] if fast else for_pytest)
 
 
@@ -87,6 +88,7 @@ class Share:
         os.write(numbers, b"".join(number.to_bytes(2, "big") for number in range(len(parts))))
         os.close(numbers)
         self._others: list[tuple[int, IO[str]]] = []  # process ids, and what they print
+        self._forked = False
 
     def take(self) -> tuple[str, ...] | None:
         """Files and folders of the next part; None where all are taken."""
@@ -103,7 +105,7 @@ class Share:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:
                 become_another(session.config, output)
-                self._others = []
+                self._others, self._forked = [], True
                 break
             self._others.append((pid, output))
         while (part := self.take()) is not None:
@@ -114,14 +116,23 @@ class Share:
                     raise session.Interrupted(session.shouldstop)
         return True
 
-    def ended(self, code: int) -> int:
-        """The exit code of all, when all have ended and what the others print is printed; in the others, their own."""
+    def end(self, code: int) -> NoReturn:
+        """End this process: the others with their own exit code, the first one with that of all, when what the others print is printed.
+
+        Not by the C library's exit, in which threads of Fast DDS crash that tests have left.
+        """
         for pid, output in self._others:
             with output:
-                code = max(code, 1 if os.waitpid(pid, 0)[1] else 0)
+                ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
                 output.seek(0)
                 print(output.read(), flush=True)
-        return code
+            if ended:
+                code = max(code, 1)
+                print(f"the process of these tests ended with {f'signal {-ended}' if ended < 0 else f'exit code {ended}'}", flush=True)
+        if not self._forked:
+            atexit._run_exitfuncs()
+        sys.stdout.flush(), sys.stderr.flush()
+        os._exit(code)
 
 
 def become_another(config, output: IO[str]) -> None:

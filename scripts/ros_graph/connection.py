@@ -15,6 +15,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
+from perch_core.ros.shared_memory import end_unfinished
 from ros_graph.commands import GraphError
 
 T = TypeVar("T")
@@ -108,6 +109,7 @@ class Visit:
 def visit() -> Iterator[Visit]:
     """Join the graph with a hidden node, and leave it again."""
     context = Context()
+    end_unfinished()
     rclpy.init(args=[], context=context)
     node = Node(
         f"_perch_{time.time_ns() % 1_000_000_000}",

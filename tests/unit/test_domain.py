@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import mmap
-import os
 import socket
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from perch_core.errors import PerchError
@@ -33,27 +28,6 @@ def test_a_domain_in_which_somebody_takes_part_is_not_given(tmp_path):
             assert domain == 6
     with reserved_domain([5, 6], tmp_path) as domain:
         assert domain == 5
-
-
-def test_nodes_start_in_a_domain_in_which_one_was_killed_as_it_made_its_port(tmp_path):
-    """Fast DDS waits for ever for whoever made a segment to finish it."""
-    with reserved_domain([100, 101], tmp_path) as domain:
-        files = [Path(f"/dev/shm/fastrtps_port{7400 + 250 * domain + 11 + 2 * k}") for k in range(12)]
-        used, *unused = files
-        for file in files:
-            file.write_bytes(bytes(4096))
-    try:
-        with used.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
-            with reserved_domain([domain], tmp_path):
-                assert used.exists() and not any(file.exists() for file in unused)
-        for file in files:
-            file.write_bytes(bytes(4096))
-        with reserved_domain([domain], tmp_path):
-            subprocess.run([sys.executable, "-c", "import rclpy; rclpy.init(); rclpy.create_node('one'); rclpy.shutdown()"],
-                           env={**os.environ, "ROS_DOMAIN_ID": str(domain)}, timeout=300, check=True)
-    finally:
-        for file in files:
-            file.unlink(missing_ok=True)
 
 
 def test_domains_keep_below_the_ephemeral_ports():

@@ -36,18 +36,20 @@ def test_every_part_is_taken_once():
 
 
 PROGRAM = """
-import sys, pytest, test
+import os, sys, pytest, test
+sys.first = os.getpid()
 share = test.Share(PARTS, 2)
-sys.exit(share.ended(test.run_pytest(["--rootdir=.", "-c", "/dev/null", "-rA", "."], share)))
+share.end(test.run_pytest(["--rootdir=.", "-c", "/dev/null", "-rA", "."], share))
 """
 GOOD, BAD, BROKEN = "def test_{0}(one): assert one", "def test_{0}(): assert False", "import no_such_module"
 SHARED = "import pytest\n@pytest.fixture\ndef one(): return 1\n"
+CRASHED = "import os, sys\ndef test_{0}(): os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT) if os.getpid() == sys.first else os.kill(os.getpid(), 11)"
 SKIPPED = "import pytest\npytest.skip('{0}', allow_module_level=True)"
 
 
 @pytest.mark.parametrize("contents, code, words", [
     ((GOOD,) * 9, 0, {"passed": 9}), ((GOOD, SKIPPED), 0, {"passed": 1, "skipped": 2}), ((BAD, GOOD), 1, {"failed": 1, "passed": 1}),
-    ((GOOD, BROKEN, GOOD), 1, {"error": 1})])
+    ((GOOD, BROKEN, GOOD), 1, {"error": 1}), ((CRASHED, CRASHED), 1, {"passed": 1})])
 def test_two_processes_run_each_part_once_and_whatever_fails_is_told(contents, code, words, tmp_path):
     """Both have collected what is skipped as a file."""
     names = [f"test_{number}.py" for number in range(len(contents))]
@@ -60,3 +62,4 @@ def test_two_processes_run_each_part_once_and_whatever_fails_is_told(contents, c
     for line in re.findall(r"^=+ (.*) in [\d.]+s =+$", done.stdout, re.MULTILINE):
         told.update({word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", line)})
     assert (done.returncode, told) == (code, words), done.stdout + done.stderr
+    assert ("ended with signal 11" in done.stdout) == (CRASHED in contents)

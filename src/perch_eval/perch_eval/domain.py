@@ -13,7 +13,8 @@ from pathlib import Path
 import psutil
 
 from perch_core.errors import PerchError
-from perch_eval.shared_memory import FIRST_PORT, PORTS, clean_ports
+from perch_core.ros.shared_memory import end_unfinished
+from perch_eval.shared_memory import FIRST_PORT, PORTS
 
 USABLE = range(43, 102)
 """Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
@@ -23,7 +24,7 @@ _given: list[int] = []
 
 @contextlib.contextmanager
 def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None = None) -> Iterator[int]:
-    """A domain id that no other reservation on this machine holds, in which nobody takes part, and in which killed nodes have left nothing.
+    """A domain id that no other reservation on this machine holds, and in which nobody takes part.
 
     The kernel gives it back when the process ends, however it ends.
 
@@ -42,9 +43,10 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            if not clear(candidate):
+            if participants(candidate):
                 continue
             _given.append(candidate)
+            end_unfinished()
             yield candidate
             return
     raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")
@@ -54,15 +56,6 @@ def participants(domain: int) -> list[int]:
     """UDP ports of a domain that are bound on this machine."""
     first = FIRST_PORT + PORTS * domain
     return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + PORTS})
-
-
-def clear(domain: int) -> bool:
-    """Remove what killed nodes have left in a domain, for which new ones would wait without end, unless somebody takes part in it; whether
-    nobody does."""
-    if participants(domain):
-        return False
-    clean_ports(domain)
-    return True
 
 
 def free_domain() -> int:

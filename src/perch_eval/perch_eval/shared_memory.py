@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 
 FIRST_PORT, PORTS = 7400, 250
@@ -82,13 +81,3 @@ def of_ports(domain: int) -> set[Path]:
 def segment(file: Path) -> str:
     """The segment to which a file belongs: itself, or that whose lock it is."""
     return str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name)))
-
-
-def clean_ports(domain: int) -> None:
-    """Remove the segments of a domain's ports that no process uses: where one was killed while it made it, all others wait for ever."""
-    files = of_ports(domain)
-    used = SharedMemory().used() if files else set()
-    for file in files:
-        if segment(file) not in used:
-            with suppress(OSError):  # gone already, or another user's
-                file.unlink()

@@ -19,6 +19,7 @@ from perch_core.processes import end_within, freeze_heap
 from perch_core.registry import resolved
 from perch_core.ros.arrival import ArrivalNode
 from perch_core.ros.priority import priority
+from perch_core.ros.shared_memory import end_unfinished
 from perch_core.ros.wiring import Wiring
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
@@ -163,6 +164,7 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
     stop = StopSignal()
     try:
         _check_parameter_files(sys.argv if args is None else args)
+        end_unfinished()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         nodes += create(Wiring())
         priority.nodes = len(nodes)

@@ -24,6 +24,7 @@ from std_msgs.msg import String
 
 from perch_core.ros import topics
 from perch_core.ros.node import StopSignal, spin_until_stopped
+from perch_core.ros.shared_memory import end_unfinished
 
 DIRECT = "direct"
 DELAY = 0.2    # [s]
@@ -103,6 +104,7 @@ class Relay:
         """Pass on the channels of the command line until SIGINT or SIGTERM."""
         end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
         stop = StopSignal()
+        end_unfinished()
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         node, executor = RelayNode(sys.argv[1:end]), EventsExecutor()
         executor.add_node(node)
