@@ -93,14 +93,15 @@ class PerchMotion:
     settings: PerchMotionConfig = PerchMotionConfig()
     seed: int = 0
     duration: float = field(init=False)
-    _path: BSpline = field(init=False, repr=False)
+    _path: tuple[BSpline, ...] = field(init=False, repr=False)  # position and its derivatives up to the fourth
 
     def __post_init__(self) -> None:
         s = self.settings
         object.__setattr__(self, "duration", s.ground + s.climb + s.hover + s.perch)
         times = np.arange(0.0, self.duration + 0.0201, 0.02)
         # a spline of degree 7 through the path: position and its derivatives then belong together exactly
-        object.__setattr__(self, "_path", make_interp_spline(times, self._position(times), k=7))
+        path = make_interp_spline(times, self._position(times), k=7)
+        object.__setattr__(self, "_path", tuple(path.derivative(k) if k else path for k in range(5)))
 
     @property
     def perch_time(self) -> float:
@@ -128,7 +129,7 @@ class PerchMotion:
 
     def sample(self, times: np.ndarray) -> Motion:
         """The state at times [s], shape (n,)."""
-        derivatives = [self._path.derivative(k)(times) if k else self._path(times) for k in range(5)]
+        derivatives = [path(times) for path in self._path]
         states = [flat_to_state(p, v, a, j, s, 0.0, 0.0, 0.0, 1.0) for p, v, a, j, s in zip(*derivatives)]
         R = np.array([s.R_WB for s in states])
         a = derivatives[2]
