@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
+import subprocess
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from . import stamps, virtualenv, workspace
-from .alone import alone
+from .alone import alone, held
 from .environment import variables
 from .errors import CALLERS_MISTAKE, SetupError
-from .layout import BUILD, EXTRAS, INSTALL, ROOT, VENV, VENV_PYTHON
+from .layout import BUILD, EXTRAS, INSTALL, ROOT, SOURCES, VENV, VENV_PYTHON
 from .machine import Platform, check_python, check_tools, detect_platform, remember
 from .progress import Step
 
@@ -42,7 +45,8 @@ def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
                 shutil.rmtree(folder, ignore_errors=True)
         _install(wanted, done)
         _install_extras(wanted, done, extras)
-        _build(wanted, done)
+        with _first_flight(wanted):
+            _build(wanted, done)
         _warm_up(wanted, done)
     return wanted
 
@@ -94,6 +98,31 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
         workspace.build(stale, wanted, fresh)
         done.update({folder.name: current[folder] for folder in stale}, built_with=environment)
         stamps.save(done)
+
+
+_FIRST_FLIGHT = """
+from perch_eval.in_process import Sensing, fly
+from perch_sim.scenario import load_scenario
+fly(load_scenario("surface_90"), 1, Sensing(vio="rendered", target="rendered"))
+"""
+
+
+@contextlib.contextmanager
+def _first_flight(wanted: Platform) -> Iterator[None]:
+    """Fly without ROS beside the building of a new workspace, which leaves cores idle: most numerics are then compiled when it ends."""
+    if INSTALL.exists():
+        yield
+        return
+    environment = variables(wanted, with_workspace=False)
+    environment["PYTHONPATH"] = os.pathsep.join([*map(str, SOURCES.glob("perch_*")), environment.get("PYTHONPATH", "")])
+    with subprocess.Popen([VENV_PYTHON, "-c", _FIRST_FLIGHT], env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                          stderr=subprocess.DEVNULL, pass_fds=held()) as flight:
+        try:
+            yield
+            with Step("compiling the numerics of a flight without ROS"):
+                flight.wait()
+        finally:
+            flight.kill()
 
 
 def _warm_up(wanted: Platform, done: dict[str, str]) -> None:

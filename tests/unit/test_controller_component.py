@@ -200,7 +200,7 @@ NAN = float("nan")
 
 @pytest.mark.parametrize("changes", [
     {"p_WB": (NAN, 0.0, 0.0)}, {"v_B": (0.0, float("inf"), 0.0)}, {"q_WB": (0.0, 0.0, 0.0, 0.0)}, {"q_WB": (0.0, 0.0, 0.0, 0.4)},
-    {"p_WB": (1e300, 0.0, 0.0)}, {"w_B": (0.0, 0.0, 1e200)}])
+    {"p_WB": (1e300, 0.0, 0.0)}, {"w_B": (0.0, 0.0, 1e200)}, {"pose_covariance": NAN * np.eye(6)}, {"twist_covariance": 1e300 * np.eye(6)}])
 def test_odometry_that_cannot_be_used_is_answered_bridged_and_then_descended_without(changes):
     flight = hovering()
     count = len(flight.motors)
@@ -216,6 +216,13 @@ def test_odometry_that_jumps_and_does_not_know_where_it_is_is_not_followed(varia
     flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=variance * np.eye(6))
     assert flight.state is state and "position jumped" in flight.said
     assert (flight.component.flight.flown.belief[0] > 0.9) == (state is State.HOVERING)
+
+
+def test_a_jump_with_a_covariance_that_is_no_number_is_refused():
+    flight = hovering()
+    flight.step(0.004, pose_covariance=np.full((6, 6), NAN))
+    flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=np.diag([NAN] + [1e-4] * 5))
+    assert flight.state is State.LANDING and "pose_covariance: an entry of nan is not finite" in flight.said
 
 
 def test_odometry_in_another_frame_is_ignored():

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+import os
 import re
 import subprocess
 import sys
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -258,6 +260,27 @@ def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_flight_beside_a_failing_build_ends_with_it(tmp_path, monkeypatch):
+    seen = tmp_path / "seen"
+    monkeypatch.setattr(prepare, "INSTALL", tmp_path / "install")
+    monkeypatch.setattr(prepare, "_FIRST_FLIGHT", "import os, sys, time, perch_planner; assert 'perch_msgs' not in sys.modules; "
+                        f"os.mkfifo('{seen}'); open('{seen}', 'w'); time.sleep(1000)")
+    with pytest.raises(SetupError, match="the compiler"), prepare._first_flight(WHEELS):
+        while not seen.exists():
+            time.sleep(0.01)
+        with seen.open():
+            raise SetupError("the compiler failed")
+    with pytest.raises(OSError):  # nobody is there who opens the other end
+        os.open(seen, os.O_WRONLY | os.O_NONBLOCK)
+
+
+def test_only_a_new_workspace_is_built_beside_a_flight(tmp_path, monkeypatch):
+    monkeypatch.setattr(prepare, "INSTALL", tmp_path)
+    monkeypatch.setattr(prepare.subprocess, "Popen", lambda *_, **__: pytest.fail("it flies"))
+    with prepare._first_flight(WHEELS):
+        pass
 
 
 def test_a_failing_tool_is_reported_with_its_last_lines_and_its_log(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample,
     LawChosen, MotorCommand, OdometryState, PowerlineMap, RatesThrust, TrajectoryOrder, nanoseconds, seconds)
+from perch_core.values.limits import problem
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
@@ -118,7 +119,7 @@ class Controller(Component[ControllerParameters]):
             return
         self._answered, self._silent = self._stamps.newest, False
         self._answer(state.stamp, self.flight.step(seconds(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B),
-                                                   (state.pose_covariance, state.twist_covariance)))
+                                                   (state.pose_covariance, state.twist_covariance), problem(state)))
 
     def _believed(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is of the present; a time that has evidently begun anew is a new flight."""

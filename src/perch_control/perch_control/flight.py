@@ -238,17 +238,19 @@ class FlightController:
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
-    def step(self, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None) -> StepResult:
+    def step(self, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None,
+             problem: str = "") -> StepResult:
         """Answer one odometry sample: always with a command, also when disarmed or when the sample is refused.
 
         Args:
             stamp: of the sample [s].
             sample: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
             covariances: its own, as `OdometryGate.check` takes them.
+            problem: why the sample is nonsense; empty: all its values are within their limits.
         """
         if self._period.update(stamp):
             self.law.pace(self._period.value)
-        verdict = self.gate.check(stamp, sample, covariances)
+        verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self.gate.check(stamp, sample, covariances)
         # Odometry that repeats itself does not stop the time.
         x = self._believed(self.flown, stamp if stamp > self.flown.now else max(self.flown.now, self._imu_stamp), verdict, sample)
         self.odometry_age = x.now - self.gate.stamp if self.gate.stamp is not None else inf
