@@ -84,7 +84,8 @@ class _Played:
 
     def __init__(self, flight: str, name: str) -> None:
         self.name, self.component = name, component(flight, name)
-        self.words, self.problem = 0, ""
+        self.words, self.problem, self.grown = 0, "", 0  # bytes, while it was called
+        self._process = psutil.Process()
         self.outputs: list[Any] = []
         vehicle = getattr(self.component, "_vehicle", None)
         self._turned = 2e-3 if name == "vio_model" else 1e-6  # the stand-in hands on the truth as it is
@@ -116,7 +117,7 @@ class _Played:
         Raises:
             Nonsense: with what went wrong.
         """
-        words, began = self.words, time.process_time()
+        words, memory, began = self.words, self._process.memory_info().rss, time.thread_time()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", RuntimeWarning)
@@ -125,7 +126,8 @@ class _Played:
             self.words += 1
         except Exception:
             raise Nonsense(f"{method}: {traceback.format_exc()}") from None
-        if (took := time.process_time() - began) > SLOW:
+        self.grown += self._process.memory_info().rss - memory
+        if (took := time.thread_time() - began) > SLOW:
             raise Nonsense(f"{method} took {took:.1f} s")
         if self.problem:
             raise Nonsense(f"after {method}: {self.problem}")
@@ -195,8 +197,6 @@ def play(flight: str, name: str, sent: Sequence[Spoilt], strict: bool, last: int
     events, one, count = recorded(flight)[name], _Played(flight, name), Counter()
     queue, unsaid = list(reversed(sent)), -1
     channels = inputs_of(flight, name)
-    process = psutil.Process()
-    memory = process.memory_info().rss
     for k, event in enumerate(events[:last]):
         while queue and queue[-1].at <= k:
             spoil = queue.pop()
@@ -205,7 +205,7 @@ def play(flight: str, name: str, sent: Sequence[Spoilt], strict: bool, last: int
             data = _on_the_wire(spoilt(_message(flight, name, channel, spoil.of), list(spoil.ways)))
             if not data:
                 continue
-            outcome, began = "refused", time.process_time()
+            outcome, began = "refused", time.thread_time()
             try:
                 value = topics.topic(channel).read(data)
                 received = value if isinstance(value, list) else [value]
@@ -213,7 +213,7 @@ def play(flight: str, name: str, sent: Sequence[Spoilt], strict: bool, last: int
                 received = []
             except Exception:
                 raise Nonsense(f"{channel}: {traceback.format_exc()}") from None
-            if (took := time.process_time() - began) > SLOW:
+            if (took := time.thread_time() - began) > SLOW:
                 raise Nonsense(f"{channel}: took {took:.1f} s to read")
             for value in received:
                 outcome = one.call(method, (value,))
@@ -226,8 +226,8 @@ def play(flight: str, name: str, sent: Sequence[Spoilt], strict: bool, last: int
             unsaid = -1
         if 0 <= unsaid < k - WORDLESS:
             raise Nonsense(f"taken without a word: {next(s for s in sent if s.at == unsaid)}")
-    if process.memory_info().rss > memory + MEMORY:
-        raise Nonsense(f"grown by {(process.memory_info().rss - memory) / 1e6:.0f} MB")
+    if one.grown > MEMORY:
+        raise Nonsense(f"grown by {one.grown / 1e6:.0f} MB")
     if strict and not sense.same(one.outputs, _untouched(flight, name, last)):
         first = next((k for k, pair in enumerate(zip(one.outputs, _untouched(flight, name, last))) if not sense.same(*pair)), -1)
         raise Nonsense(f"nonsense has moved the outputs, from the {first}th on: {[str(way) for s in sent[-3:] for way in s.ways]}")
