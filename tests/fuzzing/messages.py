@@ -32,7 +32,7 @@ from fuzzing.streams import FLIGHTS, Event, component, is_rendered, recorded
 
 SLOW = 2.0        # of processor time [s]
 HUNG = 600.0      # of the wall clock, for a whole game [s]
-MEMORY = 1 << 30  # more than at the beginning of a game [byte]
+MEMORY = 1 << 30  # by which the calls of a game may let the process grow [byte]
 WORDLESS = 300    # events within which something must have been said of what makes no sense
 EVENTS = 2000     # of a game, on an average
 SHRINKING = 20.0  # for the search of a smaller case [s]
