@@ -18,6 +18,8 @@ from .layout import BUILD, EXTRAS, INSTALL, ROOT, SOURCES, VENV, VENV_PYTHON
 from .machine import Platform, check_python, check_tools, detect_platform, remember
 from .progress import Step
 
+WARM_UP = "perch_eval.warm_up"
+
 
 def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
     """Set up whatever is not: fast where nothing is to do, and safe to interrupt and repeat.
@@ -45,9 +47,8 @@ def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
                 shutil.rmtree(folder, ignore_errors=True)
         _install(wanted, done)
         _install_extras(wanted, done, extras)
-        with _first_flight(wanted):
+        with _compiled(wanted, done):
             _build(wanted, done)
-        _warm_up(wanted, done)
     return wanted
 
 
@@ -100,44 +101,32 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
         stamps.save(done)
 
 
-_FIRST_FLIGHT = """
-from perch_eval.in_process import Sensing, fly
-from perch_sim.scenario import load_scenario
-fly(load_scenario("surface_90"), 1, Sensing(vio="rendered", target="rendered"))
-"""
-
-
 @contextlib.contextmanager
-def _first_flight(wanted: Platform) -> Iterator[None]:
-    """Fly without ROS beside the building of a new workspace, which leaves cores idle: most numerics are then compiled when it ends."""
-    if INSTALL.exists():
-        yield
-        return
-    environment = variables(wanted, with_workspace=False)
-    environment["PYTHONPATH"] = os.pathsep.join([*map(str, SOURCES.glob("perch_*")), environment.get("PYTHONPATH", "")])
-    with subprocess.Popen([VENV_PYTHON, "-c", _FIRST_FLIGHT], env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                          stderr=subprocess.DEVNULL, pass_fds=held()) as flight:
-        try:
-            yield
-            with Step("compiling the numerics of a flight without ROS"):
-                flight.wait()
-        finally:
-            flight.kill()
-
-
-def _warm_up(wanted: Platform, done: dict[str, str]) -> None:
-    """Compile the numerics of a flight into their caches, whenever their sources have changed.
+def _compiled(wanted: Platform, done: dict[str, str]) -> Iterator[None]:
+    """Compile the numerics into their caches where their sources have changed: those of a flight without ROS beside the building,
+    which leaves cores idle, and after it what only nodes call.
 
     Nothing depends on it: what is not cached is compiled when a node first needs it. So a failure is only mentioned.
     """
     stamp = stamps.kernel_stamp(done["environment"])
     if done.get("warmed") == stamp:
+        yield
         return
-    with Step("compiling the numerics of a flight") as step:
+    command = (VENV_PYTHON, "-m", WARM_UP)
+    environment = variables(wanted, with_workspace=False)
+    environment["PYTHONPATH"] = os.pathsep.join([*map(str, SOURCES.glob("perch_*")), environment.get("PYTHONPATH", "")])
+    with subprocess.Popen([*command, "flight"], env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                          stderr=subprocess.DEVNULL, pass_fds=held()) as flight:
         try:
-            step.run((VENV_PYTHON, "-m", "perch_eval.warm_up"), "warm_up", variables(wanted))
-        except SetupError as error:
-            print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
+            yield
+            with Step("compiling the numerics of a flight") as step:
+                flight.wait()
+                try:
+                    step.run((*command, "nodes"), "warm_up", variables(wanted))
+                except SetupError as error:
+                    print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
+        finally:
+            flight.kill()
     done["warmed"] = stamp
     stamps.save(done)
 

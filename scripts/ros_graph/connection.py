@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import rclpy
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
-from perch_core.ros.shared_memory import end_unfinished
+from perch_core.ros.joining import join
 from ros_graph.commands import GraphError
 
 T = TypeVar("T")
@@ -109,8 +108,7 @@ class Visit:
 def visit() -> Iterator[Visit]:
     """Join the graph with a hidden node, and leave it again."""
     context = Context()
-    end_unfinished()
-    rclpy.init(args=[], context=context)
+    join([], context)
     node = Node(
         f"_perch_{time.time_ns() % 1_000_000_000}",
         context=context,

@@ -262,25 +262,55 @@ def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
 # -- steps -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_flight_beside_a_failing_build_ends_with_it(tmp_path, monkeypatch):
-    seen = tmp_path / "seen"
-    monkeypatch.setattr(prepare, "INSTALL", tmp_path / "install")
-    monkeypatch.setattr(prepare, "_FIRST_FLIGHT", "import os, sys, time, perch_planner; assert 'perch_msgs' not in sys.modules; "
-                        f"os.mkfifo('{seen}'); open('{seen}', 'w'); time.sleep(1000)")
-    with pytest.raises(SetupError, match="the compiler"), prepare._first_flight(WHEELS):
-        while not seen.exists():
-            time.sleep(0.01)
-        with seen.open():
-            raise SetupError("the compiler failed")
-    with pytest.raises(OSError):  # nobody is there who opens the other end
-        os.open(seen, os.O_WRONLY | os.O_NONBLOCK)
+@pytest.fixture
+def warm_up(tmp_path, monkeypatch):
+    """What compiles the numerics: a module that tells of itself in a file, waits with `flight` for somebody who reads that, and needs no workspace."""
+    (tmp_path / "standing_in.py").write_text(
+        "import os, sys, time\n"
+        "if sys.argv[1] == 'flight': import perch_planner; assert 'perch_msgs' not in sys.modules\n"
+        f"open(r'{tmp_path}/' + sys.argv[1], 'w').close()\n"
+        f"while sys.argv[1] == 'flight' and not os.path.exists(r'{tmp_path}/built'): time.sleep(0.01)\n"
+        f"sys.exit(os.path.exists(r'{tmp_path}/spoiled'))\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(prepare, "WARM_UP", "standing_in")
+    monkeypatch.setattr(prepare, "variables", lambda *_, **__: dict(os.environ))
+    monkeypatch.setattr(progress, "STATE", tmp_path)
+    monkeypatch.setattr(prepare.stamps, "save", lambda done: None)
+    return tmp_path
 
 
-def test_only_a_new_workspace_is_built_beside_a_flight(tmp_path, monkeypatch):
-    monkeypatch.setattr(prepare, "INSTALL", tmp_path)
-    monkeypatch.setattr(prepare.subprocess, "Popen", lambda *_, **__: pytest.fail("it flies"))
-    with prepare._first_flight(WHEELS):
+def _wait_for(path):
+    while not path.exists():
+        time.sleep(0.01)
+
+
+def test_numerics_are_compiled_beside_the_build_and_after_it_and_once(warm_up):
+    done = {"environment": "1"}
+    with prepare._compiled(WHEELS, done):
+        _wait_for(warm_up / "flight")
+        assert not (warm_up / "nodes").exists() and "warmed" not in done
+        (warm_up / "built").touch()
+    assert (warm_up / "nodes").exists() and done["warmed"]
+    (warm_up / "flight").unlink()
+    with prepare._compiled(WHEELS, done):
         pass
+    assert not (warm_up / "flight").exists()
+
+
+def test_the_flight_beside_a_failing_build_ends_with_it(warm_up):
+    done = {"environment": "1"}
+    with pytest.raises(SetupError, match="the compiler"), prepare._compiled(WHEELS, done):
+        _wait_for(warm_up / "flight")
+        raise SetupError("the compiler failed")
+    assert "warmed" not in done and not (warm_up / "nodes").exists()  # `Popen`'s context has waited for the end of the flight
+
+
+def test_numerics_that_could_not_be_compiled_are_mentioned_and_left_to_the_first_flight(warm_up, capsys):
+    (warm_up / "built").touch(), (warm_up / "spoiled").touch()
+    done = {"environment": "1"}
+    with prepare._compiled(WHEELS, done):
+        pass
+    assert "left to the first flight" in capsys.readouterr().err and done["warmed"]
 
 
 def test_a_failing_tool_is_reported_with_its_last_lines_and_its_log(tmp_path, monkeypatch):

@@ -1,8 +1,9 @@
 """Compile once what every flight needs: the numerics are compiled at first use and cached beside their sources.
 
-    python -m perch_eval.warm_up
+    python -m perch_eval.warm_up flight     builds all control laws and flies a scenario without ROS, which needs no built workspace
+    python -m perch_eval.warm_up nodes      runs its nodes on the ground, in one process, for a moment of simulated time
 
-All nodes of a scenario are run in one process on the ground for a moment of simulated time; then its flight is flown in process.
+A kernel that is left to be compiled in flight keeps its node silent for so long that the vehicle may drop it.
 """
 
 from __future__ import annotations
@@ -12,28 +13,40 @@ import sys
 import tempfile
 from pathlib import Path
 
-from perch_eval.domain import reserved_domain
+from perch_control.assembly import build_law
+from perch_control.laws import LAWS
+from perch_control.parameters import ControllerParameters
+from perch_core.vehicle import load_vehicle
 from perch_eval.goal import SUCCESSES
 from perch_eval.in_process import Sensing, fly
-from perch_eval.nodes import ALL_NODES, programs
-from perch_eval.ros.mission_client import MissionClient
-from perch_eval.stack import Stack
 from perch_sim.scenario import load_scenario
 
+SCENARIO = "surface_90"
 SIMULATED = 1.5   # [s] long enough for VIO to start and the filter to take its poses
 CLOCK_BEGINS = 1.0  # [s] the vehicle's
 PATIENCE = 600.0  # [s] wall clock
 
 
-def warm_up() -> bool:
-    """Run a scenario's nodes on the ground, then its flight in process; whether both got as far as they should.
+def flight() -> bool:
+    """Build the laws and fly; whether the flight succeeded."""
+    scenario = load_scenario(SCENARIO)
+    for law in LAWS:
+        build_law(law, load_vehicle(scenario.vehicle), ControllerParameters(vehicle=scenario.vehicle))
+    return fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
 
-    A kernel that is left to be compiled in flight keeps its node silent for so long that the vehicle may drop it.
+
+def nodes() -> bool:
+    """Run the nodes; whether they got as far as they should.
 
     Raises:
         PerchError: a node ended, or did not come up.
     """
-    scenario = load_scenario("surface_90")
+    from perch_eval.domain import reserved_domain
+    from perch_eval.nodes import ALL_NODES, programs
+    from perch_eval.ros.mission_client import MissionClient
+    from perch_eval.stack import Stack
+
+    scenario = load_scenario(SCENARIO)
     with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         folder = Path(name)
@@ -44,11 +57,10 @@ def warm_up() -> bool:
             try:
                 stack.wait_until_ready(client.visible_nodes, PATIENCE)
                 client.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
-                reached = client.time >= CLOCK_BEGINS + SIMULATED
+                return client.time >= CLOCK_BEGINS + SIMULATED
             finally:
                 client.close()
-    return reached and fly(scenario, 1, Sensing(vio="rendered", target="rendered")).outcome in SUCCESSES
 
 
 if __name__ == "__main__":
-    sys.exit(0 if warm_up() else 1)
+    sys.exit(0 if {"flight": flight, "nodes": nodes}[sys.argv[1]]() else 1)

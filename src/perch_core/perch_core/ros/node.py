@@ -18,14 +18,13 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.processes import end_within, freeze_heap
 from perch_core.registry import resolved
 from perch_core.ros.arrival import ArrivalNode
+from perch_core.ros.joining import join
 from perch_core.ros.priority import priority
-from perch_core.ros.shared_memory import end_unfinished
 from perch_core.ros.wiring import Wiring
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 LOOK = 0.1  # [s] wall clock, between looks for a signal to stop
@@ -164,8 +163,7 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
     stop = StopSignal()
     try:
         _check_parameter_files(sys.argv if args is None else args)
-        end_unfinished()
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        join(args)
         nodes += create(Wiring())
         priority.nodes = len(nodes)
         executor = EventsExecutor()

@@ -19,12 +19,11 @@ from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from perch_core.ros import topics
+from perch_core.ros.joining import join
 from perch_core.ros.node import StopSignal, spin_until_stopped
-from perch_core.ros.shared_memory import end_unfinished
 
 DIRECT = "direct"
 DELAY = 0.2    # [s]
@@ -104,8 +103,7 @@ class Relay:
         """Pass on the channels of the command line until SIGINT or SIGTERM."""
         end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
         stop = StopSignal()
-        end_unfinished()
-        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+        join(sys.argv)
         node, executor = RelayNode(sys.argv[1:end]), EventsExecutor()
         executor.add_node(node)
         stop.patient = True

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import rclpy
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
-from perch_core.ros.shared_memory import end_unfinished
+from perch_core.ros.joining import join
 from perch_eval.nodes import in_namespace
 
 
@@ -25,8 +24,7 @@ class GraphNode:
             namespace: of the vehicle's nodes, as in `/quad1`.
         """
         self._context = Context()
-        end_unfinished()
-        rclpy.init(context=self._context)
+        join(context=self._context)
         self.node = Node(name, context=self._context, cli_args=["--ros-args", *in_namespace(namespace)], start_parameter_services=False)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
