@@ -165,6 +165,20 @@ def test_who_is_waited_for_is_told_when_time_stands_still(mission, pilot, monkey
     assert waiting == {"simulation time stands still: waiting for estimator: odometry of 1.200 s"}
 
 
+def test_a_node_that_hangs_before_it_was_ever_heard_is_named(mission, pilot, monkeypatch):
+    monkeypatch.setattr(client_module, "SILENT", 0.5)
+    told = []
+
+    def on_phase(t, phase, message):
+        told.append(message)
+        if "silent" in message:
+            mission.finish.set()
+
+    mission.passes.set()
+    assert pilot.fly(SCENARIO, on_phase).outcome == "perched"
+    assert [message for message in told if "silent" in message] == ["/mission has been silent for 0.5 s"]  # others are not there, or speak
+
+
 def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot, monkeypatch):
     mission.passes.set()
     hear_who_owes(pilot)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -138,6 +138,9 @@ class MissionClient(GraphNode):
     def visible_nodes(self) -> set[str]:
         """Fully qualified names of the nodes in the graph."""
         self.spin(0.02)
+        return self._visible()
+
+    def _visible(self) -> set[str]:
         return {f"{ns.rstrip('/')}/{name}" for name, ns in self.node.get_node_names_and_namespaces()}
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
@@ -181,7 +184,7 @@ class MissionClient(GraphNode):
             check()
             for words in self.news():
                 on_phase(self._time, seen[0], words)
-            self._check_server(servers)
+            self._look_around(servers, scenario.nodes)
             still = progress.look(self._time)
             if progress.explain():
                 on_phase(self._time, "waiting", f"simulation time stands still: {self._whom()}")
@@ -239,11 +242,13 @@ class MissionClient(GraphNode):
         topic = f"{self.node.resolve_service_name('perch')}/_action/status"
         return {bytes(info.endpoint_gid) for info in self.node.get_publishers_info_by_topic(topic)}
 
-    def _check_server(self, servers: set[bytes]) -> None:
-        """A result comes from the process that took the goal, or never."""
+    def _look_around(self, servers: set[bytes], nodes: Collection[str]) -> None:
+        """A result comes from the process that took the goal, or never; a node of the scenario that is there must be heard from then on."""
         if time.monotonic() - self._looked < LOOK:
             return
         self._looked = time.monotonic()
+        for name in self._visible() & {self._vehicle.removesuffix("vehicle") + node for node in nodes}:
+            self._heard.setdefault(name, self._looked)
         now = self._servers()
         if servers and (not now or now - servers):
             raise PerchError(f"the mission {'was restarted' if now else 'has ended'}: the goal is lost")
