@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from perch_eval.arguments import output_folder
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -89,3 +91,17 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
         script.main()
     path, words = started.value.args
     assert Path(path).name == node and Path(path).parent.name == package and words[-1] == "link:=/dev/ttyACM0"
+
+
+def test_a_folder_of_results_belongs_to_one_process_at_a_time(tmp_path):
+    # the nodes of both would read the parameters that the second one has written
+    assert output_folder(tmp_path / "out") == output_folder(tmp_path / "out")
+    program = ("import sys; from pathlib import Path; from perch_eval.arguments import exit_code, output_folder; "
+               "sys.exit(exit_code(lambda: 0 * len(str(output_folder(Path(sys.argv[1]))))))")
+
+    def another(folder):
+        return subprocess.run([sys.executable, "-c", program, str(folder)], capture_output=True, text=True)
+
+    refused = another(tmp_path / "out")
+    assert refused.returncode == 2 and "another run is writing there" in refused.stderr and len(refused.stderr.splitlines()) == 1
+    assert another(tmp_path / "other").returncode == another(tmp_path / "other").returncode == 0  # its end is the end of the lock

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import socket
 import sys
@@ -11,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from perch_core.errors import ConfigError, PerchError
+
+_locked: dict[Path, int] = {}  # folder of results -> its open file, whose lock ends with this process
 
 
 def count(text: str) -> int:
@@ -49,19 +52,27 @@ def exit_code(work: Callable[[], int], *mistakes: type[Exception], interrupted: 
 
 
 def output_folder(path: Path, option: str = "--out") -> Path:
-    """Make a folder for results.
+    """Make a folder for results, which this process has to itself until it ends: nodes read their parameters there.
 
     Args:
         path: of the folder.
         option: what the caller named it with, for the message.
 
     Raises:
-        ConfigError: it cannot be made, or nothing can be written to it.
+        ConfigError: it cannot be made, nothing can be written to it, or another process has it.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
-            return path
+            pass
+        if (place := path.resolve()) not in _locked:
+            lock = os.open(place, os.O_RDONLY)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _locked[place] = lock
+        return path
+    except BlockingIOError:
+        os.close(lock)
+        raise ConfigError(option, str(path), "another run is writing there: wait for its end, or choose another folder") from None
     except OSError as error:
         raise ConfigError(option, str(path), f"cannot be written: {error.strerror}") from None
 

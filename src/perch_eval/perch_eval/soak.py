@@ -253,7 +253,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if not 0.0 < args.hours <= 1000.0:
             raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
-        output_folder(args.out), output_folder(args.logs)
+        output_folder(args.out), output_folder(args.logs, "--logs")
         write = partial(_write, args, commit(), began)
         composed = sharing(args.composed, otherwise=FAST_NODES)
         flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs, write)

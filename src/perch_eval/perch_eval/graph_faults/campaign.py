@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
     try:
-        output_folder(args.out), output_folder(args.logs)
+        output_folder(args.out), output_folder(args.logs, "--logs")
         chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
         if not chosen:
             raise PerchError(f"--only {args.only}: no case has these words in its name")
