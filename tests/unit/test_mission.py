@@ -26,6 +26,7 @@ class World:
         self.detour, self.flown = detour, []  # what a new plan's contact is late by [s]; starts and durations of perches
         self.sees, self.plans, self.sticks, self.stays, self.recovers, self.ready = sees, plans, sticks, stays, recovers, ready
         self.machine = SurfaceMission(MissionSettings())
+        self.deaf = 0  # so many commands to arm are lost
         self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self.controller, self.trajectory_id = ControllerState.DISARMED, 0
         self.reference = self.perch_end = self.query = None
@@ -63,7 +64,9 @@ class World:
             self.trajectory_id, 0.0, target, np.tile(self.force(), (10, 1)), plan, cancel))
         for command, _ in out.commands:
             self.commands.append(command)
-            if command is Command.ARM:
+            if command is Command.ARM and self.deaf:
+                self.deaf -= 1
+            elif command is Command.ARM:
                 self.controller = ControllerState.ARMED
             elif command is Command.HOVER:
                 self.controller, self.hover_at, self.perch_end = ControllerState.RECOVERING, self.time + 1.0, None
@@ -101,6 +104,15 @@ def test_a_perch_passes_through_every_phase():
                       Phase.PERCHED, Phase.IDLE]
     assert world.commands == [Command.ARM, Command.ATTACHED]
     assert world.outcome.contact_time == pytest.approx(world.off_at)
+
+
+def test_a_command_to_arm_that_is_lost_is_given_again():
+    world = World()
+    world.deaf = 2
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is Phase.ARMING:
+        world.tick()
+    assert world.commands == 3 * [Command.ARM] and 2.0 <= world.time < 2.5
 
 
 def test_a_goal_in_the_air_waits_for_the_estimator():

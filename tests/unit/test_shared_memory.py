@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+
 from perch_eval import shared_memory
 from perch_eval.shared_memory import SharedMemory
 
@@ -31,3 +33,18 @@ def test_only_own_unused_segments_are_removed(tmp_path, monkeypatch):
     uses(2)
     assert memory.clean() == [str(shm / "fastrtps_port1"), str(shm / "sem.fastrtps_port1_mutex")]
     assert memory.clean() == []
+
+
+def test_a_segment_whose_maker_has_ended_is_removed_though_somebody_still_holds_it(tmp_path, monkeypatch):
+    shm, proc = tmp_path / "shm", tmp_path / "proc"
+    monkeypatch.setattr(shared_memory, "_SEGMENT", shared_memory.re.compile(rf"({shm}/(?:sem\.)?fast(?:rtps|dds)_\S+)"))
+    shm.mkdir(), (proc / "1").mkdir(parents=True)
+    for name in ("fastrtps_0a", "fastrtps_0a_el", "fastrtps_port7", "fastrtps_port7_el"):
+        (shm / name).touch()
+    (proc / "1" / "maps").write_text(f"7f00-7f01 rw-s 0 00:1b 6 {shm}/fastrtps_0a\n7f00-7f01 rw-s 0 00:1b 6 {shm}/fastrtps_port7\n")
+    memory = SharedMemory(proc)
+    memory.observe([1])
+    with (shm / "fastrtps_0a_el").open() as lock:  # as its maker does while it lives
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert memory.clean() == []
+    assert memory.clean() == [str(shm / "fastrtps_0a"), str(shm / "fastrtps_0a_el")]  # a port is shared: it has no one maker

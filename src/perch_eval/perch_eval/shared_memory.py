@@ -2,11 +2,13 @@
 
 Fast DDS removes its segments when a process ends by itself. A killed one leaves up to some megabytes in
 `/dev/shm`, until the machine is full. Other people's segments are never touched: only those that our own
-processes were seen to use, and that nobody uses any more.
+processes were seen to use, and that nobody uses any more, or whose maker has ended: a participant that was
+not told of that end holds such a segment until its process ends.
 """
 
 from __future__ import annotations
 
+import fcntl
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -40,8 +42,8 @@ class SharedMemory:
         return frozenset(self._seen)
 
     def clean(self) -> list[str]:
-        """Remove the remembered segments that no process uses any more, with their lock files; one that a process which is about to end
-        has made anew is removed by the next call.
+        """Remove the remembered segments that no process uses any more, or whose maker has ended, with their lock files; one that a
+        process which is about to end has made anew is removed by the next call.
 
         Returns:
             The files that were removed.
@@ -50,7 +52,7 @@ class SharedMemory:
             return []
         used = self.used()
         removed = []
-        for segment in sorted(self._seen - used):
+        for segment in sorted(one for one in self._seen if one not in used or abandoned(Path(one))):
             mutex = Path(segment).with_name(f"sem.{Path(segment).name}_mutex")  # stays after a process that ended by itself, too
             for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl"), mutex):
                 try:
@@ -81,3 +83,13 @@ def of_ports(domain: int) -> set[Path]:
 def segment(file: Path) -> str:
     """The segment to which a file belongs: itself, or that whose lock it is."""
     return str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name)))
+
+
+def abandoned(segment: Path) -> bool:
+    """Whether the maker of a segment has ended: while it lives, Fast DDS holds the lock of the file `<segment>_el`."""
+    try:
+        with Path(f"{segment}_el").open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return not PORT.match(segment.name)
+    except OSError:  # it is held, or there is none
+        return False

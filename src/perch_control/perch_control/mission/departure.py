@@ -41,12 +41,11 @@ class Departure(MissionMachine):
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             why = inputs.controller_message if inputs.estimator_ready else "the estimator is not ready"
             self._end(outputs, Result.TIMEOUT, f"no departure within {self.settings.phase_timeout:g} s: {why}")
-        elif inputs.estimator_ready and not self._asked:
-            self._asked = True
-            if self._moves.wire is None:
-                outputs.commands.append((Command.ARM, "departing"))
-            else:
-                outputs.query = self._way_out(inputs, self._moves.wire)
+        elif inputs.estimator_ready and (wire := self._moves.wire) is not None:
+            if not self._asked:
+                self._asked, outputs.query = True, self._way_out(inputs, wire)
+        elif inputs.estimator_ready and self._time_to_ask(inputs):
+            outputs.commands.append((Command.ARM, "departing"))
 
     def _way_out(self, inputs: Inputs, wire: Target) -> PlanQuery:
         """From the vehicle as it hangs there."""

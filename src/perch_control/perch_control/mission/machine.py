@@ -55,7 +55,7 @@ class MissionMachine(ABC):
         self._adhesion = AdhesionMonitor()
         self._since = self._entered_search = 0.0
         self._seen_since: float | None = None
-        self._asked = False
+        self._asked, self._asked_at = False, 0.0
         self._ids = count(1) if ids is None else ids
         self._moves = Moves(settings) if moves is None else moves
 
@@ -146,9 +146,16 @@ class MissionMachine(ABC):
             outputs.commands.append((Command.DISARM, "arming took too long"))
             why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
             self._end(outputs, Result.TIMEOUT, f"not armed within {self.settings.arming_timeout:g} s: {why}")
-        elif inputs.estimator_ready and not self._asked:
+        elif inputs.estimator_ready and self._time_to_ask(inputs):
             outputs.commands.append((Command.ARM, "goal accepted"))
-            self._asked, self.message = True, "arming"
+            self.message = "arming"
+
+    def _time_to_ask(self, inputs: Inputs) -> bool:
+        """Whether to ask the controller to arm, now or again: a command can be lost, or refused since the odometry is a moment late."""
+        if self._asked and inputs.time - self._asked_at < self.settings.ask_again:
+            return False
+        self._asked, self._asked_at = True, inputs.time
+        return True
 
     def _take_off(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._lost(inputs, outputs):

@@ -45,6 +45,7 @@ class MissionSettings:
     inspection_speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0, doc="mean speed between waypoints")
     rest_time: ClassVar[float] = 0.6  # rest with motors off that confirms the perch [s]
     arming_timeout: ClassVar[float] = 10.0  # [s]
+    ask_again: ClassVar[float] = 1.0       # between two requests to arm [s]
     phase_timeout: ClassVar[float] = 20.0  # longest take-off or recovery [s]
 
     def __post_init__(self) -> None:
