@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import time
 from contextlib import suppress
 
 import psutil
@@ -54,6 +55,17 @@ def children(process: subprocess.Popen) -> dict[str, psutil.Process]:
     return found
 
 
+def connected(port: int) -> socket.socket:
+    """A connection to the viewer, which listens a moment after its node is visible."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+        except ConnectionRefusedError:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+
+
 @pytest.mark.parametrize("composed, number", [(False, signal.SIGINT), (True, signal.SIGTERM)], ids=["processes with a live view", "composed in a namespace"])
 def test_ready_then_stopped_without_leftovers(start, tmp_path, composed, number):
     with socket.socket() as free:
@@ -63,7 +75,7 @@ def test_ready_then_stopped_without_leftovers(start, tmp_path, composed, number)
     started = children(process)
     assert set(started) == ({"composed"} if composed else {*NODES, "viewer"})
     if not composed:
-        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as client:
+        with connected(port) as client:
             client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
                            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n")
             assert client.recv(200).startswith(b"HTTP/1.1 101")
