@@ -264,7 +264,7 @@ def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def warm_up(tmp_path, monkeypatch):
-    """What compiles the numerics: a module that tells of itself in a file, waits with `flight` for somebody who reads that, and needs no workspace."""
+    """What compiles the numerics: a module that tells of itself in a file, with `flight` waits for the end of the build, and needs no workspace."""
     (tmp_path / "standing_in.py").write_text(
         "import os, sys, time\n"
         "if sys.argv[1] == 'flight': import perch_planner; assert 'perch_msgs' not in sys.modules\n"

@@ -50,9 +50,8 @@ class SharedMemory:
         """
         if not self._seen:
             return []
-        used = self.used()
         removed = []
-        for segment in sorted(one for one in self._seen if one not in used or abandoned(Path(one))):
+        for segment in sorted(self.unused(self._seen)):
             mutex = Path(segment).with_name(f"sem.{Path(segment).name}_mutex")  # stays after a process that ended by itself, too
             for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl"), mutex):
                 try:
@@ -62,9 +61,10 @@ class SharedMemory:
                     continue
         return removed
 
-    def used(self) -> set[str]:
-        """The segments that any process uses now."""
-        return {segment for process in self._proc.glob("[0-9]*") for segment in self._used_by(process)}
+    def unused(self, segments: Iterable[str]) -> set[str]:
+        """Those that no process uses now, or whose maker has ended."""
+        used = {segment for process in self._proc.glob("[0-9]*") for segment in self._used_by(process)}
+        return {segment for segment in segments if segment not in used or _abandoned(Path(segment))}
 
     @staticmethod
     def _used_by(process: Path) -> set[str]:
@@ -85,7 +85,7 @@ def segment(file: Path) -> str:
     return str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name)))
 
 
-def abandoned(segment: Path) -> bool:
+def _abandoned(segment: Path) -> bool:
     """Whether the maker of a segment has ended: while it lives, Fast DDS holds the lock of the file `<segment>_el`."""
     try:
         with Path(f"{segment}_el").open("rb") as file:

@@ -24,7 +24,7 @@ from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS, blind_launch
 from perch_eval.node_launch import NodeLaunch
 from perch_eval.nodes import ros_arguments
 from perch_eval.ros.mission_client import MissionClient
-from perch_eval.shared_memory import PORT, SharedMemory, abandoned, of_ports, segment
+from perch_eval.shared_memory import PORT, SharedMemory, of_ports, segment
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
 from perch_sim.obstacles import pad_surface
@@ -189,10 +189,10 @@ class Group:
 
     def _shared_memory(self, seen: frozenset[str]) -> list[str]:
         """Segments of these processes, or of a port of their domain, that no process uses any more or whose maker has ended."""
-        used = SharedMemory().used()
         ports = of_ports(self._domain) - self._before  # other ports are shared with other domains
         found = ports | {Path(name) for name in seen if Path(name).exists() and not PORT.match(Path(name).name)}
-        return [f"shared memory {file.name}" for file in sorted(found) if segment(file) not in used or abandoned(Path(segment(file)))]
+        unused = SharedMemory().unused(map(segment, found))
+        return [f"shared memory {file.name}" for file in sorted(found) if segment(file) in unused]
 
 
 class _Director:
