@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from perch_eval.recordings import command
 from perch_eval.recordings.asl import AslRecording
+from perch_eval.recordings.bag import BagRecording
 from perch_eval.recordings.trajectory import read_trajectory
 from recordings import photo_flight
 
@@ -65,6 +66,17 @@ def test_a_bag_with_its_truth_on_a_topic(files, tmp_path):
     assert report(tmp_path)["vio"]["ate_rmse_m"] < 0.015
     vio, true = read_trajectory(tmp_path / "vio.tum"), read_trajectory(tmp_path / "truth.tum")
     assert true.stamps[0] == photo_flight.START and len(vio) > 80  # to the nanosecond
+
+
+def test_a_bag_that_broke_off_is_read_as_far_as_it_goes(files, tmp_path, capsys):
+    whole = next((files / "mcap").glob("*.mcap")).read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[:len(whole) // 2])
+    assert perceive(cut, "--sensors", files / "mine.yaml", "--out", tmp_path / "out", "--without", "target_localizer", "powerline_mapper") == 0
+    assert "damage:" in capsys.readouterr().out
+    seen, everything = report(tmp_path / "out"), BagRecording(files / "mcap", None)
+    assert seen["damage"] and 0.3 < seen["imu_samples"] / everything.samples < 0.6
+    assert len(read_trajectory(tmp_path / "out" / "vio.tum")) > 20
 
 
 def test_a_folder_of_images(flight, tmp_path):

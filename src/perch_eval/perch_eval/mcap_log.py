@@ -5,13 +5,15 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from os import SEEK_END
 from pathlib import Path
 from typing import NamedTuple
 
+import mcap.records
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.stream_reader import CRCValidationError
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from zstandard import ZstdError
 
 
@@ -92,12 +94,55 @@ def read(path: Path, topics: set[str] | None = None,
         topics: only these.
         on_damage: told why a file could not be read to its end.
     """
+    for schema, channel, message in _read(path, topics, on_damage):
+        yield channel.topic, schema.name if schema else "", message.log_time, message.data
+
+
+def broke_off(path: Path) -> bool:
+    """Whether a file has no end: its writer was killed, the disk was full, or only a part of it was copied.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        size = file.seek(0, SEEK_END)
+        file.seek(max(0, size - len(MCAP0_MAGIC)))
+        return file.read() != MCAP0_MAGIC
+
+
+def make_whole(path: Path, copy: Path) -> str:
+    """Write what can be read of a file to another one, with an index.
+
+    Returns:
+        Why it could not be read to its end.
+
+    Raises:
+        OSError: the copy cannot be written.
+    """
+    damage: list[str] = []
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    with open(copy, "wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="perch")
+        for schema, channel, message in _read(path, None, damage.append):
+            if schema is not None and schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schemas[channel.schema_id],
+                                                               dict(channel.metadata))
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()
+    return damage[0] if damage else "it has no end"
+
+
+def _read(path: Path, topics: set[str] | None,
+          on_damage: Callable[[str], None]) -> Iterator[tuple[mcap.records.Schema | None, mcap.records.Channel, mcap.records.Message]]:
+    """As `read`, as the library's records."""
     if not path.exists():
         return
     with open(path, "rb") as file:
         try:
-            for schema, channel, message in NonSeekingReader(file, validate_crcs=True).iter_messages(
-                    topics=list(topics) if topics else None, log_time_order=False):
-                yield channel.topic, schema.name if schema else "", message.log_time, message.data
+            yield from NonSeekingReader(file, validate_crcs=True).iter_messages(topics=list(topics) if topics else None, log_time_order=False)
         except (McapError, EOFError, struct.error, ZstdError, CRCValidationError, UnicodeDecodeError) as error:
             on_damage(str(error) or type(error).__name__)

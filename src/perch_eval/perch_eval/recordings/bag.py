@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
@@ -12,6 +13,7 @@ from perch_core.ros.messages.sensing import compressed_value, image_value, imu_v
 from perch_core.sensors import Sensors
 from perch_core.values import CameraImage, ImuSample
 from perch_eval.extras import require
+from perch_eval.mcap_log import broke_off, make_whole
 from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError
 
 IMAGES = {"sensor_msgs/msg/Image": image_value, "sensor_msgs/msg/CompressedImage": compressed_value}
@@ -26,16 +28,26 @@ def is_bag(path: Path) -> bool:
 
 
 class BagRecording(Recording):
-    """A bag. A camera is the topic that the sensor file names, or `camera_<name>/image_raw` (or `/compressed` below it)."""
+    """A bag. A camera is the topic that the sensor file names, or `camera_<name>/image_raw` (or `/compressed` below it).
+
+    An `.mcap` that broke off is read as far as it goes, from a copy that has an index.
+    """
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
         Raises:
             RecordingError: it cannot be read, or has none of the topics.
         """
         super().__init__(path, sensors)
-        with _open(path) as reader:
+        self._readable, self._broke_off = path, ""
+        if path.is_file() and path.suffix == ".mcap" and broke_off(path):
+            self._copy = tempfile.TemporaryDirectory(prefix="perch_recording_")  # goes with this recording
+            self._readable = Path(self._copy.name) / path.name
+            self._broke_off = self.damage = make_whole(path, self._readable)
+        with self._open() as reader:
             kinds = {c.topic: c.msgtype for c in reader.connections}
             counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+        if self._broke_off and not counts:
+            raise RecordingError(f"{path}: cannot be read: {self._broke_off}")
         pictures = {topic for topic, kind in kinds.items() if kind in IMAGES}
         imus = sorted(topic for topic, kind in kinds.items() if kind == IMU_TYPE)
         if sensors is None:
@@ -60,7 +72,8 @@ class BagRecording(Recording):
         if self._imu:
             sources[self._imu] = IMU
         unusable: list[str] = []
-        with _open(self.path) as reader:
+        self.damage = self._broke_off
+        with self._open() as reader:
             messages = reader.messages([c for c in reader.connections if c.topic in sources])
             while True:
                 try:
@@ -85,7 +98,7 @@ class BagRecording(Recording):
             RecordingError: there is no such topic, or its messages are no poses.
         """
         rows: list[tuple[Any, ...]] = []
-        with _open(self.path) as reader:
+        with self._open() as reader:
             connections = [c for c in reader.connections if c.topic == topic]
             if not connections:
                 raise RecordingError(f"{self.path}: no topic {topic}")
@@ -101,6 +114,23 @@ class BagRecording(Recording):
             except Exception as error:  # whatever the libraries make of a damaged file
                 raise RecordingError(f"{self.path}: {topic}: {error}") from None
         return rows
+
+    def _open(self) -> AbstractContextManager[Any]:
+        """A reader, which the end of a block closes.
+
+        Raises:
+            RecordingError: it is none, or is damaged.
+        """
+        require("recordings")
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        try:
+            reader = AnyReader([self._readable], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            reader.open()
+        except Exception as error:  # whatever the libraries make of a damaged file
+            raise RecordingError(f"{self.path}: cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from None
+        return closing(reader)
 
     def _value(self, source: str, connection: Any, message: Any) -> ImuSample | CameraImage:
         """A message as a value.
@@ -134,21 +164,3 @@ def _camera_of(topic: str, others: list[str]) -> str:
     """A name for the camera of a topic: `down` of camera_down/image_raw; else what tells it from the others."""
     first = topic.strip("/").removesuffix("/compressed").removesuffix("/image_raw")
     return first.rpartition("camera_")[2].replace("/", "_") or "camera"
-
-
-def _open(path: Path) -> AbstractContextManager[Any]:
-    """A reader of a bag, which the end of a block closes.
-
-    Raises:
-        RecordingError: it is none, or is damaged.
-    """
-    require("recordings")
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-        reader.open()
-    except Exception as error:  # whatever the libraries make of a damaged file
-        raise RecordingError(f"{path}: cannot be read: {' '.join(str(error).split()) or type(error).__name__}") from None
-    return closing(reader)
