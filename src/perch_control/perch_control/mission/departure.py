@@ -32,9 +32,9 @@ class Departure(MissionMachine):
     def _leaving(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.plan is not None:
             self._fly(inputs, outputs, inputs.plan)
-        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING) and self._asked:
+        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING) and self._asked_at is not None:
             self._missed(inputs, "departing")
-        elif inputs.controller is ControllerState.TRACKING and self._asked:
+        elif inputs.controller is ControllerState.TRACKING and self._asked_at is not None:
             pass
         elif inputs.controller is not ControllerState.ATTACHED:
             self._end(outputs, Result.REFUSED, f"not perched: the controller is {inputs.controller.name.lower()}")
@@ -42,8 +42,8 @@ class Departure(MissionMachine):
             why = inputs.controller_message if inputs.estimator_ready else "the estimator is not ready"
             self._end(outputs, Result.TIMEOUT, f"no departure within {self.settings.phase_timeout:g} s: {why}")
         elif inputs.estimator_ready and (wire := self._moves.wire) is not None:
-            if not self._asked:
-                self._asked, outputs.query = True, self._way_out(inputs, wire)
+            if self._asked_at is None:
+                self._asked_at, outputs.query = inputs.time, self._way_out(inputs, wire)
         elif inputs.estimator_ready and self._time_to_ask(inputs):
             outputs.commands.append((Command.ARM, "departing"))
 

@@ -55,7 +55,7 @@ class MissionMachine(ABC):
         self._adhesion = AdhesionMonitor()
         self._since = self._entered_search = 0.0
         self._seen_since: float | None = None
-        self._asked, self._asked_at = False, 0.0
+        self._asked_at: float | None = None  # the controller to arm, or the planner for the way off a wire
         self._ids = count(1) if ids is None else ids
         self._moves = Moves(settings) if moves is None else moves
 
@@ -152,9 +152,9 @@ class MissionMachine(ABC):
 
     def _time_to_ask(self, inputs: Inputs) -> bool:
         """Whether to ask the controller to arm, now or again: a command can be lost, or refused since the odometry is a moment late."""
-        if self._asked and inputs.time - self._asked_at < self.settings.ask_again:
+        if self._asked_at is not None and inputs.time - self._asked_at < self.settings.ask_again:
             return False
-        self._asked, self._asked_at = True, inputs.time
+        self._asked_at = inputs.time
         return True
 
     def _take_off(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -272,7 +272,7 @@ class MissionMachine(ABC):
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         self.phase, self.message, self._since = phase, message, time
         if phase is Phase.ARMING:
-            self._asked, self._entered_search = False, time
+            self._asked_at, self._entered_search = None, time
         if phase is Phase.SEARCHING:
             self._seen_since, self._moves.looked, self._entered_search = None, 0, time
 
