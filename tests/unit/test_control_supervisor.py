@@ -10,7 +10,7 @@ from perch_control import monitors
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
-from perch_control.maneuvers import following
+from perch_control.maneuvers import following, recovered
 from perch_control.modes import Command, CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
 from perch_control.reference import FlatReference, SampledReference
@@ -125,6 +125,15 @@ def test_arming_is_refused_on_the_side():
     loop.run(0.02)
     with pytest.raises(CommandRefused, match="tilted"):
         loop.controller.command(Command.ARM)
+
+
+@pytest.mark.parametrize("height, end", [(0.15, State.DISARMED), (0.6, State.HOVERING)])
+def test_a_recovery_that_ends_at_the_ground_lands(height, end):
+    loop = make_loop()
+    loop.begin_in_hover((0.0, 0.0, height))
+    loop.controller.flown = recovered(loop.controller.flown._replace(ground=0.0), "for a test")
+    loop.run(4.0)
+    assert loop.controller.state is end, loop.events
 
 
 def test_attached_stops_the_motors_and_arming_again_recovers():

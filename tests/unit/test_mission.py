@@ -115,6 +115,20 @@ def test_a_command_to_arm_that_is_lost_is_given_again():
     assert world.commands == 3 * [Command.ARM] and 2.0 <= world.time < 2.5
 
 
+@pytest.mark.parametrize("height", [0.0, 0.8])
+def test_a_vehicle_that_hovers_elsewhere_has_not_arrived(height):
+    """The controller has given up the way, by a recovery that was over before the mission looked."""
+    world = World()
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is not Phase.TAKE_OFF:
+        world.tick()
+    world.reference, world.controller, world.p = None, ControllerState.HOVERING, np.array([0.0, 0.0, height])
+    while world.outcome is None and world.time < 20.0:
+        world.tick()
+    assert world.outcome.result is Result.MISSED and world.queries == 0
+    assert "gave up the way to the search place: says so; recovered to a hover" in world.outcome.message
+
+
 def test_a_goal_in_the_air_waits_for_the_estimator():
     """One that was just restarted may not know where the vehicle is."""
     world = World(ready=False)

@@ -16,7 +16,7 @@ from perch_core.vehicle import Vehicle
 _LONGEST_PERCH = 120.0  # the way to a contact is rehearsed, period by period [s]
 _EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
 _LATEST = 0.5           # the oldest start that is flown: a plan is of the present [s]
-_START_GAP = 0.35       # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
+START_GAP = 0.35       # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
 
@@ -138,8 +138,8 @@ def check_start(order: Order, now: float, present: Setpoint) -> None:
         raise TrajectoryRefused(f"starts {-late:.2f} s in the future; at most {_EARLIEST:g} s is allowed")
     begin = order.source.setpoint(max(late, 0.0))
     gap = float(np.linalg.norm(np.subtract(begin.p, present.p)))
-    if gap > _START_GAP:
-        raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {_START_GAP:g} m is allowed")
+    if gap > START_GAP:
+        raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {START_GAP:g} m is allowed")
     speed = float(np.linalg.norm(np.subtract(begin.v, present.v)))
     if speed > _START_SPEED_GAP:
         raise TrajectoryRefused(f"starts {speed:.2f} m/s from the vehicle's velocity; at most {_START_SPEED_GAP:g} m/s is allowed")

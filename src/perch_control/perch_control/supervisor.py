@@ -22,6 +22,7 @@ _FENCE_SLACK = 1.0   # so far outside the fence: land, since a hover has not com
 _MISSED_SPEED = 1.0  # faster than this after the planned contact: it was missed; a contact that may hold is slower [m/s]
 _GROUND_GAP = 0.12   # the descending reference is so far below the vehicle ... [m]
 _GROUND_TIME = 0.25  # ... for so long: on the ground [s]
+_LOW = 0.25          # a recovery that ends nearer to the ground lands: a hover would touch it [m]
 _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
 
 
@@ -93,6 +94,8 @@ class Supervisor:
             return self._on_reference(x)  # a planned way out
         source.update(x.belief, x.elapsed)
         if source.finished:
+            if x.belief[2] - x.ground < _LOW:
+                return landing(x, "landing: the recovery ended at the ground", self.settings.land_speed)
             return settled(x, "recovered: hovering")
         if x.elapsed > TIMEOUT:
             return landing(x, "landing: the recovery did not come to rest", self.settings.land_speed)

@@ -242,6 +242,10 @@ class MissionMachine(ABC):
         if inputs.controller in (ControllerState.LANDING, ControllerState.DISARMED):
             self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
             return True
+        if inputs.controller is ControllerState.HOVERING and self._moves.astray(inputs.time, inputs.state):
+            self._attempts_left = 1
+            self._missed(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
+            return True
         if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "take-off took too long"))
             self._end(outputs, Result.TIMEOUT, f"search hover not reached within {self.settings.phase_timeout:g} s; landing")

@@ -9,6 +9,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
+from perch_control.admission import START_GAP
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, State, Target
 
@@ -86,6 +87,11 @@ class Moves:
     def arrived(self, time: float, state: State) -> bool:
         """The last move has ended a while ago and the vehicle rests."""
         return time > self.began + self.length + self.settings.settle_time and self.slow(state)
+
+    def astray(self, time: float, state: State) -> bool:
+        """The last move has ended a while ago, and the vehicle is elsewhere: a plan from the hover would begin too far away."""
+        return (time > self.began + self.length + self.settings.settle_time
+                and float(np.linalg.norm(state.p_WB - self.hover[0])) > START_GAP)
 
     def dwelt(self, time: float) -> bool:
         """The vehicle has looked around from here for long enough."""
