@@ -19,7 +19,6 @@ from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
 from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
-from perch_eval.report import build_report, summary
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import Scenario, load_scenario
@@ -88,6 +87,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         stack = Stack(started, out / "logs", on_line=say)
         print(f"{scenario.name}, seed {seed}: starting {len(started)} processes", flush=True)
         with stack:
+            from perch_eval.report import build_report  # and with it matplotlib, while the nodes start
             result = _flown(scenario, stack)
     return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
                         result.start_time)
@@ -121,6 +121,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _demonstrate(args: argparse.Namespace) -> int:
     open_network(args.network)
     report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose, args.vehicle)
+    from perch_eval.report import summary
     print(f"outcome: {report['outcome']}")
     print("".join(f"  {name}: {words}\n" for name, words in summary(report)), end="")
     if "unwritten" in report:

@@ -5,18 +5,15 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402  (the backend must be chosen first)
-
-from perch_core import so3  # noqa: E402
-from perch_eval.flight import States  # noqa: E402
-from perch_eval.flight_view import ESTIMATE, LIMIT, PAD, TRUTH, WANTED, FlightView  # noqa: E402
-from perch_eval.metrics import thrust_history, tilt_degrees, touch_of  # noqa: E402
+from perch_core import so3
+from perch_eval.flight import States
+from perch_eval.flight_view import ESTIMATE, LIMIT, PAD, TRUTH, WANTED, FlightView
+from perch_eval.metrics import thrust_history, tilt_degrees, touch_of
 
 RUNNING = 1  # state in perch_msgs/EstimatorStatus
 BEFORE, AFTER = 0.3, 0.7  # shown around the perch [s]
@@ -38,13 +35,12 @@ Panel = tuple[str, list[Line]]
 """Label of the y axis with its unit, and curves."""
 
 
-def encode(figure: Any) -> str:
+def encode(figure: Figure) -> str:
     """A figure as PNG in base64, for a page; it fills its size."""
     buffer = io.BytesIO()
     if figure.get_layout_engine() is None:
         figure.set_layout_engine("constrained")
     figure.savefig(buffer, format="png", dpi=95)
-    plt.close(figure)
     return base64.b64encode(buffer.getvalue()).decode()
 
 
@@ -63,7 +59,8 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
     alone, rows = len(views) == 1, -(-len(content) // columns)
     low, high = span or (min(view.start - _zero(views, view) for view in views) - BEFORE,
                          max(view.end - _zero(views, view) for view in views) + AFTER)
-    figure, grid = plt.subplots(rows, columns, figsize=(12, height * rows), sharex=True, squeeze=False)
+    figure = Figure(figsize=(12, height * rows))
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for axis, (label, lines) in zip(grid.flat, content):
         for line in lines:
             keep = (line.t >= low) & (line.t <= high)
@@ -173,7 +170,8 @@ def distance_figure(*views: FlightView) -> str:
 
 def path_figure(*views: FlightView) -> str:
     """Side view of the perch with the thrust direction as arrows (the paper's Fig. 5, right)."""
-    figure, axis = plt.subplots(figsize=(12, 5))
+    figure = Figure(figsize=(12, 5))
+    axis = figure.subplots()
     along = _horizontal(views[0])
     if views[0].pad is not None:
         c, R = views[0].pad

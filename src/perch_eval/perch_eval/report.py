@@ -14,7 +14,7 @@ from perch_eval import plots
 from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
-from perch_eval.identification.page import inner_loop_figure
+from perch_eval.identification.answers import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected, recorded
 from perch_eval.margins import limits, margins

@@ -181,11 +181,10 @@ def verdicts(flights: Sequence[Flight]) -> list[str]:
 
 def plot(flights: Sequence[Flight], file: Path) -> None:
     """Memory, descriptors and threads of each process, and shared memory, by flight."""
-    import matplotlib
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib.figure import Figure
 
-    figure, axes = plt.subplots(4, 1, figsize=(7.0, 8.0), sharex=True)
+    figure = Figure(figsize=(7.0, 8.0), layout="tight")
+    axes = figure.subplots(4, 1, sharex=True)
     x = np.arange(1, len(flights) + 1)
     for name in flights[0].processes:
         own = [flight.processes[name] for flight in flights]
@@ -197,9 +196,7 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
         ax.set_ylabel(label)
     axes[3].set_xlabel("flight")
     axes[0].legend(fontsize=7, ncol=2)
-    figure.tight_layout()
     figure.savefig(file, dpi=110)
-    plt.close(figure)
 
 
 def page(folder: Path) -> str:

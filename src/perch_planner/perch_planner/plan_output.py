@@ -67,16 +67,14 @@ def write_json(path: Path, plan: PerchPlan) -> None:
 
 def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, vehicle: Vehicle) -> None:
     """Picture: the way in the vertical plane of the approach with the thrust, and thrust, speed, body rate over time."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
     times, full = states(plan, vehicle.mass)
     p = np.array([s.p_WB for s in full])
     heading = problem.surface.heading
     along = np.array([np.cos(heading), np.sin(heading), 0.0])
-    figure, axes = pyplot.subplots(2, 2, figsize=(11, 7.5), layout="constrained")
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    axes = figure.subplots(2, 2)
     side, thrust, speed, rate = axes.ravel()
     x = (p - problem.start.p) @ along
     side.plot(x, p[:, 2], color="tab:blue")
@@ -104,4 +102,3 @@ def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, veh
     for axis in axes.ravel():
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    pyplot.close(figure)

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import fcntl
-import multiprocessing
 import select
-import signal
+import subprocess
+import sys
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Pipe
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from perch_core.camera import CameraMount, Region
-from perch_core.processes import end_with_parent, give_way, without_interrupts
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
+from perch_sim.drawing_process import GREETING
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
 from perch_sim.scenario import Scenario
 
-NICE = 5             # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
-GREETING = b"ready"
 Exposure = Callable[[], tuple[Sequence[Pose], np.random.Generator, np.ndarray]]  # what `Renderer.render` takes, worked out when it is drawn
+COMMAND = (sys.executable, "-m", "perch_sim.drawing_process")
 PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [B]
 
 
@@ -137,9 +135,7 @@ class DrawnInProcesses:
             ConfigError: the scenario's vehicle or board does not exist.
         """
         self.cameras = tuple(cameras)
-        seen = _seen(scenario, seed, cameras)
-        with without_interrupts():
-            self._draftsmen = {name: _Draftsman(scene, mount, seed) for name, scene, mount in seen}
+        self._draftsmen = {name: _Draftsman(scene, mount, seed) for name, scene, mount in _seen(scenario, seed, cameras)}
 
     def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
         """As `Drawing.draw`."""
@@ -152,29 +148,30 @@ class DrawnInProcesses:
     @property
     def process_ids(self) -> dict[str, int]:
         """Of each camera's process."""
-        return {name: draftsman.process.pid or 0 for name, draftsman in self._draftsmen.items()}
+        return {name: draftsman.process.pid for name, draftsman in self._draftsmen.items()}
 
     def close(self) -> None:
         """End the processes."""
         for draftsman in self._draftsmen.values():
             draftsman.process.kill()
         for draftsman in self._draftsmen.values():
-            draftsman.process.join(1.0)
+            draftsman.process.wait()
 
 
 class _Draftsman:
     """This side of a process that draws the images of one camera, in the order in which they are asked for."""
 
     def __init__(self, scene: Scene, mount: CameraMount, seed: int) -> None:
-        spawn = multiprocessing.get_context("spawn")
-        orders, self._orders = spawn.Pipe(duplex=False)
-        self._images, images = spawn.Pipe(duplex=False)
+        orders, self._orders = Pipe(duplex=False)
+        self._images, images = Pipe(duplex=False)
         with suppress(OSError, AttributeError):  # not Linux, or a smaller limit
             fcntl.fcntl(images.fileno(), fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-        self.process = spawn.Process(target=_draw_until_closed, args=(orders, images, scene, mount, seed), daemon=True)
-        self.process.start()
+        ends = (orders.fileno(), images.fileno())
+        self.process = subprocess.Popen([*COMMAND, *map(str, ends)], pass_fds=ends, process_group=0)  # Ctrl-C is the caller's matter
         for end in (orders, images):
             end.close()  # so that the end of the process is the end of the pipe
+        with suppress(OSError):  # it has ended already, which the first order finds out
+            self._orders.send((scene, mount, seed))
         self._poll = select.poll()  # Connection.poll makes one for every call, which takes 0.1 ms
         self._poll.register(self._images.fileno(), select.POLLIN)
         self._shape = (mount.camera.height, mount.camera.width, 3)[:3 if mount.colour else 2]
@@ -237,18 +234,6 @@ class _Ordered:
         while not self._complete:
             self._draftsman.receive(1.0)
         return self._image
-
-
-def _draw_until_closed(orders: Connection, images: Connection, scene: Scene, mount: CameraMount, seed: int) -> None:
-    end_with_parent(signal.SIGTERM)
-    give_way(0, NICE)
-    cv2.setNumThreads(1)
-    renderer = Renderer(scene, mount, seed)
-    renderer.render([(np.array([0.0, 0.0, 1.0]), np.eye(3))], np.random.default_rng(0))  # loads what is compiled
-    with suppress(EOFError, BrokenPipeError):
-        images.send_bytes(GREETING)
-        while True:
-            images.send_bytes(renderer.render(*orders.recv()).ravel().data)
 
 
 def _seen(scenario: Scenario, seed: int, cameras: Collection[str]) -> list[tuple[str, Scene, CameraMount]]:

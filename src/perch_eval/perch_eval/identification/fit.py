@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import exp, inf, sqrt
+from math import inf, sqrt
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_eval.identification.answers import Answer, lagged
 from perch_eval.identification.record import Record
 
 PARTS = 6            # of the record, fitted one by one for the scatter
@@ -51,32 +52,6 @@ class Found:
     def __str__(self) -> str:
         refused = f"   not identified: {self.refused}" if self.refused else ""
         return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{refused}"
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A command and its answer over time, for the page: title, unit, t [s], command, measured, model, each (n,)."""
-
-    title: str
-    unit: str
-    t: np.ndarray
-    command: np.ndarray
-    measured: np.ndarray
-    model: np.ndarray
-
-    @property
-    def explained(self) -> float:
-        """Share of the measured variance, after the noise between neighbouring samples, that the model explains."""
-        error, noise = self.measured - self.model, 0.5 * float(np.mean(np.diff(self.measured) ** 2))
-        return 1.0 - max(float(np.var(error)) - noise, 0.0) / max(float(np.var(self.measured)) - noise, 1e-12)
-
-
-def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
-    """First-order lag of a command given at each sample, (n, ...); it begins settled."""
-    from scipy.signal import lfilter  # 0.3 s of imports, which a report without an inner loop does without
-
-    fade = exp(-period / max(lag, 1e-6))
-    return lfilter([1.0 - fade], [1.0, -fade], u, axis=0, zi=fade * u[:1])[0]
 
 
 def _fitted(model: Callable[[np.ndarray, slice], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],

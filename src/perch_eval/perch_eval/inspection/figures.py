@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_eval.inspection.measures import Inspected
-
-matplotlib.use("Agg")
-from matplotlib.figure import Figure  # noqa: E402  (the backend must be chosen first)
 
 FLOWN, REFERENCE, HEADING, WIRE, COLLISION = "#1f5fa8", "#555555", "#3a9a4b", "#b02a2a", "#e8402a"
 SIGHT_LENGTH = 0.35  # of the drawn camera axis [m]

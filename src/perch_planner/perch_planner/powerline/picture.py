@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_core.lines import Segment
@@ -14,11 +16,6 @@ from perch_core.rotor_model import P, Q
 from perch_planner.powerline.plan import Manoeuvre
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.visibility import visibility
-
-matplotlib.use("Agg")
-from matplotlib.animation import FuncAnimation, PillowWriter  # noqa: E402  (the backend must be chosen first)
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
 
 PERCH, RECOVERY, SIGHT, WIRE = "#1f5fa8", "#d9822b", "#3a9a4b", "#b02a2a"
 SIGHT_LENGTH = 0.5  # of the drawn camera axis [m]

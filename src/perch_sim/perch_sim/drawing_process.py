@@ -1,0 +1,43 @@
+"""The process that draws the images of one camera. Run by `drawing.DrawnInProcesses`, never by hand.
+
+A module of its own, so that such a process loads what draws, and nothing of the node that starts it.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+import cv2
+import numpy as np
+
+from perch_core.processes import end_with_parent, give_way
+from perch_sim.rendering import Renderer
+
+GREETING = b"ready"
+NICE = 5  # the step goes first; but those who wait for an image give way to it (perch_core/ros/priority.py)
+
+
+def draw_until_closed(orders: Connection, images: Connection) -> None:
+    """Receive scene, mount and seed; say that images can be drawn; then draw one for each order, what `Renderer.render` takes."""
+    renderer = Renderer(*orders.recv())
+    renderer.render([(np.array([0.0, 0.0, 1.0]), np.eye(3))], np.random.default_rng(0))  # loads what is compiled
+    images.send_bytes(GREETING)
+    while True:
+        images.send_bytes(renderer.render(*orders.recv()).ravel().data)
+
+
+def main() -> None:
+    """Serve the pipes of orders and of images, whose numbers are on the command line."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
+    end_with_parent(signal.SIGTERM)
+    give_way(0, NICE)
+    cv2.setNumThreads(1)
+    with suppress(EOFError, BrokenPipeError):
+        draw_until_closed(Connection(int(sys.argv[1])), Connection(int(sys.argv[2])))
+
+
+if __name__ == "__main__":
+    main()
