@@ -10,7 +10,7 @@ from perch_core.errors import PerchError
 from perch_core.values import ImuSample, RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.flight import Flight
-from perch_eval.identification import command, page
+from perch_eval.identification import answers, command, page
 from perch_eval.identification.fit import Found, battery, identify, rates, thrust
 from perch_eval.identification.record import Record, record_of
 from scipy.signal import lfilter, lfiltic
@@ -142,13 +142,13 @@ def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_report_shows_the_loop_where_rates_are_taken(monkeypatch):
-    monkeypatch.setattr(page, "perch_window", lambda flight: (1.0, 2.0))
+    monkeypatch.setattr(answers, "perch_window", lambda flight: (1.0, 2.0))
     one = record(seconds=3.0)
     sent = [(float(t), RatesThrust(0, True, tuple(map(float, w)), float(T))) for t, w, T in zip(one.command_t, one.rates, one.thrust)]
     imu = [(float(t), ImuSample(0, tuple(map(float, w)), tuple(map(float, f)))) for t, w, f in zip(one.t, one.gyro, one.accel)]
-    drawn = page.inner_loop_figure(Flight({"rates_thrust_command": sent, "imu/data_raw": imu}), VEHICLE)
+    drawn = answers.inner_loop_figure(Flight({"rates_thrust_command": sent, "imu/data_raw": imu}), VEHICLE)
     assert base64.b64decode(drawn).startswith(b"\x89PNG") and len(drawn) > 20_000
-    assert page.inner_loop_figure(Flight({"imu/data_raw": imu}), VEHICLE) == ""
+    assert answers.inner_loop_figure(Flight({"imu/data_raw": imu}), VEHICLE) == ""
 
 
 # -- the battery: one flight at each voltage -------------------------------------------------------------------------------

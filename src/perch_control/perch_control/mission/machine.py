@@ -158,13 +158,13 @@ class MissionMachine(ABC):
         return True
 
     def _take_off(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs):
+        if self._lost(inputs, outputs) or self._astray(inputs):
             return
         if self._moves.arrived(inputs.time, inputs.state):
             self._enter(Phase.SEARCHING, inputs.time, "looking for the target")
 
     def _searching(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs):
+        if self._lost(inputs, outputs) or self._astray(inputs):
             return
         if self._moves.looked < self.legs:
             if self._moves.arrived(inputs.time, inputs.state):
@@ -242,15 +242,19 @@ class MissionMachine(ABC):
         if inputs.controller in (ControllerState.LANDING, ControllerState.DISARMED):
             self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
             return True
-        if inputs.controller is ControllerState.HOVERING and self._moves.astray(inputs.time, inputs.state):
-            self._attempts_left = 1
-            self._missed(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
-            return True
         if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "take-off took too long"))
             self._end(outputs, Result.TIMEOUT, f"search hover not reached within {self.settings.phase_timeout:g} s; landing")
             return True
         return False
+
+    def _astray(self, inputs: Inputs) -> bool:
+        """The controller hovers, but not where it was sent: it has recovered on the way."""
+        if inputs.controller is not ControllerState.HOVERING or not self._moves.astray(inputs.time, inputs.state):
+            return False
+        self._attempts_left = 1
+        self._missed(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
+        return True
 
     def _missed(self, inputs: Inputs, why: str) -> None:
         self._failure = why
