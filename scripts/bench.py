@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import sys
 from pathlib import Path
 
-from perch_setup import ROOT, enter, leave_quietly_on_interrupt
+from perch_setup import ROOT, command_parser, enter, leave_quietly_on_interrupt
 
 GROUPS = ("planner", "perception", "control", "powerline", "sim", "autopilot", "ros")
 EXAMPLES = """examples:
@@ -33,7 +32,7 @@ def group_figures(group: str, quick: bool) -> list:
 
 def main() -> int:
     """Run the groups, print their tables, write the JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("group", nargs="?", choices=GROUPS, metavar="GROUP", help=", ".join(GROUPS) + "; all when left out")
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures to FILE")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions: the figures are rougher")

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 from pathlib import Path
 
-from perch_setup import ROOT, enter, quiet_on_interrupt
+from perch_setup import ROOT, command_parser, enter, quiet_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/fuzz.py files                          a minute of mutated vehicles, scenarios, boards, campaigns, problems, parameter files
@@ -22,7 +21,7 @@ exit code: 0 nothing found, 1 something found, 2 wrong arguments"""
 def main() -> int:
     """Hunt inputs of one kind; the kinds are modules of tests/fuzzing."""
     kinds = sorted(path.stem for path in (ROOT / "tests" / "fuzzing").glob("*.py") if "\ndef run(" in path.read_text())
-    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("kind", choices=kinds, help="of inputs")
     parser.add_argument("--minutes", type=float, default=1.0, help="of hunting (default: %(default)g)")
     parser.add_argument("--seed", type=int, default=1, help="of the changes (default: %(default)s)")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ros_graph.commands import add_spin_time, main, parser
+from ros_graph.commands import Commands, carry_out
 
 EXAMPLES = """examples:
   python3 scripts/param.py list /controller
@@ -15,33 +15,22 @@ EXAMPLES = """examples:
   python3 scripts/param.py set /controller gains.position '[8.0, 8.0, 10.0]'
   python3 scripts/param.py dump /controller > controller.yaml
 """
-HANDLERS = {
-    "list": "parameters:list_parameters",
-    "get": "parameters:get_parameter",
-    "set": "parameters:set_parameter",
-    "describe": "parameters:describe_parameters",
-    "dump": "parameters:dump_parameters",
-}
 
 
 def command_line() -> argparse.ArgumentParser:
     """Sub-commands and their arguments."""
-    top = parser(__doc__ or "", EXAMPLES)
-    commands = top.add_subparsers(dest="command", required=True, metavar="|".join(HANDLERS))
-    commands.add_parser("list", help="names, of one node or of all").add_argument("node", nargs="?")
-    for name, text in (("get", "one value"), ("set", "change one value"), ("dump", "all values as a parameter file")):
-        command = commands.add_parser(name, help=text)
+    commands = Commands(__doc__, EXAMPLES)
+    commands.add("list", "parameters:list_parameters", "names, of one node or of all").add_argument("node", nargs="?")
+    get = commands.add("get", "parameters:get_parameter", "one value")
+    change = commands.add("set", "parameters:set_parameter", "change one value")
+    describe = commands.add("describe", "parameters:describe_parameters", "unit, range and meaning, of one parameter or of all")
+    for command, how_many in ((get, None), (change, None), (describe, "?")):
         command.add_argument("node")
-        if name != "dump":
-            command.add_argument("parameter")
-    description = commands.add_parser("describe", help="unit, range and meaning, of one parameter or of all")
-    description.add_argument("node")
-    description.add_argument("parameter", nargs="?")
-    commands.choices["set"].add_argument("value", help="in YAML")
-    for command in commands.choices.values():
-        add_spin_time(command)
-    return top
+        command.add_argument("parameter", nargs=how_many)
+    change.add_argument("value", help="in YAML")
+    commands.add("dump", "parameters:dump_parameters", "all values as a parameter file").add_argument("node")
+    return commands.parser
 
 
 if __name__ == "__main__":
-    sys.exit(main(command_line(), HANDLERS))
+    sys.exit(carry_out(command_line()))

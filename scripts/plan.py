@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
-from perch_setup import enter, leave_quietly_on_interrupt
+from perch_setup import command_parser, enter, leave_quietly_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/plan.py surface_90                       config/problems/surface_90.yaml, results in out/plan
@@ -81,7 +80,7 @@ def _apply(mapping: dict, changes: list[str]) -> None:
 
 def main() -> int:
     """Read the problem, plan by its kind, write the files."""
-    parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("problem", nargs="?", help="name in config/problems, or a YAML file")
     parser.add_argument("--out", type=Path, default=Path("out/plan"), help="folder for the results (default: %(default)s)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner")

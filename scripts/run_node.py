@@ -7,11 +7,10 @@ after the file, so that it counts.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 
-from perch_setup import ROOT, enter
+from perch_setup import ROOT, command_parser, enter
 
 EXAMPLES = """examples:
   python3 scripts/run_node.py vehicle
@@ -23,12 +22,7 @@ EXAMPLES = """examples:
 
 def main() -> int:
     """Become the node; 2 for a node that does not exist."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
     parser.add_argument("node", metavar="NODE", help="as in config/scenarios: vehicle, controller, ...")
     parser.add_argument("--no-config", action="store_true", help="do not pass config/<node>.yaml")
     parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")

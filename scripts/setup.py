@@ -6,10 +6,9 @@ Every other script here does this by itself when it has to; this one does nothin
 
 from __future__ import annotations
 
-import argparse
 import sys
 
-from perch_setup import EXTRAS, ROOT, SetupError, prepare
+from perch_setup import EXTRAS, ROOT, SetupError, command_parser, prepare
 
 EXAMPLES = """examples:
   python3 scripts/setup.py            set up what is missing or out of date
@@ -21,9 +20,7 @@ EXAMPLES = """examples:
 
 def main() -> int:
     """Set up and say how to go on."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("--clean", action="store_true", help="remove .venv, build and install first")
     parser.add_argument("--extra", action="append", default=[], choices=EXTRAS,
                         help="packages that are otherwise installed by the script that needs them; repeatable")

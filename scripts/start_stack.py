@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from perch_setup import ROOT, enter, quiet_on_interrupt
+from perch_setup import ROOT, command_parser, enter, quiet_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/start_stack.py                                       scenario surface_90
@@ -33,9 +33,7 @@ COLOURS = (36, 33, 32, 35, 34, 96, 93, 92, 95, 94, 31)
 
 def command_line() -> argparse.ArgumentParser:
     """Options of the script."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a file (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of every random number (default: 1)")
     parser.add_argument("--composed", nargs="*", metavar="NODE", help="nodes that share a process, all without names: faster")

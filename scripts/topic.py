@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ros_graph.commands import add_spin_time, count, main, parser, positive
+from ros_graph.commands import Commands, carry_out, count, positive
 
 EXAMPLES = """examples:
   python3 scripts/topic.py list -t
@@ -15,49 +15,36 @@ EXAMPLES = """examples:
   python3 scripts/topic.py hz /imu/data_raw --window 500
   python3 scripts/topic.py info /trajectory -v
 """
-HANDLERS = {
-    "list": "topics:list_topics",
-    "info": "topics:show_info",
-    "echo": "echo:echo",
-    "hz": "rate:measure_rate",
-    "pub": "publish:publish",
-}
 
 
 def command_line() -> argparse.ArgumentParser:
     """Sub-commands and their arguments."""
-    top = parser(__doc__ or "", EXAMPLES)
-    commands = top.add_subparsers(dest="command", required=True, metavar="|".join(HANDLERS))
-
-    listing = commands.add_parser("list", help="the topics of the graph")
-    listing.add_argument("-t", "--show-types", action="store_true")
-
-    info = commands.add_parser("info", help="a topic's type, publishers and subscribers")
+    commands = Commands(__doc__, EXAMPLES)
+    commands.add("list", "topics:list_topics", "the topics of the graph").add_argument("-t", "--show-types", action="store_true")
+    info = commands.add("info", "topics:show_info", "a topic's type, publishers and subscribers")
     info.add_argument("topic")
     info.add_argument("-v", "--verbose", action="store_true", help="nodes and QoS")
 
-    echo = commands.add_parser("echo", help="print messages as they come")
+    echo = commands.add("echo", "echo:echo", "print messages as they come")
     _add_topic(echo)
     echo.add_argument("--once", action="store_true", help="end after one message")
     echo.add_argument("-n", type=count, metavar="N", help="end after N messages")
     echo.add_argument("--field", metavar="PATH", help="only a part, as in pose.pose.position.x or rotor_speed[0]")
     echo.add_argument("--no-arr", action="store_true", help="do not print arrays")
 
-    rate = commands.add_parser("hz", help="measure the rate")
+    rate = commands.add("hz", "rate:measure_rate", "measure the rate")
     _add_topic(rate)
     rate.add_argument("-w", "--window", type=count, default=10_000, metavar="N", help="messages to average over")
     rate.add_argument("-n", type=count, metavar="N", help="end after N messages")
 
-    publish = commands.add_parser("pub", help="publish a message")
+    publish = commands.add("pub", "publish:publish", "publish a message")
     publish.add_argument("topic")
     publish.add_argument("type")
     publish.add_argument("values", nargs="?", default="", help="fields in YAML, as in '{data: 1.0}'")
     publish.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ")
     publish.add_argument("-1", "--once", action="store_true")
 
-    for command in commands.choices.values():
-        add_spin_time(command)
-    return top
+    return commands.parser
 
 
 def _add_topic(command: argparse.ArgumentParser) -> None:
@@ -66,4 +53,4 @@ def _add_topic(command: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(command_line(), HANDLERS))
+    sys.exit(carry_out(command_line()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import os
 import signal
@@ -18,6 +19,11 @@ _ENTERED = "PERCH_ENTERED"
 """Process id of the script that was started again inside. An `exec` keeps the id; children have others."""
 INTERRUPTED = 130
 _HELP = {"-h", "--help"}
+
+
+def command_parser(description: str, examples: str, **options) -> argparse.ArgumentParser:
+    """A command line with examples below its help, which stay as they are written; `options` are those of `ArgumentParser`."""
+    return argparse.ArgumentParser(description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter, **options)
 
 
 def enter(*extras: str) -> None:

@@ -6,9 +6,9 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
-from perch_setup import enter
+from perch_setup import command_parser, enter
 
 CALLERS_MISTAKE = 2
 INTERRUPTED = 130
@@ -18,14 +18,30 @@ class GraphError(Exception):
     """Something in the graph is not as the caller thinks. The message is one line."""
 
 
-def parser(description: str, examples: str) -> argparse.ArgumentParser:
-    """A command line with examples below its help."""
-    return argparse.ArgumentParser(
-        description=description,
-        epilog=examples,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+class Commands:
+    """The sub-commands of a script.
+
+    Attributes:
+        parser: of the command line.
+    """
+
+    def __init__(self, description: str | None, examples: str) -> None:
+        self.parser = command_parser(description or "", examples, allow_abbrev=False)
+        self._verbs = self.parser.add_subparsers(required=True)
+
+    def add(self, name: str, handler: str, about: str) -> argparse.ArgumentParser:
+        """A sub-command, for its arguments.
+
+        Args:
+            name: on the command line.
+            handler: `module:function` in this package, which is imported inside the environment only; it takes the arguments.
+            about: what it does.
+        """
+        command = self._verbs.add_parser(name, help=about)
+        command.set_defaults(handler=handler)
+        command.add_argument("--spin-time", type=float, default=3.0, metavar="S", help="wait at most so long for discovery [s] (default: 3)")
+        self._verbs.metavar = "|".join(self._verbs.choices)
+        return command
 
 
 def count(text: str) -> int:
@@ -44,23 +60,11 @@ def positive(text: str) -> float:
     return value
 
 
-def add_spin_time(target: argparse.ArgumentParser) -> None:
-    """How long to wait for the graph to become known."""
-    target.add_argument(
-        "--spin-time", type=float, default=3.0, metavar="S", help="wait at most so long for discovery [s] (default: 3)"
-    )
-
-
-def main(command_line: argparse.ArgumentParser, handlers: Mapping[str, str]) -> int:
-    """Parse, set up if necessary, and run one sub-command.
-
-    Args:
-        command_line: with sub-commands that set `command`.
-        handlers: sub-command -> `module:function` in this package; imported only inside the environment.
-    """
+def carry_out(command_line: argparse.ArgumentParser) -> int:
+    """Parse, set up if necessary, and run the sub-command."""
     arguments = command_line.parse_args()
     enter()
-    module, function = handlers[arguments.command].split(":")
+    module, function = arguments.handler.split(":")
     return run(lambda: getattr(importlib.import_module(f"ros_graph.{module}"), function)(arguments))
 
 

@@ -33,7 +33,7 @@ def run(monkeypatch, tmp_path):
         spec.loader.exec_module(script)
         monkeypatch.setattr(script, "enter", enter, raising=False)
         monkeypatch.setattr(sys, "argv", [name, *arguments])
-        if hasattr(script, "main") and not hasattr(script, "HANDLERS"):
+        if hasattr(script, "main"):
             script.main()
         else:
             script.command_line().parse_args(arguments)
