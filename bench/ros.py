@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from perch_core.trajectory import rest_to_rest
 from perch_core.values import ControllerCommand as Command
 from perch_core.values import TrajectoryOrder, nanoseconds, seconds
 from perch_eval.demo import fly
-from perch_eval.domain import reserved_domain
+from perch_eval.domain import own_domain
 from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
 from perch_eval.ros.graph_node import GraphNode
 from perch_eval.stack import Stack
@@ -103,18 +102,6 @@ class Probe(GraphNode):
         self.listen(4.0)
         assert self.diagnostics["controller"]["state"] == "HOVERING", self.diagnostics["controller"]
 
-    def visible(self) -> set[str]:
-        """Fully qualified names of the nodes in the graph."""
-        self.listen(0.05)
-        return {f"{ns.rstrip('/')}/{name}" for name, ns in self.node.get_node_names_and_namespaces()}
-
-    def listen(self, seconds: float) -> float:
-        """Take what comes for some wall-clock time; returns how long it really was [s]."""
-        begin = time.perf_counter()
-        while time.perf_counter() - begin < seconds:
-            self.spin(min(0.05, seconds))
-        return time.perf_counter() - begin
-
     def close(self) -> None:
         """Leave the graph."""
         self._aside.destroy_node()
@@ -124,20 +111,14 @@ class Probe(GraphNode):
 @contextmanager
 def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe, Stack]]:
     """A stack that is up and stepping, and a probe beside it."""
-    with reserved_domain() as domain:
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
-        with Stack(programs(scenario, folder=folder, **options), folder) as stack:
-            probe = Probe()
-            try:
-                stack.wait_until_ready(probe.visible)
-                for _ in range(600):
-                    if probe.time > 2.0:  # one second of flight
-                        break
-                    probe.listen(0.1)
-                    stack.raise_if_ended()
-                yield probe, stack
-            finally:
-                probe.close()
+    with own_domain(), Stack(programs(scenario, folder=folder, **options), folder) as stack, closing(Probe()) as probe:
+        stack.wait_until_ready(probe.visible_nodes)
+        for _ in range(600):
+            if probe.time > 2.0:  # one second of flight
+                break
+            probe.listen(0.1)
+            stack.raise_if_ended()
+        yield probe, stack
 
 
 def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geometric",

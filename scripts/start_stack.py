@@ -129,7 +129,7 @@ def run(arguments: argparse.Namespace) -> None:
     try:
         stack.start()
         with visit() as graph:
-            stack.wait_until_ready(graph.nodes, arguments.ready_timeout)
+            stack.wait_until_ready(graph.visible_nodes, arguments.ready_timeout)
         names = ", ".join(launch.name for launch in launches)
         print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {names}. Logs: {folder}. Ctrl-C stops all.", flush=True)
         stack.wait()

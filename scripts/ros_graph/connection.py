@@ -5,16 +5,14 @@ from __future__ import annotations
 import argparse
 import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
 from typing import Any, TypeVar
 
-from rclpy.context import Context
-from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
-from perch_core.ros.joining import join
+from perch_eval.ros.graph_node import GraphNode
 from ros_graph.commands import GraphError
 
 T = TypeVar("T")
@@ -22,45 +20,11 @@ _SETTLED_S = 0.7
 """Discovery counts as finished when nothing new has come for so long."""
 
 
-class Visit:
+class Visit(GraphNode):
     """A hidden node, and what is needed to wait for answers with it."""
 
-    def __init__(self, node: Node, executor: EventsExecutor) -> None:
-        self.node = node
-        self._executor = executor
-        self._interrupted = False
-
-    def interrupt(self) -> None:
-        """End the present wait. (An exception out of a signal handler would end in the executor's callbacks.)"""
-        self._interrupted = True
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt where Ctrl-C has come."""
-        if self._interrupted:
-            self._interrupted = False
-            raise KeyboardInterrupt
-
-    def nodes(self) -> set[str]:
-        """Fully qualified names of the nodes in the graph."""
-        self.check()
-        return {f"{namespace.rstrip('/')}/{name}" for name, namespace in self.node.get_node_names_and_namespaces()}
-
-    def spin_until(self, done: Callable[[], bool], timeout: float | None = None) -> bool:
-        """Handle what arrives until `done`.
-
-        Returns:
-            Whether `done` came before the timeout.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C.
-        """
-        last = None if timeout is None else time.monotonic() + timeout
-        while not done():
-            self.check()
-            if last is not None and time.monotonic() > last:
-                return False
-            self._executor.spin_once(timeout_sec=0.05)
-        return True
+    def __init__(self) -> None:
+        super().__init__(f"_perch_{time.time_ns() % 1_000_000_000}", interrupts=(signal.SIGINT, signal.SIGTERM))
 
     def answer(self, future: Future, what: str, timeout: float = 10.0) -> Any:
         """The result of a future.
@@ -104,29 +68,9 @@ class Visit:
         return name if name.startswith("/") else f"/{name}"
 
 
-@contextmanager
-def visit() -> Iterator[Visit]:
+def visit() -> AbstractContextManager[Visit]:
     """Join the graph with a hidden node, and leave it again."""
-    context = Context()
-    join([], context)
-    node = Node(
-        f"_perch_{time.time_ns() % 1_000_000_000}",
-        context=context,
-        start_parameter_services=False,
-        enable_rosout=False,
-    )
-    executor = EventsExecutor(context=context)
-    executor.add_node(node)
-    guest = Visit(node, executor)
-    before = {number: signal.signal(number, lambda *_: guest.interrupt()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield guest
-        guest.check()  # an interrupt that nobody has looked for must not be lost with the handlers
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        node.destroy_node()
-        context.try_shutdown()
+    return closing(Visit())
 
 
 def hidden(name: str) -> bool:

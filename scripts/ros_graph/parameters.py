@@ -117,8 +117,7 @@ def dump_parameters(arguments: argparse.Namespace) -> int:
 
 
 def _nodes(graph: Visit, timeout: float) -> list[str]:
-    found = graph.settle(graph.node.get_node_names_and_namespaces, timeout)
-    return sorted(f"{space.rstrip('/')}/{name}" for name, space in found if not hidden(name))
+    return sorted(name for name in graph.settle(graph.nodes, timeout) if not hidden(name))
 
 
 def _client(graph: Visit, node: str, timeout: float) -> AsyncParameterClient:

@@ -28,7 +28,7 @@ def test_ctrl_c_ends_the_wait_for_nodes(visit, tmp_path):
     loading = Program("loading", (sys.executable, "-S", "-c", "import time; time.sleep(1000)"), ("/loading",))
     with Stack([loading], tmp_path) as stack, pytest.raises(KeyboardInterrupt), visit() as graph:
         signal.raise_signal(signal.SIGINT)
-        stack.wait_until_ready(graph.nodes, timeout=60.0)
+        stack.wait_until_ready(graph.visible_nodes, timeout=60.0)
     assert stack.pids == {}
 
 

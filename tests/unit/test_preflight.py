@@ -10,7 +10,7 @@ from perch_core.urdf import fixed_frames
 from perch_core.values import CameraModel, ControllerStatus, ImuSample
 from perch_core.vehicle import load_vehicle
 from perch_eval.preflight import checks, command
-from perch_eval.preflight.camera_turns import CameraTurns, rotation_between
+from perch_eval.camera_turns import CameraTurns, rotation_between
 from perch_eval.preflight.checks import Order, Verdict
 from scipy.spatial.transform import Rotation
 

@@ -12,7 +12,7 @@ from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import CameraModel
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.preflight import checks, command
-from perch_eval.preflight.camera_turns import CameraTurns
+from perch_eval.camera_turns import CameraTurns
 from perch_eval.preflight.ros import listener
 from perch_sim.drawing import DrawnOnDemand
 from perch_sim.parameters import VehicleParameters

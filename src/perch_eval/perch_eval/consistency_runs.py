@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from perch_core.errors import PerchError
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
-from perch_eval.arguments import count, output_folder
+from perch_eval.arguments import count, exit_code, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
@@ -105,7 +105,7 @@ def _judge_target(sightings: list[Sightings]) -> list[Consistency]:
                               s.stop - s.start) for name, s in groups.items()]
 
 
-def main() -> None:
+def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="surface_90", help="perch that is flown (default: %(default)s)")
@@ -113,15 +113,17 @@ def main() -> None:
     parser.add_argument("--first-seed", type=count, default=100, metavar="N", help="first of consecutive seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/consistency"), metavar="DIR", help="folder of results (default: %(default)s)")
     arguments = parser.parse_args()
-    try:
-        out = output_folder(arguments.out)
-        results, summary = run(arguments.scenario, arguments.runs, arguments.first_seed)
-    except PerchError as error:
-        parser.error(str(error))
+    return exit_code(lambda: _judge(arguments))
+
+
+def _judge(arguments: argparse.Namespace) -> int:
+    out = output_folder(arguments.out)
+    results, summary = run(arguments.scenario, arguments.runs, arguments.first_seed)
     (out / "consistency.json").write_text(json.dumps(summary, indent=2))
     consistency.plot(results, out / "consistency.png", {"take-off": 1.0, "hover": 3.0, "perch": 4.5})
     print(json.dumps(summary, indent=2))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

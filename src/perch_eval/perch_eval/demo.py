@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Collection
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval.arguments import command_parser, exit_code, open_network, output_folder
-from perch_eval.domain import reserved_domain
+from perch_eval.domain import own_domain
 from perch_eval.flyable import check_flight
 from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
@@ -80,8 +80,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
     (output_folder(out) / "flight.mcap").unlink(missing_ok=True)  # of an earlier flight: this one may end before it records
     say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
-    with reserved_domain() as domain:
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
+    with own_domain():
         started = programs(scenario, seed, scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
                            record=out / "flight.mcap", hold_for_goal=not realtime)
         stack = Stack(started, out / "logs", on_line=say)
@@ -95,21 +94,16 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
 
 def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
     """Send the goal to a started stack; a flight that breaks off is a result too, its recording is kept."""
-    client = MissionClient()
-    try:
-        stack.wait_until_ready(client.visible_nodes, timeout=READY_TIMEOUT)
-        result = client.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True),
-                           stack.raise_if_ended)
-        client.linger(0.5)
-        return result
-    except StackError as error:
-        if error.callers_mistake:
-            raise
-        return FlightResult("failed", str(error), client.time, math.nan)
-    except PerchError as error:
-        return FlightResult("failed", str(error), client.time, math.nan)
-    finally:
-        client.close()
+    with closing(MissionClient()) as client:
+        try:
+            stack.wait_until_ready(client.visible_nodes, timeout=READY_TIMEOUT)
+            result = client.fly(scenario, lambda t, phase, text: print(f"  {t:7.2f} s  {phase:<10} {text}", flush=True), stack.raise_if_ended)
+            client.linger(0.5)
+            return result
+        except PerchError as error:
+            if isinstance(error, StackError) and error.callers_mistake:
+                raise
+            return FlightResult("failed", str(error), client.time, math.nan)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -52,6 +52,18 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
     raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")
 
 
+@contextlib.contextmanager
+def own_domain(candidates: Iterable[int] | None = None) -> Iterator[int]:
+    """A `reserved_domain` that is this process's own meanwhile, and that of what it starts."""
+    before = os.environ.get("ROS_DOMAIN_ID")
+    try:
+        with reserved_domain(candidates) as domain:
+            os.environ["ROS_DOMAIN_ID"] = str(domain)
+            yield domain
+    finally:
+        os.environ.pop("ROS_DOMAIN_ID", None) if before is None else os.environ.update(ROS_DOMAIN_ID=before)
+
+
 def participants(domain: int) -> list[int]:
     """UDP ports of a domain that are bound on this machine."""
     first = FIRST_PORT + PORTS * domain

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -14,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from perch_core import config
 from perch_core.errors import PerchError
-from perch_eval.arguments import count, output_folder
+from perch_eval.arguments import command_parser, count, exit_code, output_folder
 from perch_eval.campaign.progress import Progress
-from perch_eval.domain import reserved_domain
+from perch_eval.domain import own_domain
 from perch_eval.evaluation.document import machine
 from perch_eval.modelled_sight_node import blind_launches, blind_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
@@ -39,7 +39,6 @@ BAR = 1.0             # growth of a process per 100 flights [MB]
 READY = 180.0         # [s]
 IN_A_ROW = 5          # failures after which it ends
 KEPT = 20             # flights after which what has been measured is written
-PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 @dataclass(frozen=True)
@@ -79,9 +78,8 @@ class Flight:
 
 def sample(pid: int) -> Sample:
     """A process as it is now."""
-    folder = Path("/proc") / str(pid)
-    rss = int((folder / "statm").read_text().split()[1]) * PAGE / 1e6
-    return Sample(round(rss, 3), len(os.listdir(folder / "fd")), len(os.listdir(folder / "task")))
+    process = psutil.Process(pid)
+    return Sample(round(process.memory_info().rss / 1e6, 3), process.num_fds(), process.num_threads())
 
 
 def slope(values: Sequence[float], settled: int = SETTLED) -> float | None:
@@ -114,8 +112,7 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
         started = programs(scenario, seed, scenario_source=str(source), composed=composed, folder=folder)
     else:
         started = blind_programs(node_programs(blind_launches(scenario, seed, str(source), True), folder, composed=composed))
-    with reserved_domain(range(43, 70)) as domain:
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
+    with own_domain(range(43, 70)):
         progress, pilot = Progress(flights, what="flights"), MissionClient()
         try:
             with Stack(started, folder) as stack:
@@ -227,8 +224,7 @@ def page(folder: Path) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="soak.py", description=__doc__, epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("soak.py", __doc__, EXAMPLES)
     out.add_argument("--scenario", default="surface_90", help="name in config/scenarios, or a file (default: %(default)s)")
     out.add_argument("--seed", type=int, default=1, help="of every random number (default: %(default)s)")
     out.add_argument("--hours", type=float, default=1.0, help="of simulated time (default: %(default)s)")
@@ -246,22 +242,19 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
+    return exit_code(lambda: _soak(args), psutil.Error)
+
+
+def _soak(args: argparse.Namespace) -> int:
     began = time.monotonic()
-    try:
-        if not 0.0 < args.hours <= 1000.0:
-            raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
-        output_folder(args.out), output_folder(args.logs, "--logs")
-        write = partial(_write, args, commit(), began)
-        composed = sharing(args.composed, otherwise=FAST_NODES)
-        flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs, write)
-        if not flights:
-            raise PerchError(f"no flight was flown; logs: {args.logs}")
-    except (PerchError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+    if not 0.0 < args.hours <= 1000.0:
+        raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
+    output_folder(args.out), output_folder(args.logs, "--logs")
+    write = partial(_write, args, commit(), began)
+    composed = sharing(args.composed, otherwise=FAST_NODES)
+    flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs, write)
+    if not flights:
+        raise PerchError(f"no flight was flown; logs: {args.logs}")
     problems = write(flights)
     print(f"{args.out / 'README.md'}: {len(flights)} flights", *problems, sep="\n  ")
     return 1 if problems else 0

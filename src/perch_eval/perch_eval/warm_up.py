@@ -8,9 +8,9 @@ A kernel that is left to be compiled in flight keeps its node silent for so long
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
 from perch_control.assembly import build_law
@@ -41,25 +41,20 @@ def nodes() -> bool:
     Raises:
         PerchError: a node ended, or did not come up.
     """
-    from perch_eval.domain import reserved_domain
+    from perch_eval.domain import own_domain
     from perch_eval.nodes import ALL_NODES, programs
     from perch_eval.ros.mission_client import MissionClient
     from perch_eval.stack import Stack
 
     scenario = load_scenario(SCENARIO)
-    with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
+    with tempfile.TemporaryDirectory() as name, own_domain():
         folder = Path(name)
         overrides = {"vehicle": {"lockstep_timeout": PATIENCE}}
         started = programs(scenario, composed=ALL_NODES, record=folder / "flight.mcap", folder=folder, overrides=overrides)
-        with Stack(started, folder) as stack:
-            client = MissionClient()
-            try:
-                stack.wait_until_ready(client.visible_nodes, PATIENCE)
-                client.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
-                return client.time >= CLOCK_BEGINS + SIMULATED
-            finally:
-                client.close()
+        with Stack(started, folder) as stack, closing(MissionClient()) as client:
+            stack.wait_until_ready(client.visible_nodes, PATIENCE)
+            client.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
+            return client.time >= CLOCK_BEGINS + SIMULATED
 
 
 if __name__ == "__main__":

@@ -7,10 +7,10 @@ import os
 import sqlite3
 import sys
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
-from perch_core.errors import PerchError
-from perch_eval.arguments import command_parser, count, output_folder
+from perch_eval.arguments import command_parser, count, exit_code, output_folder
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
 from perch_eval.campaign.progress import Progress
@@ -45,30 +45,25 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    try:
-        campaign = load_campaign(args.campaign, args.engine, args.runs)
-        resolve(campaign.engine)
-        out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
-        results = Results(out / "results.sqlite", campaign.name, campaign.digest, args.resume)
-    except PerchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    try:
-        fly_all(campaign, results, args.jobs, args.cluster)
-        from perch_eval.campaign.report import write_report  # draws figures: not needed before, nor by workers
+    return exit_code(lambda: _carry_out(args), sqlite3.Error)
 
-        found = results.all()
-        keep_worst(campaign, found, out)
-        report = write_report(campaign, found, out)
-    except (PerchError, OSError, sqlite3.Error) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\ninterrupted: {len(results.finished())} of {len(campaign.runs)} results are in {out / 'results.sqlite'}; "
-              "go on with --resume", file=sys.stderr)
-        return 130
-    finally:
-        results.close()
+
+def _carry_out(args: argparse.Namespace) -> int:
+    campaign = load_campaign(args.campaign, args.engine, args.runs)
+    resolve(campaign.engine)
+    out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
+    with closing(Results(out / "results.sqlite", campaign.name, campaign.digest, args.resume)) as results:
+        try:
+            fly_all(campaign, results, args.jobs, args.cluster)
+            from perch_eval.campaign.report import write_report  # draws figures: not needed before, nor by workers
+
+            found = results.all()
+            keep_worst(campaign, found, out)
+            report = write_report(campaign, found, out)
+        except KeyboardInterrupt:
+            print(f"\ninterrupted: {len(results.finished())} of {len(campaign.runs)} results are in {out / 'results.sqlite'}; "
+                  "go on with --resume", file=sys.stderr)
+            return 130
     print(summary(found))
     print(f"results: {out / 'results.sqlite'}\nreport: {report}")
     return 1 if any(r.cause == "error" for r in found) else 0

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
-from perch_eval.arguments import count, output_folder
+from perch_eval.arguments import command_parser, count, exit_code, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine
@@ -38,8 +38,7 @@ FALL = 1.5  # speed beyond which an end on the floor is a fall [m/s]
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="faults.py", description=__doc__, epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("faults.py", __doc__, EXAMPLES)
     out.add_argument("--out", type=Path, default=Path("docs/results/faults"), metavar="DIR", help="rows and page (default: %(default)s)")
     out.add_argument("--logs", type=Path, default=Path("out/faults"), metavar="DIR", help="logs of the flights (default: %(default)s)")
     out.add_argument("--only", default="", metavar="WORDS", help="cases with all of these words in their names")
@@ -53,23 +52,20 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    try:
-        output_folder(args.out), output_folder(args.logs, "--logs")
-        chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
-        if not chosen:
-            raise PerchError(f"--only {args.only}: no case has these words in its name")
-        rows = load(args.out / ROWS, None if args.page else digest())
-        missing = [] if args.page else [case for case in chosen if args.again or case not in rows][:args.most]
-        if missing:
-            fly_all(missing, args.out / ROWS, args.logs, rows, args.jobs)
-        known = [rows[case] for case in cases() if case in rows]
-        (args.out / "README.md").write_text(page(known))
-    except KeyboardInterrupt:
-        print("\ninterrupted; what has been flown is kept, the same command goes on", file=sys.stderr)
-        return 130
-    except (PerchError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return exit_code(lambda: _strike(args), interrupted="interrupted; what has been flown is kept, the same command goes on")
+
+
+def _strike(args: argparse.Namespace) -> int:
+    output_folder(args.out), output_folder(args.logs, "--logs")
+    chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
+    if not chosen:
+        raise PerchError(f"--only {args.only}: no case has these words in its name")
+    rows = load(args.out / ROWS, None if args.page else digest())
+    missing = [] if args.page else [case for case in chosen if args.again or case not in rows][:args.most]
+    if missing:
+        fly_all(missing, args.out / ROWS, args.logs, rows, args.jobs)
+    known = [rows[case] for case in cases() if case in rows]
+    (args.out / "README.md").write_text(page(known))
     bad = [row for row in known if problems(row)]
     print(f"{args.out / 'README.md'}: {len(known)} of {len(cases())} flown, {len(known) - len(bad)} good")
     return 1 if bad else 0

@@ -8,14 +8,12 @@ import os
 import re
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
-from perch_eval.domain import reserved_domain
+from perch_eval.domain import own_domain
 from perch_eval.fork_server import ForkServer, alive, session
 from perch_eval.graph_faults.cases import LOCKSTEP, NAMED, PROCESS, SAFE, TALKERS, Case, Situation, ending, named
 from perch_eval.graph_faults.relay_node import DIRECT
@@ -271,16 +269,6 @@ class _Director:
                 group.start(case.node)
 
 
-@contextmanager
-def _in_domain(domain: int) -> Iterator[None]:
-    before = os.environ.get("ROS_DOMAIN_ID")
-    os.environ["ROS_DOMAIN_ID"] = str(domain)
-    try:
-        yield
-    finally:
-        os.environ.pop("ROS_DOMAIN_ID") if before is None else os.environ.update(ROS_DOMAIN_ID=before)
-
-
 def fly(case: Case, server: ForkServer, folder: Path, commit: str = "") -> Row:
     """Fly one case.
 
@@ -300,7 +288,7 @@ def fly(case: Case, server: ForkServer, folder: Path, commit: str = "") -> Row:
     scenario, lockstep = load_scenario(source), case.mode == LOCKSTEP
     hold = {"mission": {"lockstep_hold": "perch"}} if lockstep else None
     launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
-    with reserved_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain, _in_domain(domain):
+    with own_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain:
         group, pilot = Group(server, launches, case, folder, domain), MissionClient()
         try:
             watcher = Watcher(pilot)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
+from contextlib import suppress
+
 import numpy as np
 
-from perch_core import so3
-from perch_core.camera import Camera
 from perch_core.sensors import Sensors
 from perch_core.values import CameraImage
+from perch_eval.camera_turns import CameraTurns
 from perch_eval.recordings.findings import Report
 from perch_eval.recordings.recording import Recording
 from perch_perception.images import ImageError, image_array
@@ -21,27 +21,17 @@ def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: 
     """The time offset between each camera and the IMU, by which the turns that both see fit best."""
     begin = _liveliest(stamps, imu[:, :3])
     end = begin + round(SPAN * 1e9)
-    turns: dict[str, list[tuple[float, ...]]] = {name: [] for name in recording.images if name in sensors.cameras}
-    before: dict[str, tuple[int, np.ndarray]] = {}
+    turns = {name: CameraTurns(sensors.cameras[name].camera) for name in recording.images if name in sensors.cameras}
     for event in recording.events():
         image = event.value
         if event.source not in turns or not isinstance(image, CameraImage) or not begin <= image.stamp <= end:
             continue
-        camera = sensors.cameras[event.source].camera
-        try:
-            pixels = image_array(image, camera)
-        except ImageError:
+        with suppress(ImageError):
+            turns[event.source].add(image.stamp, image_array(image, sensors.cameras[event.source].camera))
+    for name, seen in turns.items():
+        if len(seen.spans) < 20:
             continue
-        grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-        if event.source in before:
-            stamp, last = before[event.source]
-            turn = image_turn(last, grey, camera)
-            if np.isfinite(turn).all() and image.stamp > stamp:
-                turns[event.source].append((1e-9 * (stamp - stamps[0]), 1e-9 * (image.stamp - stamps[0]), *turn))
-        before[event.source] = image.stamp, grey
-    for name, rows in turns.items():
-        if len(rows) < 20:
-            continue
+        rows = [(1e-9 * (before - stamps[0]), 1e-9 * (after - stamps[0]), *rate) for before, after, rate in seen.spans]
         told = sensors.cameras[name].stamp_offset
         R_CI = sensors.mounts[name].R_BC.T @ R_BI
         offset, sigma = clock_offset(np.array(rows), 1e-9 * (stamps - stamps[0]), imu[:, :3] @ R_CI.T)
@@ -64,34 +54,11 @@ def _liveliest(stamps: np.ndarray, gyro: np.ndarray) -> int:
     return int(edges[int(np.argmax([np.linalg.norm(span - span.mean(axis=0), axis=1).mean() for span in spans]))])
 
 
-def image_turn(last: np.ndarray, now: np.ndarray, camera: Camera) -> np.ndarray:
-    """How a camera has turned between two grey images, rotation vector in C [rad], shape (3,); nan: too few tracks.
-
-    What fits the rays of most tracks. Where it also moves, the turn about its axis is not concerned by that.
-    """
-    corners = cv2.goodFeaturesToTrack(last, 150, 0.01, 15)
-    if corners is None or len(corners) < 15:
-        return np.full(3, np.nan)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(last, now, corners, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
-    found = found.ravel() == 1
-    a, b = camera.unproject(corners[found, 0].astype(float)), camera.unproject(moved[found, 0].astype(float))
-    good = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    a, b, weights, R = a[good], b[good], np.ones(int(good.sum())), np.eye(3)
-    if len(a) < 15:
-        return np.full(3, np.nan)
-    for _ in range(8):
-        u, _, vt = np.linalg.svd((weights[:, None] * a).T @ b)  # a = R b
-        R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        residual = np.linalg.norm(a - b @ R.T, axis=1)
-        weights = 1.0 / (1.0 + (residual / max(np.median(residual), 1e-4))**2)
-    return so3.log(R)
-
-
 def clock_offset(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> tuple[float, float]:
     """By how much the images' stamps are late against the gyro's, and how alike the turns are then.
 
     Args:
-        turns: stamp before, stamp after [s], turn between in C [rad], shape (n, 5).
+        turns: stamp before, stamp after [s], mean rate between in C [rad/s], shape (n, 5).
         stamps: of the gyro on the same clock [s], shape (m,).
         gyro_C: angular rate in the axes of C [rad/s], shape (m, 3).
 
@@ -99,8 +66,7 @@ def clock_offset(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> t
         Stamp minus IMU time [s], by the axis where the rates are most alike, and its 1 sigma: the rates' difference over their slope.
     """
     integral = np.vstack([np.zeros(3), np.cumsum(0.5 * (gyro_C[1:] + gyro_C[:-1]) * np.diff(stamps)[:, None], axis=0)])
-    begin, end = turns[:, 0], turns[:, 1]
-    rate = turns[:, 2:] / (end - begin)[:, None]
+    begin, end, rate = turns[:, 0], turns[:, 1], turns[:, 2:]
     offsets, best = np.arange(-REACH, REACH + 1e-9, 0.002), (0.0, np.inf)
     for axis in range(3):
         found = []

@@ -16,7 +16,7 @@ from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage
-from perch_eval.arguments import exit_code, output_folder
+from perch_eval.arguments import command_parser, exit_code, output_folder
 from perch_eval.node_launch import parse_overrides
 from perch_eval.page import finite
 from perch_eval.recordings import report
@@ -47,10 +47,7 @@ exit code: 0 done, 1 VIO never gave a pose (or no image could be looked at), 2 t
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="perceive.py",
-                                  description=__doc__,
-                                  epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("perceive.py", __doc__, EXAMPLES)
     out.add_argument("recording",
                      type=Path,
                      metavar="RECORDING",

@@ -11,7 +11,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.sensors import load_sensors
-from perch_eval.arguments import exit_code
+from perch_eval.arguments import command_parser, exit_code
 from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_eval.recordings.check import check
@@ -29,10 +29,7 @@ exit code: 0 done (nothing would fail), 1 something would make perception fail, 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    out = argparse.ArgumentParser(prog="sensors.py",
-                                  description=__doc__,
-                                  epilog=EXAMPLES,
-                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    out = command_parser("sensors.py", __doc__, EXAMPLES)
     verbs = out.add_subparsers(dest="verb", required=True, metavar="import|check")
     read = verbs.add_parser("import",
                             help="make a sensor file from a calibration",

@@ -1,40 +1,92 @@
-"""A visit to a running graph: a node in a ROS context of its own."""
+"""A visit to a running graph: a node in a ROS context of its own, whose callbacks run while its owner waits."""
 
 from __future__ import annotations
 
+import signal
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from perch_core.ros.joining import join
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
-from perch_core.ros.joining import join
-from perch_eval.nodes import in_namespace
+SLICE = 0.05  # of a wait, after which an interrupt counts [s]
 
 
 class GraphNode:
-    """A node whose callbacks run while its owner spins.
+    """A visitor. An interrupt ends its present wait, or what comes next: an exception out of a signal handler would end in rclpy's C++.
 
     Attributes:
         node: for publishers, subscriptions and clients.
     """
 
-    def __init__(self, name: str, namespace: str = "") -> None:
+    def __init__(self, name: str, arguments: Sequence[str] = (), interrupts: Sequence[signal.Signals] = (signal.SIGINT,)) -> None:
         """
         Args:
             name: of the node.
-            namespace: of the vehicle's nodes, as in `/quad1`.
+            arguments: ROS arguments.
+            interrupts: signals that are a KeyboardInterrupt of the main thread's wait.
         """
         self._context = Context()
-        join(context=self._context)
-        self.node = Node(name, context=self._context, cli_args=["--ros-args", *in_namespace(namespace)], start_parameter_services=False)
+        join([], self._context)
+        self.node = Node(name, context=self._context, cli_args=["--ros-args", *arguments], start_parameter_services=False, enable_rosout=False)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._interrupted = False
+        main = threading.current_thread() is threading.main_thread()
+        self._handlers: dict[signal.Signals, Any] = {one: signal.signal(one, self._interrupt) for one in interrupts if main}
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted = True
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt where an interrupt has come."""
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt
 
     def spin(self, timeout: float) -> None:
-        """Run what has come, or comes in time [s]."""
+        """Run what has come, or comes in time [s].
+
+        Raises:
+            KeyboardInterrupt: an interrupt has come.
+        """
         self._executor.spin_once(timeout_sec=timeout)
+        self.check()
+
+    def spin_until(self, done: Callable[[], object], timeout: float | None = None) -> bool:
+        """Run what comes until `done`; whether that came before the timeout [s]."""
+        last = None if timeout is None else time.monotonic() + timeout
+        while not done():
+            if last is not None and time.monotonic() > last:
+                return False
+            self.spin(SLICE)
+        return True
+
+    def listen(self, duration: float) -> float:
+        """Run what comes for some wall-clock time; returns how long it really was [s]."""
+        begin = time.monotonic()
+        while (left := begin + duration - time.monotonic()) > 0.0:
+            self.spin(min(left, SLICE))
+        return time.monotonic() - begin
+
+    def nodes(self) -> set[str]:
+        """Fully qualified names of the nodes in the graph, as far as this one has been told."""
+        return {f"{namespace.rstrip('/')}/{name}" for name, namespace in self.node.get_node_names_and_namespaces()}
+
+    def visible_nodes(self) -> set[str]:
+        """The same after a look at what has come."""
+        self.spin(0.02)
+        return self.nodes()
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Leave the graph. An interrupt that nobody has looked for counts now."""
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler or signal.SIG_DFL)
         self._executor.shutdown()  # it holds the context, and so the middleware's threads, sockets and shared memory
         self.node.destroy_node()
         self._context.try_shutdown()
+        self.check()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -20,6 +18,7 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.messages.mission import goal_message
 from perch_eval.goal import goal_of, outcome_of
+from perch_eval.nodes import in_namespace
 from perch_eval.ros.graph_node import GraphNode
 from perch_sim.scenario import Scenario
 
@@ -83,7 +82,7 @@ class MissionClient(GraphNode):
         Args:
             namespace: of the vehicle's nodes, as in `/quad1`.
         """
-        super().__init__("mission_client", namespace)
+        super().__init__("mission_client", in_namespace(namespace))
         self._client = ActionClient(self.node, Perch, "perch")
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
         self._time, self._waiting_for, self._looked = 0.0, "", 0.0
@@ -91,26 +90,9 @@ class MissionClient(GraphNode):
         self._process: dict[str, str] = {}  # node -> where it runs, as its diagnostics say
         self._silent: set[str] = set()
         self._news: list[str] = []
-        self._interrupted = False
-        self._handler: Any = None
-        if threading.current_thread() is threading.main_thread():
-            self._handler = signal.signal(signal.SIGINT, self._interrupt)
         self.node.create_subscription(Clock, "/clock", self._receive_clock, topics.topic("/clock").qos.subscribe)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
                                        topics.topic("/diagnostics").qos.subscribe)
-
-    def _interrupt(self, *_: Any) -> None:
-        self._interrupted = True
-
-    def _check_interrupt(self) -> None:
-        if self._interrupted:
-            self._interrupted = False
-            raise KeyboardInterrupt
-
-    def spin(self, timeout: float) -> None:
-        """Run what has come, or comes in time [s]; an interrupt counts afterwards: rclpy's C++ cannot pass on an exception of a callback."""
-        super().spin(timeout)
-        self._check_interrupt()
 
     @property
     def time(self) -> float:
@@ -134,14 +116,6 @@ class MissionClient(GraphNode):
     def process(self, node: str) -> str | None:
         """Where a node runs, as its newest diagnostics say; another process after a restart. None: it has not been heard."""
         return self._process.get(node)
-
-    def visible_nodes(self) -> set[str]:
-        """Fully qualified names of the nodes in the graph."""
-        self.spin(0.02)
-        return self._visible()
-
-    def _visible(self) -> set[str]:
-        return {f"{ns.rstrip('/')}/{name}" for name, ns in self.node.get_node_names_and_namespaces()}
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
             check: Callable[[], None] = lambda: None, stall: float = 60.0) -> FlightResult:
@@ -224,18 +198,18 @@ class MissionClient(GraphNode):
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 30.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
-        end, last = self._time + duration, time.monotonic() + patience
-        while self._time < end and time.monotonic() < last:
-            self.spin(0.05)
+        end = self._time + duration
+
+        def over() -> bool:
             check()
+            return self._time >= end
+
+        self.spin_until(over, patience)
 
     def close(self) -> None:
         """Leave the graph."""
-        if self._handler is not None:
-            signal.signal(signal.SIGINT, self._handler)
         self._client.destroy()
         super().close()
-        self._check_interrupt()
 
     def _servers(self) -> set[bytes]:
         """Who carries out goals."""
@@ -247,7 +221,7 @@ class MissionClient(GraphNode):
         if time.monotonic() - self._looked < LOOK:
             return
         self._looked = time.monotonic()
-        for name in self._visible() & {self._vehicle.removesuffix("vehicle") + node for node in nodes}:
+        for name in self.nodes() & {self._vehicle.removesuffix("vehicle") + node for node in nodes}:
             self._heard.setdefault(name, self._looked)
         now = self._servers()
         if servers and (not now or now - servers):
@@ -257,13 +231,13 @@ class MissionClient(GraphNode):
         return f"waiting for {self._waiting_for}" if self._waiting_for else f"{self._vehicle} does not say why"
 
     def _spin_until(self, done: Callable[[], object], check: Callable[[], None], timeout: float, problem: str) -> None:
-        last = time.monotonic() + timeout
-        while not done():
-            self.spin(0.05)
+        def over() -> object:
             check()
-            if time.monotonic() > last:
-                waiting = f" (the vehicle is waiting for {self._waiting_for})" if self._waiting_for else ""
-                raise PerchError(f"{problem} within {timeout:g} s{waiting}")
+            return done()
+
+        if not self.spin_until(over, timeout):
+            waiting = f" (the vehicle is waiting for {self._waiting_for})" if self._waiting_for else ""
+            raise PerchError(f"{problem} within {timeout:g} s{waiting}")
 
     def _receive_clock(self, msg: Clock) -> None:
         self._time = max(self._time, msg.clock.sec + 1e-9 * msg.clock.nanosec)

@@ -12,7 +12,8 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.values import ControllerCommand, RotorState
 from perch_core.vehicle import Vehicle
-from perch_eval.preflight.camera_turns import CameraTurns
+from perch_eval.nodes import in_namespace
+from perch_eval.camera_turns import CameraTurns
 from perch_eval.preflight.checks import ANSWER, Order
 from perch_eval.ros.graph_node import GraphNode
 
@@ -34,7 +35,7 @@ class GraphListener(GraphNode):
     """
 
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
-        super().__init__("preflight", namespace)
+        super().__init__("preflight", in_namespace(namespace))
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
         self.turns: CameraTurns | None = None
         self._fastest = vehicle.speed_max
@@ -62,20 +63,12 @@ class GraphListener(GraphNode):
 
     def await_first(self, channel: str, patience: float) -> None:
         """Until a channel's first value has come, or for so long [s]: nodes find each other in their own time."""
-        end = time.monotonic() + patience
-        while not self.values[channel] and time.monotonic() < end:
-            self.listen(0.05)
+        self.spin_until(lambda: self.values[channel], patience)
 
     def watch(self, camera: str, model: Camera) -> None:
         """Look through a camera from now on."""
         self.turns, row = CameraTurns(model), topics.topic(f"camera_{camera}/image_raw")
         self.node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._look, row), row.qos.subscribe, raw=True)
-
-    def listen(self, duration: float) -> None:
-        """For so long [s]."""
-        end = time.monotonic() + duration
-        while time.monotonic() < end:
-            self.spin(0.05)
 
     def stamped(self, channel: str) -> list[tuple[float, int]]:
         """Arrival [s] and stamp [ns] of everything on a channel."""
@@ -90,11 +83,8 @@ class GraphListener(GraphNode):
         stamp = getattr(self.newest("odometry"), "stamp", 0)
         row, begun = topics.topic("controller/command"), time.monotonic()
         self._orders.publish(row.to_message(ControllerCommand(stamp, command, "preflight, props off")))
-        while time.monotonic() - begun < 2.0 * ANSWER:
-            self.listen(0.02)
-            status = self.values["controller/status"]
-            if status and status[-1][0] > begun and status[-1][1].state == state:
-                break
+        status = self.values["controller/status"]
+        self.spin_until(lambda: status and status[-1][0] > begun and status[-1][1].state == state, 2.0 * ANSWER)
         delay = time.monotonic() - begun
         self.listen(SETTLING)
         sent = [value for channel in COMMANDS for arrival, value in self.values[channel][-1:] if arrival > begun]

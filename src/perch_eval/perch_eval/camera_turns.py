@@ -1,4 +1,4 @@
-"""How a camera turns from frame to frame, told from its images alone: for shaking it by hand, where turning is most of what it does."""
+"""How a camera turns from frame to frame, told from its images alone; where it moves, too, the turn about its axis is hardly concerned by that."""
 
 from __future__ import annotations
 
