@@ -20,10 +20,10 @@ from closed_loop.supervised_loop import Body, SupervisedLoop  # noqa: E402
 from harness import Figure, figure  # noqa: E402
 
 from perch_autopilot.watchdog import OFF, Mode  # noqa: E402
-from perch_core import so3  # noqa: E402
 from perch_core.vehicle import load_vehicle  # noqa: E402
 from perch_eval.goal import goal_of  # noqa: E402
 from perch_eval.in_process import Loop, arrange  # noqa: E402
+from perch_eval.metrics import tilt_degrees  # noqa: E402
 from perch_sim.scenario import load_scenario  # noqa: E402
 
 SCENARIO = replace(load_scenario("surface_90"), vehicle="betaflight")
@@ -102,7 +102,7 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
         flying = loop.vehicle.simulation.plant.rotor_speed.min() > 0.0
         until, rows = last + min(gap or WATCHED, WATCHED), []
         while loop.time < until and not touched:
-            rows.append((loop.time - last, _tilt(loop), kept.watchdog.mode))
+            rows.append((loop.time - last, float(tilt_degrees(loop.vehicle.simulation.state.q_WB)), kept.watchdog.mode))
             loop.step()
     finally:
         loop.close()
@@ -163,11 +163,6 @@ def taken_over(at: float) -> float:
         return loop.time - begin
     finally:
         loop.close()
-
-
-def _tilt(loop: Loop) -> float:
-    x = loop.vehicle.simulation.state.x
-    return float(np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x[3:7])[2, 2], -1.0, 1.0))))
 
 
 def figures(quick: bool) -> list[Figure]:

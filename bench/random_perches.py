@@ -7,6 +7,7 @@ import numpy as np
 from perch_core import config
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import Vehicle
+from perch_eval.node_launch import read_parameters
 from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.verifier import Requirements, Rotors
@@ -14,8 +15,7 @@ from perch_planner.verifier import Requirements, Rotors
 
 def shipped_settings() -> PerchSettings:
     """The planner's settings in `config/perching_planner.yaml`."""
-    content = config.read_yaml(config.config_dir() / "perching_planner.yaml")
-    return config.from_mapping(PerchSettings, content["/**"]["ros__parameters"], "perching_planner.yaml")
+    return config.from_mapping(PerchSettings, read_parameters("perching_planner"), "perching_planner.yaml")
 
 
 def random_problem(rng: np.random.Generator) -> PerchProblem:

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 import yaml
-from perch_core.config import parse_yaml
+from perch_core.config import nested, parse_yaml
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
@@ -103,15 +103,8 @@ def dump_parameters(arguments: argparse.Namespace) -> int:
         client = _client(graph, node, arguments.spin_time)
         names = _names(graph, client, node)
         values = _values(graph, client, node, names)
-    tree: dict[str, Any] = {}
-    for name, value in zip(names, values):
-        if value.type == ParameterType.PARAMETER_NOT_SET:
-            continue
-        *groups, leaf = name.split(".")
-        branch = tree
-        for group in groups:
-            branch = branch.setdefault(group, {})
-        branch[leaf] = _plain(parameter_value_to_python(value))
+    known = {name: value for name, value in zip(names, values) if value.type != ParameterType.PARAMETER_NOT_SET}
+    tree = nested({name: _plain(parameter_value_to_python(value)) for name, value in known.items()})
     print(yaml.safe_dump({node: {"ros__parameters": tree}}, sort_keys=False), end="")
     return 0
 

@@ -32,7 +32,6 @@ from fuzzing.messages import Nonsense
 from fuzzing.report import Report
 from fuzzing.spoiled import Way, in_effect, senseless, some_way, spoilt
 from fuzzing.streams import Event, component, recorded
-from perch_eval.in_process.parameters import nested
 
 PATIENCE = 15.0   # for an answer: the longest deadline of a planner, and some [s]
 NO_CERTIFICATE = 1.02  # rotor thrusts of a flat trajectory are looked at as the collective thrust alone
@@ -311,7 +310,7 @@ def _reconfigure(one: Component[Any], rng: random.Random) -> str:
             flat[name] = [rng.choice((math.nan, 0.0, -1.0, 1e9, 5.0)) for _ in old]
     plain = {name: list(value) if isinstance(value, tuple) else value for name, value in flat.items()}
     try:
-        changed = config.from_mapping(type(one.config), nested(plain), "controller")
+        changed = config.from_mapping(type(one.config), config.nested(plain), "controller")
         one.reconfigure(changed)
     except ConfigError:
         return "refused"

@@ -55,7 +55,7 @@ def refused(command: list[str], capsys) -> str:
 
 
 def numbers(folder: Path) -> list[int]:
-    return [r.number for r in read_results(folder / "out" / "results.sqlite")]
+    return [r.number for r in read_results(folder / "out" / "results.jsonl")]
 
 
 def wait_for_results(folder: Path, count: int) -> None:
@@ -86,7 +86,7 @@ def test_a_killed_campaign_resumes_to_the_200_results_of_an_undisturbed_one(camp
     assert again.returncode == 0, again.stderr
     assert numbers(tmp_path) == list(range(200))
     assert f"{200 - len(kept)} of 200 runs to fly" in again.stdout
-    found = read_results(tmp_path / "out" / "results.sqlite")
+    found = read_results(tmp_path / "out" / "results.jsonl")
     assert len({r.values["wind.gust_sigma"] for r in found}) == 200 and len({r.seed for r in found}) == 200
     assert all((r.cause == "perched") == (r.values["wind.gust_sigma"] < 0.5) for r in found)
     page = (tmp_path / "out" / "report.html").read_text()
@@ -130,7 +130,7 @@ def test_a_killed_worker_loses_no_result(campaign, tmp_path):
 
 def test_a_killed_worker_of_a_cluster_loses_no_result_and_all_add_on_one_thread(campaign, tmp_path, cluster):
     lost_none(campaign, tmp_path, "--cluster", cluster)
-    assert {r.message for r in read_results(tmp_path / "out" / "results.sqlite")} == {"1"}
+    assert {r.message for r in read_results(tmp_path / "out" / "results.jsonl")} == {"1"}
 
 
 def lost_none(campaign, tmp_path, *where: str) -> None:
@@ -138,7 +138,7 @@ def lost_none(campaign, tmp_path, *where: str) -> None:
     assert (tmp_path / "killed").exists()
     assert finished.returncode == 0, finished.stderr
     assert numbers(tmp_path) == list(range(40))
-    assert not [r for r in read_results(tmp_path / "out" / "results.sqlite") if r.cause == "error"]
+    assert not [r for r in read_results(tmp_path / "out" / "results.jsonl") if r.cause == "error"]
 
 
 def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_path):
@@ -159,7 +159,7 @@ def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_pa
 def test_runs_that_break_are_results_and_do_not_mix_with_those_of_other_settings(campaign, tmp_path, capsys):
     finished = run(campaign("broken", 12, "--jobs", "1"))
     assert finished.returncode == 1
-    found = read_results(tmp_path / "out" / "results.sqlite")
+    found = read_results(tmp_path / "out" / "results.jsonl")
     assert [r.number for r in found if r.cause == "error"] == [0, 4, 8]
     assert "the simulator is out of fuel" in found[0].message
     assert "other settings" in refused(campaign("broken", 13, "--resume"), capsys)

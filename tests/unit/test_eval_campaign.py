@@ -1,7 +1,7 @@
 """Campaign files, draws, causes of failure, results and their ranking."""
 
+import json
 import math
-import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -142,7 +142,7 @@ def test_causes_come_from_the_first_thing_that_went_wrong(outcome, touches, caus
 
 
 def test_results_outlive_the_writer_and_are_read_while_it_writes(tmp_path):
-    path = tmp_path / "r.sqlite"
+    path = tmp_path / "r.jsonl"
     results = Results(path, "c", "digest", resume=False)
     for n in (3, 1, 2, 1):
         results.add(RunResult(n, 10 + n, "perched", "perched", "", {"a": 1.5}, {"x": None, "y": 2.0}))
@@ -153,38 +153,40 @@ def test_results_outlive_the_writer_and_are_read_while_it_writes(tmp_path):
         Results(path, "c", "digest", resume=False)
     with pytest.raises(ResultsError, match="other settings"):
         Results(path, "c", "another", resume=True)
-    assert Results(path, "c", "digest", resume=True).finished() == {1, 2, 3}
+    assert [r.number for r in Results(path, "c", "digest", resume=True).all()] == [1, 2, 3]
 
 
-def test_a_damaged_results_file_is_named_and_left_as_it_is(tmp_path):
-    path = tmp_path / "r.sqlite"
+def test_a_row_that_was_cut_off_does_not_count_and_is_flown_again(tmp_path):
+    path = tmp_path / "r.jsonl"
     with closing(Results(path, "c", "digest", resume=False)) as results:
-        for n in range(400):
-            results.add(RunResult(n, n, "perched", "perched", "words " * 20))
-    whole = path.read_bytes()
-    for content in (b"no database at all" * 100, whole[:len(whole) // 2], whole[:8192] + bytes(8192) + whole[16384:]):
-        path.write_bytes(content)
-        with pytest.raises(ResultsError, match="r.sqlite cannot be read as results"):
-            Results(path, "c", "digest", resume=True)
-        assert path.read_bytes() == content
+        for n in range(3):
+            results.add(RunResult(n, n, "perched", "perched", ""))
+    path.write_bytes(path.read_bytes()[:-20])
+    with closing(Results(path, "c", "digest", resume=True)) as results:
+        assert [r.number for r in results.all()] == [0, 1]
+        results.add(RunResult(2, 2, "perched", "perched", ""))
+    assert [r.number for r in read_results(path)] == [0, 1, 2]
 
 
-@pytest.mark.parametrize("damage", ["folder", "UPDATE runs SET vary = '{'", "UPDATE runs SET metrics = '[1]'", "UPDATE runs SET seed = 'x'",
-                                    f"UPDATE runs SET vary = '{'[' * 100_000}'", "DROP TABLE runs", "UPDATE runs SET metrics = '{\"a\": []}'"])
-def test_results_that_make_no_sense_are_refused_in_one_line(tmp_path, capsys, damage):
-    path = tmp_path / "results.sqlite"
+@pytest.mark.parametrize("damage", [
+    "folder", b"no results at all\n" * 100, b"\xff\n", b"[" * 100_000 + b"\n", {"values": None}, {"metrics": [1]}, {"seed": "x"},
+    {"metrics": {"a": []}}, {"more": 1}])
+def test_results_that_make_no_sense_are_refused_in_one_line_and_left_as_they_are(tmp_path, capsys, damage):
+    path = tmp_path / "results.jsonl"
     if damage == "folder":
         path.mkdir()
     else:
         with closing(Results(path, "c", "digest", resume=False)) as results:
             results.add(RunResult(1, 1, "perched", "perched", ""))
-        with closing(sqlite3.connect(path)) as db, db:
-            db.execute(damage)
-    with pytest.raises(ResultsError, match="results.sqlite cannot be read as results"):
+        whose, row = path.read_bytes().splitlines(keepends=True)
+        path.write_bytes(whose + (damage if isinstance(damage, bytes) else json.dumps(json.loads(row) | damage).encode() + b"\n"))
+    with pytest.raises(ResultsError, match="results.jsonl cannot be read as results"):
         read_results(path)
+    before = None if path.is_dir() else path.read_bytes()
     assert campaign.main(["contact", "--out", str(tmp_path), "--resume"]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"error: {path} ") and len(said.splitlines()) == 1
+    assert path.is_dir() or path.read_bytes() == before
 
 
 @pytest.mark.parametrize("folder", ["file", "file/below", "/proc/flights"])

@@ -130,7 +130,7 @@ class Graph:
     def order(self, order, state):
         self.orders.append(order)
         status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, "said")
-        return Order(status, 0.1, state == command.ARMED and self.obeys)
+        return Order(status, 0.1, state == command.State.ARMED and self.obeys)
 
     def await_end_of_commands(self, patience):
         return 10.0, 10.4
@@ -141,13 +141,13 @@ def test_motors_start_only_where_the_propellers_are_off():
     assert {check.verdict for check in command.exercised(graph, False, True)} == {OPEN} and not graph.orders
     seen = verdicts(command.exercised(graph, True, True))
     assert [seen[name] for name in ("armed state", "disarming", "kill", "watchdog", "pilot's takeover")] == [PASSED] * 4 + [OPEN]
-    assert graph.orders[-1] == command.KILL, "it is left with the motors off"
+    assert graph.orders[-1] == command.Command.KILL, "it is left with the motors off"
 
 
 def test_who_does_not_arm_fails_and_is_not_tried_further():
     graph = Graph(obeys=False)
     seen = verdicts(command.exercised(graph, True, True))
-    assert seen["armed state"] is FAILED and seen["watchdog"] is OPEN and graph.orders == [command.ARM, command.DISARM, command.ARM]
+    assert seen["armed state"] is FAILED and seen["watchdog"] is OPEN and graph.orders == [command.Command.ARM, command.Command.DISARM, command.Command.ARM]
 
 
 @pytest.mark.parametrize("motion, verdict", [(10.3, PASSED), (11.5, FAILED), (None, OPEN)])

@@ -13,7 +13,7 @@ import os
 import re
 import types
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -194,6 +194,33 @@ def _hints(cls: Any) -> dict[str, Any]:
 def load(cls: type[T], path: Path | str) -> T:
     """Read a YAML file into a frozen dataclass, strictly. See `from_mapping`."""
     return from_mapping(cls, read_yaml(path) or {}, str(path))
+
+
+def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted names as nested mappings."""
+    out: dict[str, Any] = {}
+    for name, value in flat.items():
+        *groups, leaf = name.split(".")
+        place = out
+        for group in groups:
+            place = place.setdefault(group, {})
+            if not isinstance(place, dict):
+                raise ConfigError("", name, f"{group!r} is a value, not a group")
+        if isinstance(place.get(leaf), dict):
+            raise ConfigError("", name, f"{leaf!r} is a group, not a value")
+        place[leaf] = value
+    return out
+
+
+def flattened(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested parameters under dotted names, so that later ones replace single values."""
+    flat: dict[str, Any] = {}
+    for key, value in parameters.items():
+        if isinstance(value, Mapping):
+            flat |= flattened(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = list(value) if isinstance(value, tuple) else value
+    return flat
 
 
 def config_dir() -> Path:

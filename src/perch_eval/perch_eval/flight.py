@@ -30,10 +30,15 @@ class States:
     def at(self, times: np.ndarray) -> States:
         """The states at given times; vectors are interpolated, the attitude is that of the nearest sample."""
         def between(values: np.ndarray) -> np.ndarray:
-            return np.stack([np.interp(times, self.t, column) for column in values.T], axis=1)
+            return interpolated(times, self.t, values)
 
         nearest = np.clip(np.searchsorted(self.t, times), 0, len(self.t) - 1)
         return States(np.asarray(times), between(self.p), self.q[nearest], between(self.v), between(self.w))
+
+
+def interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (n, m) of times t (n,) at other times (k,), shape (k, m)."""
+    return np.stack([np.interp(times, t, column) for column in values.T], axis=1)
 
 
 def time_of(value: Any) -> float | None:

@@ -11,9 +11,10 @@ import numpy as np
 from perch_core import so3
 from perch_core.values import AtEnd, Contact
 from perch_core.vehicle import Vehicle
+from perch_eval.consistency import attitude_error
 from perch_eval.flight import Flight, States
+from perch_sim.contact_event import ContactState
 
-CONTACT_STATES = {0: "none", 1: "attached", 2: "bounced", 3: "collision", 4: "ground"}
 FIGURES: dict[str, tuple[str, str, float]] = {
     **{f"{kind}_rmse_m_{axis}": (f"{kind} RMSE {axis}", "cm", 100.0) for kind in ("tracking", "estimation") for axis in "xyz"},
     "max_body_rate_deg_s": ("largest body rate", "deg/s", 1.0), "max_acceleration_m_s2": ("largest acceleration", "m/s^2", 1.0),
@@ -53,11 +54,11 @@ def touch_of(flight: Flight) -> tuple[float, Contact] | None:
     airborne = False
     first = None
     for t, contact in flight.values("contact"):
-        if contact.state == 1:
+        if contact.state == ContactState.ATTACHED:
             return t, contact
-        if contact.state == 0:
+        if contact.state == ContactState.NONE:
             airborne = True
-        elif airborne and first is None and contact.state in (2, 3):
+        elif airborne and first is None and contact.state in (ContactState.BOUNCED, ContactState.COLLISION):
             first = (t, contact)
     return first
 
@@ -68,7 +69,7 @@ def contact_report(flight: Flight) -> dict[str, Any] | None:
     if touch is None:
         return None
     t, contact = touch
-    return {"time": t, "state": CONTACT_STATES[contact.state], "body": contact.body, "normal_speed_m_s": contact.normal_speed,
+    return {"time": t, "state": ContactState(contact.state).name.lower(), "body": contact.body, "normal_speed_m_s": contact.normal_speed,
             "tangential_speed_m_s": contact.tangential_speed, "tilt_error_deg": math.degrees(contact.tilt_error),
             "offset_m": contact.offset, "reason": contact.reason}
 
@@ -112,8 +113,7 @@ def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, 
         estimated = estimate.at(cut.t)
         out["estimation_rmse_m"] = _rmse(cut.p - estimated.p)
         out["estimation_error_at_end_m"] = (estimated.p[-1] - cut.p[-1]).tolist()
-        error = so3.quat_multiply(so3.quat_conjugate(cut.q[-1]), estimated.q[-1])
-        out["attitude_error_at_end_deg"] = math.degrees(float(np.linalg.norm(so3.quat_log(error))))
+        out["attitude_error_at_end_deg"] = math.degrees(float(np.linalg.norm(attitude_error(cut.q[-1], estimated.q[-1]))))
         out["velocity_rmse_m_s"] = _rmse(cut.v - estimated.v)
     out["target_error"] = target_error(flight)
     return out
@@ -145,8 +145,8 @@ def target_error(flight: Flight) -> dict[str, float] | None:
     used = [pose for t, pose in found if t <= plans[0]] or [found[0][1]]
     pad, pose = true[-1][1], used[-1]
     dp = np.array(pose.p_WS) - np.array(pad.p)
-    dq = so3.quat_multiply(so3.quat_conjugate(np.array(pad.q)), np.array(pose.q_WS))
-    return {"position_m": float(np.linalg.norm(dp)), "attitude_deg": math.degrees(float(np.linalg.norm(so3.quat_log(dq))))}
+    turn = attitude_error(np.array(pad.q), np.array(pose.q_WS))
+    return {"position_m": float(np.linalg.norm(dp)), "attitude_deg": math.degrees(float(np.linalg.norm(turn)))}
 
 
 def thrust_history(flight: Flight, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -217,6 +217,6 @@ def missed_deadlines(flight: Flight) -> dict[str, dict[str, float]]:
 
 
 def tilt_degrees(q: np.ndarray) -> np.ndarray:
-    """Angle of b3 from the vertical, (n, 4) -> (n,) [deg]."""
+    """Angle of b3 from the vertical, (..., 4) -> (...) [deg]."""
     b3 = so3.quat_rotate(q, np.array([0.0, 0.0, 1.0]))
-    return np.degrees(np.arccos(np.clip(b3[:, 2], -1.0, 1.0)))
+    return np.degrees(np.arccos(np.clip(b3[..., 2], -1.0, 1.0)))

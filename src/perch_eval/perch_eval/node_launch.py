@@ -123,8 +123,8 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
     common = _scenario_parameters(scenario, nodes, seed, scenario_source or scenario.name, lockstep)
     launches = []
     for node in nodes:
-        parameters = flattened(read_parameters(node)) | common.get(node, {}) | _host_parameters(node, lockstep)
-        parameters |= flattened((scenario.parameters or {}).get(node, {})) | flattened(overrides.get(node, {}))
+        parameters = config.flattened(read_parameters(node)) | common.get(node, {}) | _host_parameters(node, lockstep)
+        parameters |= config.flattened((scenario.parameters or {}).get(node, {})) | config.flattened(overrides.get(node, {}))
         host = {name: parameters.pop(name) for name in HOST_PARAMETERS if name in parameters}
         launches.append(NodeLaunch(node, parameters, host))
     return tuple(launches)
@@ -206,14 +206,3 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         "target_localizer": vehicle | {"board": scenario.target.board},
         "perching_planner": planner, "powerline_planner": vehicle, "controller": controller, "mission": mission,
     }
-
-
-def flattened(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested parameters under dotted names, so that later ones replace single values."""
-    flat: dict[str, Any] = {}
-    for key, value in parameters.items():
-        if isinstance(value, Mapping):
-            flat |= flattened(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = list(value) if isinstance(value, tuple) else value
-    return flat

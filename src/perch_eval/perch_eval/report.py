@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from perch_control.modes import Command
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
@@ -75,11 +76,10 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
 
 UNITS = {"per_s": "per s", "us": "us", "ms": "ms", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
 _UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
-COMMANDS = ("disarm", "arm", "hover", "land", "attached", "kill")  # perch_msgs/ControllerCommand
 
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
-    rows = [(t, f"mission commands {COMMANDS[c.command]}: {c.reason}") for t, c in flight.values("controller/command")]
+    rows = [(t, f"mission commands {Command(c.command).name.lower()}: {c.reason}") for t, c in flight.values("controller/command")]
     for _, order in flight.values("trajectory"):
         kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[order.at_end]
         rows.append((order.trajectory.start_time, f"trajectory {order.id} ({kind}) starts, {order.trajectory.duration:.2f} s"))

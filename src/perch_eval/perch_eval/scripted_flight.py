@@ -15,6 +15,7 @@ from perch_control.mission import State as BodyState
 from perch_control.mission import Target
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.parameters import MissionParameters
+from perch_control.mission_component import RUNNING
 from perch_control.modes import Command, State
 from perch_core import so3
 from perch_core.component import Component, Input, Output, Wake
@@ -29,7 +30,6 @@ from perch_sim.scenario import Scenario
 
 LEAD = 0.04           # from an order to its start [s]
 TAKE_OFF_SPEED = 0.8  # mean [m/s]
-RUNNING = 1           # of `EstimatorHealth.state`
 PATIENCE = 11.0       # until the estimator is ready, in simulated time [s]
 
 

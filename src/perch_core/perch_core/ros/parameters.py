@@ -37,18 +37,6 @@ def _leaves(cls: type[DataclassInstance], prefix: str = "") -> dict[str, tuple[F
     return out
 
 
-def nested(flat: dict[str, Any]) -> dict[str, Any]:
-    """Dotted names as nested mappings."""
-    out: dict[str, Any] = {}
-    for name, value in flat.items():
-        *groups, leaf = name.split(".")
-        target = out
-        for group in groups:
-            target = target.setdefault(group, {})
-        target[leaf] = value
-    return out
-
-
 def _numeric(kind: Any) -> bool:
     return kind in (float, int) or any(map(_numeric, typing.get_args(kind)))
 
@@ -109,7 +97,7 @@ class Parameters(typing.Generic[T]):
             if name not in self._leaves and not name.startswith(_FOREIGN):
                 raise config.unknown(node.get_name(), name, "parameter", self._leaves)
         self.value: T = config.from_mapping(
-            cls, nested({n: v for n, v in overrides.items() if n in self._leaves}), node.get_name())
+            cls, config.nested({n: v for n, v in overrides.items() if n in self._leaves}), node.get_name())
         for name, (item, kind) in self._leaves.items():
             fixed = not any(name.startswith(beginning) for beginning in changeable)
             node.declare_parameter(name, self._shown(name, kind, self.value), descriptor(item, kind, fixed), ignore_override=True)
@@ -140,7 +128,7 @@ class Parameters(typing.Generic[T]):
     def _changed(self, changes: list[Parameter]) -> T:
         mine = {p.name: _plain(p.value) for p in changes if p.name in self._leaves}
         flat = {name: _plain(_value_at(self.value, name)) for name in self._leaves} | mine
-        return config.from_mapping(self._cls, nested(flat), self._node.get_name())
+        return config.from_mapping(self._cls, config.nested(flat), self._node.get_name())
 
     def _set(self, changes: list[Parameter]) -> SetParametersResult:
         if not any(change.name in self._leaves for change in changes):

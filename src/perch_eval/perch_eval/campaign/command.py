@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sqlite3
 import sys
 from collections import Counter
 from contextlib import closing
@@ -45,14 +44,15 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    return exit_code(lambda: _carry_out(args), sqlite3.Error)
+    return exit_code(lambda: _carry_out(args))
 
 
 def _carry_out(args: argparse.Namespace) -> int:
     campaign = load_campaign(args.campaign, args.engine, args.runs)
     resolve(campaign.engine)
     out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
-    with closing(Results(out / "results.sqlite", campaign.name, campaign.digest, args.resume)) as results:
+    file = out / "results.jsonl"
+    with closing(Results(file, campaign.name, campaign.digest, args.resume)) as results:
         try:
             fly_all(campaign, results, args.jobs, args.cluster)
             from perch_eval.campaign.report import write_report  # draws figures: not needed before, nor by workers
@@ -61,11 +61,10 @@ def _carry_out(args: argparse.Namespace) -> int:
             keep_worst(campaign, found, out)
             report = write_report(campaign, found, out)
         except KeyboardInterrupt:
-            print(f"\ninterrupted: {len(results.finished())} of {len(campaign.runs)} results are in {out / 'results.sqlite'}; "
-                  "go on with --resume", file=sys.stderr)
+            print(f"\ninterrupted: {len(results.all())} of {len(campaign.runs)} results are in {file}; go on with --resume", file=sys.stderr)
             return 130
     print(summary(found))
-    print(f"results: {out / 'results.sqlite'}\nreport: {report}")
+    print(f"results: {file}\nreport: {report}")
     return 1 if any(r.cause == "error" for r in found) else 0
 
 

@@ -1,32 +1,15 @@
-"""Results of a campaign in one SQLite file: a row is there or it is not, whatever happens to the process. And which are worth a look."""
+"""Results of a campaign in one file, which outlives its writer. And which are worth a look."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import sqlite3
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.campaign.causes import SUCCESS
-
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS campaign (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS runs (
-    run INTEGER PRIMARY KEY,      -- number in the campaign
-    seed INTEGER NOT NULL,
-    cause TEXT NOT NULL,          -- 'perched', or why not
-    outcome TEXT NOT NULL,        -- the mission's result
-    message TEXT NOT NULL,
-    vary TEXT NOT NULL,           -- JSON: varied name -> value
-    metrics TEXT NOT NULL,        -- JSON: name -> number or null
-    wall_time REAL NOT NULL,      -- [s]
-    finished TEXT NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now'))
-);
-"""
+from perch_eval.rows import Rows, rows_of
 
 
 @dataclass(frozen=True)
@@ -48,7 +31,7 @@ class ResultsError(PerchError):
 
 
 class Results:
-    """The file. One process writes; others may read at any time."""
+    """The file: whose results it holds, then a row for each run. One process writes; others may read at any time."""
 
     def __init__(self, path: Path, name: str, digest: str, resume: bool) -> None:
         """
@@ -60,50 +43,31 @@ class Results:
         Raises:
             ResultsError: it holds another campaign's results, or results and `resume` is not asked for, or it is damaged.
         """
-        try:
-            self._db = sqlite3.connect(path)
-        except sqlite3.Error as error:
-            raise _unreadable(path, error) from None
-        try:
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=NORMAL")
-            self._db.executescript(_SCHEMA)
-            known = dict(self._db.execute("SELECT key, value FROM campaign"))
-            finished = len(_read(self._db))
-        except _DAMAGE as error:
-            self._db.close()
-            raise _unreadable(path, error) from None
-        if known and known.get("digest") != digest:
-            self._db.close()
-            raise ResultsError(f"{path} holds results of campaign {known.get('name')!r} with other settings: "
+        whose, found = _read(path)
+        if whose and whose.get("digest") != digest:
+            raise ResultsError(f"{path} holds results of campaign {whose.get('name')!r} with other settings: "
                                "choose another --out, or the settings of then")
-        if finished and not resume:
-            self._db.close()
-            raise ResultsError(f"{path} already holds {finished} results: --resume goes on with them, another --out starts anew")
-        with self._db:
-            self._db.executemany("INSERT OR REPLACE INTO campaign VALUES (?, ?)", [("name", name), ("digest", digest)])
+        if found and not resume:
+            raise ResultsError(f"{path} already holds {len(found)} results: --resume goes on with them, another --out starts anew")
+        self._found = {result.number: result for result in found}
+        try:
+            self._rows = Rows(path, [{"name": name, "digest": digest}, *map(asdict, found)])
+        except OSError as error:
+            raise _unreadable(path, error) from None
 
     def add(self, result: RunResult) -> None:
         """Write one row; a run that is there already is left as it is."""
-        with self._db:
-            self._db.execute(
-                "INSERT OR IGNORE INTO runs (run, seed, cause, outcome, message, vary, metrics, wall_time) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                (result.number, result.seed, result.cause, result.outcome, result.message, json.dumps(result.values),
-                 json.dumps(result.metrics), result.wall_time))
-
-    def finished(self) -> set[int]:
-        """Numbers of the runs that have a result."""
-        return {row[0] for row in self._db.execute("SELECT run FROM runs")}
+        if result.number not in self._found:
+            self._rows.add(asdict(result))
+            self._found[result.number] = result
 
     def all(self) -> list[RunResult]:
         """Every result, by number."""
-        return _read(self._db)
+        return [self._found[number] for number in sorted(self._found)]
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and close it."""
-        self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        self._db.close()
+        """Close the file."""
+        self._rows.close()
 
 
 def read_results(path: Path) -> list[RunResult]:
@@ -112,28 +76,25 @@ def read_results(path: Path) -> list[RunResult]:
     Raises:
         ResultsError: it cannot be read.
     """
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[dict[str, Any], list[RunResult]]:
+    """Whose results a file holds, and the results by number; nothing where there is no file."""
     try:
-        with contextlib.closing(sqlite3.connect(f"{Path(path).absolute().as_uri()}?mode=ro", uri=True)) as db:
-            return _read(db)
-    except _DAMAGE as error:
+        whose, *rows = [*rows_of(path)] or [{}]
+        return dict(whose), sorted((_result(**row) for row in rows), key=lambda result: result.number)
+    except (OSError, ValueError, TypeError, RecursionError) as error:  # of the file, of JSON in it, of its rows, of JSON's depth
         raise _unreadable(path, error) from None
 
 
-_DAMAGE = (sqlite3.Error, ValueError, TypeError, RecursionError)  # of the file, of JSON in it, of its columns, of JSON's depth
+def _result(number: int, seed: int, metrics: dict[str, Any], values: dict[str, Any], wall_time: float, **words: str) -> RunResult:
+    figures = {name: None if value is None else float(value) for name, value in dict(metrics).items()}
+    return RunResult(int(number), int(seed), values=dict(values), metrics=figures, wall_time=float(wall_time), **words)
 
 
 def _unreadable(path: Path, error: Exception) -> ResultsError:
     return ResultsError(f"{path} cannot be read as results ({error}): choose another --out")
-
-
-def _read(db: sqlite3.Connection) -> list[RunResult]:
-    rows = db.execute("SELECT run, seed, cause, outcome, message, vary, metrics, wall_time FROM runs ORDER BY run")
-    return [RunResult(int(n), int(seed), str(cause), str(outcome), str(message), dict(json.loads(vary)), _figures(json.loads(metrics)), float(wall))
-            for n, seed, cause, outcome, message, vary, metrics, wall in rows]
-
-
-def _figures(metrics: dict[str, Any]) -> dict[str, float | None]:
-    return {name: None if value is None else float(value) for name, value in dict(metrics).items()}
 
 
 def severity(result: RunResult) -> float:

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from perch_control.modes import Command, State
-from perch_core import so3
 from perch_core.errors import PerchError
 from perch_core.values import Ask, OdometryState, seconds
 from perch_eval.control_flights.scenarios import scenario_of
 from perch_eval.control_flights.way_out import Search, search
+from perch_eval.metrics import tilt_degrees
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
@@ -221,8 +221,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
 
 def _situation(flight: ScriptedFlight) -> tuple[float, float, float, float]:
     x, pad = flight.simulation.state, flight.simulation.pad
-    tilt = np.degrees(np.arccos(np.clip(so3.quat_to_matrix(x.q_WB)[2, 2], -1.0, 1.0)))
-    return float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt)
+    return (float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt_degrees(x.q_WB)))
 
 
 def _end(flight: ScriptedFlight) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ from perch_eval.campaign.workers import dead, in_processes
 from perch_eval.evaluation.sections import Effort
 from perch_eval.page import finite
 from perch_eval.revision import digest
+from perch_eval.rows import Rows, rows_of
 
 T = TypeVar("T")
 
@@ -36,17 +37,16 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
         PerchError: processes die at a job, and there is no `dead`.
     """
     effort.state.mkdir(parents=True, exist_ok=True)
-    file = effort.state / f"{name}_{digest()}.json"
-    known: dict[str, dict[str, Any]] = json.loads(file.read_text()) if file.exists() and not effort.fresh else {}
+    file = effort.state / f"{name}_{digest()}.jsonl"
+    known: dict[str, dict[str, Any]] = {} if effort.fresh else dict(rows_of(file))
     missing = [job for job in jobs if key(job) not in known]
     before = [known[key(job)] for job in jobs if key(job) in known]
     progress = Progress(len(jobs), len(before), sum(map(good, before)), name.replace("_", " "))
-    for job, result in in_processes(work, missing, effort.jobs, dead):
-        known[key(job)] = finite(result)
-        progress.add(good(result))
-        temporary = file.with_suffix(".part")
-        temporary.write_text(json.dumps(known))
-        temporary.replace(file)
+    with closing(Rows(file, known.items())) as rows:
+        for job, result in in_processes(work, missing, effort.jobs, dead):
+            known[key(job)] = finite(result)
+            rows.add((key(job), known[key(job)]))
+            progress.add(good(result))
     progress.close()
     return [known[key(job)] for job in jobs]
 

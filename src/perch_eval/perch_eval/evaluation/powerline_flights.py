@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
+from perch_core.lines import Segment
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder, seconds
 from perch_core.vehicle import Vehicle
@@ -111,8 +112,8 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
     if not maps or truth is None or estimate is None:
         return none
     point, cable = np.array(scenario.mission.perch_point), CableLine(scenario.world.cables[_target(scenario)])
-    ends = min(((np.array(line.start), np.array(line.end)) for line in maps[-1].lines), key=lambda ab: _distance(point, *ab))
-    samples = np.linspace(*ends, 400)
+    lines = [Segment.between(np.array(line.start), np.array(line.end), line.radius) for line in maps[-1].lines]
+    samples = np.linspace(*min(lines, key=lambda line: float(line.distance(point))).ends, 400)
     samples = samples[np.linalg.norm(samples - point, axis=1) < AROUND]
     if not len(samples):
         return none
@@ -122,12 +123,6 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
     seen = true.p[0] + (samples - believed.p[0]) @ turn.T
     return {"mapping_m": float(np.mean([cable.nearest(p).distance for p in seen])),
             "mapping_in_map_m": float(np.mean([cable.nearest(p).distance for p in samples]))}
-
-
-def _distance(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """From a point to a segment [m]."""
-    along = b - a
-    return float(np.linalg.norm(a + np.clip((p - a) @ along / (along @ along), 0.0, 1.0) * along - p))
 
 
 def recovered(run: RunResult) -> bool:

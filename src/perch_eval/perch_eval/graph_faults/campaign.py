@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from perch_eval.fork_server import ForkServer
 from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, commit, digest
+from perch_eval.rows import Rows, rows_of
 
 EXAMPLES = """examples:
   python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on;
@@ -52,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
     args = parser().parse_args(arguments)
-    return exit_code(lambda: _strike(args), interrupted="interrupted; what has been flown is kept, the same command goes on")
+    return exit_code(lambda: _strike(args), ValueError, interrupted="interrupted; what has been flown is kept, the same command goes on")
 
 
 def _strike(args: argparse.Namespace) -> int:
@@ -79,13 +80,9 @@ def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
         code: digest of the code whose rows count; None: any.
     """
     found = {}
-    for line in file.read_text().splitlines() if file.exists() else ():
-        try:
-            row = json.loads(line)
-            if row["struck"] is not None and code in (None, row.get("code")):
-                found[Case(row["fault"], row["node"], row["phase"], row["mode"])] = row
-        except (ValueError, KeyError, TypeError):
-            continue
+    for row in rows_of(file):
+        if row["struck"] is not None and code in (None, row.get("code")):
+            found[Case(row["fault"], row["node"], row["phase"], row["mode"])] = row
     return found
 
 
@@ -96,14 +93,15 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
     Raises:
         PerchError: the process of a flight has died again and again.
     """
-    file.write_text("".join(json.dumps(row) + "\n" for row in rows.values()))
-    progress = Progress(len(missing), what="flights")
-    try:
+    with closing(Rows(file, rows.values())) as kept, closing(Progress(len(missing), what="flights")) as progress:
         for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
             for case, row in in_processes(partial(_fly, logs), [case for case in missing if case.mode == mode], at_once):
-                _keep(case, row, file, rows, progress)
-    finally:
-        progress.close()
+                if isinstance(row, dict):
+                    rows[case] = row
+                    kept.add(row)
+                    progress.add(not problems(row))
+                if words := [row] if isinstance(row, str) else problems(row):
+                    print(f"\n{case.name}: {'; '.join(words)}", file=sys.stderr, flush=True)
 
 
 @lru_cache(maxsize=1)
@@ -122,17 +120,6 @@ def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
         return {**fly(case, _server(), folder, commit()).as_json(), "code": code}
     except PerchError as error:
         return f"not flown: {error}"
-
-
-def _keep(case: Case, row: dict[str, Any] | str, file: Path, rows: dict[Case, dict[str, Any]], progress: Progress) -> None:
-    if isinstance(row, dict):
-        rows[case] = row
-        with file.open("a") as out:
-            out.write(json.dumps(row) + "\n")
-        progress.add(not problems(row))
-    words = [row] if isinstance(row, str) else problems(row)
-    if words:
-        print(f"\n{case.name}: {'; '.join(words)}", file=sys.stderr, flush=True)
 
 
 def problems(row: dict[str, Any]) -> list[str]:

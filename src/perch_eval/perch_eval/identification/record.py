@@ -8,7 +8,7 @@ import numpy as np
 
 from perch_core.errors import PerchError
 from perch_core.vehicle import GRAVITY
-from perch_eval.flight import Flight
+from perch_eval.flight import Flight, interpolated
 
 SHORTEST = 5.0   # of a record in the air [s]
 ALOFT = 0.6      # specific force along b3 that means flying, as a share of gravity
@@ -51,7 +51,7 @@ class Record:
         """
         if values.ndim == 1:
             return np.interp(self.t - delay, times, values)
-        return np.stack([np.interp(self.t - delay, times, column) for column in values.T], axis=1)
+        return interpolated(self.t - delay, times, values)
 
 
 def record_of(flight: Flight) -> Record:
@@ -81,7 +81,7 @@ def record_of(flight: Flight) -> Record:
         raise PerchError(f"less than {SHORTEST:g} s of it are in the air")
     keep = (t > t[moving][0] + BEGIN) & (t < t[moving][-1] - 0.2)
     velocity = np.array([value.v_B for _, value in sorted(flight.values("odometry"), key=lambda pair: pair[0])])
-    v_B = np.stack([np.interp(t[keep], states.t, column) for column in velocity.T], axis=1)
+    v_B = interpolated(t[keep], states.t, velocity)
     rotors = channel == "motor_command"
     return Record(
         t[keep], w[keep], f[keep], v_B, command_t,

@@ -66,7 +66,7 @@ class NodeParameters:
         Raises:
             ConfigError: one of them is unknown, of the wrong type, or out of range.
         """
-        return config.from_mapping(cls, nested(self._launches[node].parameters), node)  # type: ignore[type-var]
+        return config.from_mapping(cls, config.nested(self._launches[node].parameters), node)  # type: ignore[type-var]
 
     def component(self, node: str) -> Component[Any]:
         """The component of a node with its parameters.
@@ -98,19 +98,3 @@ def check_parameters(scenario: Scenario, source: str) -> None:
             parameters.of(node, parameters.component_class(node).config_type)
         except ConfigError as error:
             raise ConfigError(source, f"parameters.{node}.{error.key}", error.problem) from None
-
-
-def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names as nested mappings."""
-    out: dict[str, Any] = {}
-    for name, value in flat.items():
-        *groups, leaf = name.split(".")
-        place = out
-        for group in groups:
-            place = place.setdefault(group, {})
-            if not isinstance(place, dict):
-                raise ConfigError("", name, f"{group!r} is a value, not a group")
-        if isinstance(place.get(leaf), dict):
-            raise ConfigError("", name, f"{leaf!r} is a group, not a value")
-        place[leaf] = value
-    return out

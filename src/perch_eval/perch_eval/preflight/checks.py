@@ -13,6 +13,7 @@ from perch_core import so3
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import CameraModel, ControllerStatus, ImuSample, OdometryState, Transform, seconds
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_eval.consistency import attitude_error
 
 TILT = 10.0       # of a vehicle that stands on its feet, at most [deg]
 FORCE = 0.5       # of the mean specific force from gravity [m/s^2]
@@ -132,7 +133,7 @@ def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]
                                "fine where the nodes take it from the vehicle file; else start `description`"))
             continue
         apart = float(np.linalg.norm(np.subtract(have.p, want.p)))
-        turn = degrees(float(np.linalg.norm(so3.quat_log(so3.quat_multiply(so3.quat_conjugate(np.array(want.q)), np.array(have.q))))))
+        turn = degrees(float(np.linalg.norm(attitude_error(np.array(want.q), np.array(have.q)))))
         found.append(judged(f"extrinsics {want.child}", have.parent == want.parent and apart < EXTRINSICS[0] and turn < EXTRINSICS[1],
                             f"{1e3 * apart:.0f} mm, {turn:.1f} deg from the file",
                             "one of them is wrong: measure, calibrate, and correct it"))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from perch_control.modes import Command, State
 from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.arguments import command_parser, exit_code
@@ -20,8 +21,6 @@ EXAMPLES = """examples:
   python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and see the motors stop
 
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
-DISARM, ARM, KILL = 0, 1, 5           # perch_msgs/ControllerCommand
-DISARMED, ARMED, FAILED = 0, 1, 6     # perch_msgs/ControllerStatus
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -71,17 +70,17 @@ def exercised(listener: Any, allowed: bool, watchdog: bool, bound: float = check
     if not allowed:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "watchdog")] + [takeover]
-    found = [checks.obeyed("armed state", listener.order(ARM, ARMED), ARMED, True),
-             checks.obeyed("disarming", listener.order(DISARM, DISARMED), DISARMED, False)]
+    found = [checks.obeyed("armed state", listener.order(Command.ARM, State.ARMED), State.ARMED, True),
+             checks.obeyed("disarming", listener.order(Command.DISARM, State.DISARMED), State.DISARMED, False)]
     if found[0].verdict is Verdict.PASSED:
-        listener.order(ARM, ARMED)
-        found.append(checks.obeyed("kill", listener.order(KILL, FAILED), FAILED, False))
-        listener.order(DISARM, DISARMED)
+        listener.order(Command.ARM, State.ARMED)
+        found.append(checks.obeyed("kill", listener.order(Command.KILL, State.FAILED), State.FAILED, False))
+        listener.order(Command.DISARM, State.DISARMED)
     last = None, None
-    if watchdog and listener.order(ARM, ARMED).armed:
+    if watchdog and listener.order(Command.ARM, State.ARMED).armed:
         print("armed: stop the controller's process now (within 60 s) ...", flush=True)
         last = listener.await_end_of_commands(60.0)
-        listener.order(KILL, FAILED)
+        listener.order(Command.KILL, State.FAILED)
     return [*found, checks.stopped(*last, bound), takeover]
 
 

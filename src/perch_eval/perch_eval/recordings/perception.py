@@ -15,8 +15,7 @@ from perch_core.sensors import Sensors
 from perch_core.tag_board import load_board
 from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState, OdometryState, PowerlineMap,
                                TargetPose, TargetSighting)
-from perch_eval.in_process.parameters import nested
-from perch_eval.node_launch import flattened, read_parameters
+from perch_eval.node_launch import read_parameters
 from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_wires
 from perch_eval.recordings.gallery import Gallery, Shown
 from perch_eval.recordings.recording import Event
@@ -218,8 +217,8 @@ class Perception:
         """A component with the parameters of its node; None where it is left out."""
         if node in self._choice.without:
             return None
-        parameters = flattened(read_parameters(node)) | dict(given) | flattened(self._choice.overrides.get(node, {}))
-        component = cls(config.from_mapping(cls.config_type, nested(parameters), node))
+        parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(self._choice.overrides.get(node, {}))
+        component = cls(config.from_mapping(cls.config_type, config.nested(parameters), node))
         component.log.receivers.append(lambda line: self._note(node, line))
         return component
 

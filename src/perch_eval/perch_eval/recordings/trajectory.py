@@ -58,8 +58,7 @@ class Trajectory:
         good = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]) & (span <= MAX_GAP * 1e9)
         left, right, span, stamps = left[good], right[good], span[good], stamps[good]
         share = ((stamps - self.stamps[left]) / span)[:, None]
-        turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(self.q[left]), self.q[right]))
-        q = so3.quat_multiply(self.q[left], so3.quat_exp(share * turn))
+        q = so3.quat_slerp(self.q[left], self.q[right], share[:, 0])
         return Trajectory(stamps, (1.0 - share) * self.p[left] + share * self.p[right], q), good
 
 

@@ -6,16 +6,17 @@ import math
 from functools import partial
 from typing import Any
 
+import numpy as np
 from std_msgs.msg import String
 
-from perch_core import so3
+from perch_control.modes import State
 from perch_core.ros import topics
 from perch_core.values import seconds
 from perch_eval.graph_faults.cases import Situation
+from perch_eval.metrics import tilt_degrees
 from perch_eval.ros.mission_client import MissionClient
 from perch_sim.contact_event import ContactState
 
-HOVERING = 3  # perch_msgs/ControllerStatus
 CHANNELS = ("ground_truth/odometry", "rotor_state", "contact", "controller/status")
 
 
@@ -71,8 +72,7 @@ class Watcher:
             return None
         state, rotors = (topics.decode(channel, self._newest[channel]) for channel in ("ground_truth/odometry", "rotor_state"))
         status = self._newest.get("controller/status")
-        up = so3.quat_to_matrix(state.q_WB)[2, 2]
         held = [c.state for c in self.contacts if c.state in (ContactState.NONE, ContactState.ATTACHED)][-1:] == [ContactState.ATTACHED]
-        hovers = status is not None and topics.decode("controller/status", status).state == HOVERING
-        return Situation(self.height, math.dist(state.v_WB, (0.0,) * 3), math.degrees(math.acos(min(max(up, -1.0), 1.0))),
+        hovers = status is not None and topics.decode("controller/status", status).state == State.HOVERING
+        return Situation(self.height, math.dist(state.v_WB, (0.0,) * 3), float(tilt_degrees(np.array(state.q_WB))),
                          max(rotors.speed), held, hovers)

@@ -1,0 +1,45 @@
+"""Results of long work in a file, a line of JSON each: a row is there or it is not, whatever becomes of the process."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+
+def rows_of(path: Path) -> Iterator[Any]:
+    """The rows of a file, also while it is written; none where there is no file. A last line that was cut off does not count.
+
+    Raises:
+        ValueError: a line is no JSON.
+    """
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else ()
+    yield from (json.loads(line) for line in lines if line.endswith("\n"))
+
+
+class Rows:
+    """Writes a file; one process at a time."""
+
+    def __init__(self, path: Path, known: Iterable[Any] = ()) -> None:
+        """
+        Args:
+            path: of the file, which is replaced.
+            known: rows that it begins with.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        draft = path.with_suffix(".part")
+        draft.write_text("".join(json.dumps(row) + "\n" for row in known))
+        draft.replace(path)
+        self._file = path.open("a")
+
+    def add(self, row: Any) -> None:
+        """Write a row."""
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
