@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from harness import Figure, figure, measure
 from perch_eval import estimation_flight
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import counted
 from perch_eval.campaign.workers import in_processes
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
@@ -28,11 +28,8 @@ def figures(quick: bool) -> list[Figure]:
     ukf = _ukf(quick)  # by the wall clock: before the flights, which use every core
     tasks = [(scenario, seed) for scenario in (*dict(SCENARIOS), IDEAL) for seed in range(1 if quick else 20)]
     flown: dict[str, list[_Flown]] = {scenario: [] for scenario, _ in tasks}
-    progress = Progress(len(tasks), what="perches")
-    for (scenario, _), one in in_processes(_fly, tasks):
+    for (scenario, _), one in counted(in_processes(_fly, tasks), len(tasks), what="perches"):
         flown[scenario].append(one)
-        progress.add(True)
-    progress.close()
     costs = [cost for one in sum(flown.values(), []) for cost in one.costs]
     out = [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="), *ukf]
     for scenario, name in SCENARIOS:

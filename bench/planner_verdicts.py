@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "oracles"
 import exact_sturm
 
 from perch_core import bernstein
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import counted
 from perch_eval.campaign.workers import in_processes
 from perch_planner import bounds
 
@@ -38,9 +38,5 @@ def _wrong(first: int) -> int:
 def wrong_verdicts(count: int) -> float:
     """Verdicts on `count` polynomials, a multiple of 100, that the exact chain contradicts; on all processors but one."""
     starts = range(0, count, _CHUNK)
-    progress, total = Progress(len(starts), what=f"times {_CHUNK} verdicts"), 0
-    for _, wrong in in_processes(_wrong, starts, max(1, (os.cpu_count() or 1) - 1)):
-        total += wrong
-        progress.add(not wrong)
-    progress.close()
-    return float(total)
+    found = in_processes(_wrong, starts, max(1, (os.cpu_count() or 1) - 1))
+    return float(sum(wrong for _, wrong in counted(found, len(starts), lambda one: not one[1], what=f"times {_CHUNK} verdicts")))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,8 @@ from perch_core import compiled, config, so3
 from perch_core.errors import PlanningRefusal
 from perch_core.rotor_model import P, Q, V
 from perch_core.vehicle import Vehicle, load_vehicle
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import counted
+from perch_eval.node_launch import read_parameters
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
@@ -39,7 +41,8 @@ def figures(quick: bool) -> list[Figure]:
     """Measure everything; `quick` takes 10 starts a case instead of 200."""
     vehicle = load_vehicle("rpg")
     out = [figure("compilation", "s", [_compile_time()], bar=30.0, comparison="max <=")]
-    answers = _answers(vehicle, 10 if quick else 200)
+    starts, random_starts = (10, 100) if quick else (200, 2000)
+    answers = _answers(vehicle, _of_cases(vehicle, starts), starts * len(SOLVE_BARS))
     for case, bar in SOLVE_BARS.items():
         plans = [answer for answer in answers if answer["case"] == case and not answer["refusal"]]
         out += [figure(f"{case} perch solve", "ms", [plan["perch_ms"] for plan in plans], bar=bar),
@@ -52,7 +55,7 @@ def figures(quick: bool) -> list[Figure]:
             figure("limits violated at 1 ms", "-", [sum(plan["violated"] for plan in plans)], bar=0, comparison="max ==")]
     out += [figure(name, {"end_tilt": "deg", "end_speed": "m/s"}.get(name, "m"), [plan[name] for plan in plans], bar=END_BARS[name],
                    comparison="max <=") for name in END_BARS]
-    anywhere = _anywhere(vehicle, 100 if quick else 2000)
+    anywhere = _answers(vehicle, _anywhere(vehicle, random_starts), random_starts)
     plans = [answer for answer in anywhere if not answer["refusal"]]
     out += [figure("starts anywhere, 0-180 deg, solved", "%", [100.0 * len(plans) / len(anywhere)], bar=99.5, comparison="min >="),
             figure("starts anywhere, limits violated", "-", [sum(plan["violated"] for plan in plans)], bar=0, comparison="max =="),
@@ -65,28 +68,29 @@ def figures(quick: bool) -> list[Figure]:
 
 def shipped_settings() -> PowerlinePlannerParameters:
     """The planner's settings in `config/powerline_planner.yaml`."""
-    content = config.read_yaml(config.config_dir() / "powerline_planner.yaml")
-    return config.from_mapping(PowerlinePlannerParameters, content["/**"]["ros__parameters"], "powerline_planner.yaml")
+    return config.from_mapping(PowerlinePlannerParameters, read_parameters("powerline_planner"), "powerline_planner.yaml")
 
 
-def _answers(vehicle: Vehicle, starts: int) -> list[dict]:
-    """What the planner says to so many random starts of each case."""
-    found, planner, progress = [], PowerlinePlanner(vehicle, shipped_settings()), Progress(len(SOLVE_BARS) * starts, what="starts")
+def _answers(vehicle: Vehicle, requests: Iterable[tuple[str, PowerlineRequest]], total: int) -> list[dict]:
+    """What the planner says to requests with their names."""
+    planner = PowerlinePlanner(vehicle, shipped_settings())
     planner.warm_up()
+    answers = ({"case": case, **_answer(planner, request)} for case, request in requests)
+    return list(counted(answers, total, lambda answer: not answer["refusal"], what="starts"))
+
+
+def _of_cases(vehicle: Vehicle, starts: int) -> Iterator[tuple[str, PowerlineRequest]]:
+    """So many random starts of each case."""
     for case in SOLVE_BARS:
         setup, rng = problem.load(f"powerline_{case}"), np.random.default_rng(2026)
         nominal = setup.request(vehicle)
         for _ in range(starts):
-            found.append({"case": case, **_answer(planner, random_start(nominal, setup, vehicle, rng))})
-            progress.add(not found[-1]["refusal"])
-    progress.close()
-    return found
+            yield case, random_start(nominal, setup, vehicle, rng)
 
 
-def _anywhere(vehicle: Vehicle, starts: int) -> list[dict]:
-    """What the planner says to perches at 0 to 180 deg on any of three wires, from anywhere 2 to 5 m before them, with and without perception."""
-    setup, found, planner = problem.load("powerline_line_80"), [], PowerlinePlanner(vehicle, shipped_settings())
-    nominal, progress = setup.request(vehicle), Progress(starts, what="starts")
+def _anywhere(vehicle: Vehicle, starts: int) -> Iterator[tuple[str, PowerlineRequest]]:
+    """Perches at 0 to 180 deg on any of three wires, from anywhere 2 to 5 m before them, with and without perception."""
+    nominal = problem.load("powerline_line_80").request(vehicle)
     for number in range(starts):
         rng = np.random.default_rng([2027, number])
         line, start = nominal.lines[rng.integers(len(nominal.lines))], nominal.start.copy()
@@ -96,11 +100,8 @@ def _anywhere(vehicle: Vehicle, starts: int) -> list[dict]:
         start[V] = rng.uniform(-0.5, 0.5, 3)
         point, pitch = line.centre + rng.uniform(-0.5, 0.5) * line.direction, rng.uniform(0.0, np.pi)
         perch = PerchPose.on_line(line, point, pitch, vehicle.wire_offset, start[P])
-        request = replace(nominal, start=start, target_line=line.id, perch=perch, perception=bool(rng.integers(2)), deadline=10.0)
-        found.append({"case": f"anywhere {number}, line {line.id}, {np.degrees(pitch):.0f} deg", **_answer(planner, request)})
-        progress.add(not found[-1]["refusal"])
-    progress.close()
-    return found
+        yield (f"anywhere {number}, line {line.id}, {np.degrees(pitch):.0f} deg",
+               replace(nominal, start=start, target_line=line.id, perch=perch, perception=bool(rng.integers(2)), deadline=10.0))
 
 
 def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> dict:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -18,16 +18,6 @@ EXAMPLES = """examples:
   python3 scripts/bench.py planner --quick          fewer repetitions, for a first look
 
 exit code: 0 every bar holds, 1 a bar does not hold or a group could not be measured, 2 wrong arguments"""
-
-
-def group_figures(group: str, quick: bool) -> list:
-    """Load bench/<group>.py and measure it."""
-    path = ROOT / "bench" / f"{group}.py"
-    spec = importlib.util.spec_from_file_location(f"bench_{group}", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module.figures(quick)
 
 
 def main() -> int:
@@ -50,15 +40,11 @@ def main() -> int:
     sys.path.insert(0, str(ROOT / "bench"))
     import harness
 
-    groups = [arguments.group] if arguments.group else [g for g in GROUPS if (ROOT / "bench" / f"{g}.py").is_file()]
     results, failed = {}, False
-    for group in groups:
-        if not (ROOT / "bench" / f"{group}.py").is_file():
-            print(f"error: bench/{group}.py: no such group here", file=sys.stderr)
-            return 2
+    for group in [arguments.group] if arguments.group else GROUPS:
         print(f"== {group}", flush=True)
         try:
-            results[group] = group_figures(group, arguments.quick)
+            results[group] = importlib.import_module(group).figures(arguments.quick)  # bench/<group>.py
         except Exception as error:  # a group that breaks must not hide the figures of the others
             print(f"error: {group}: {type(error).__name__}: {error}", file=sys.stderr)
             failed = True

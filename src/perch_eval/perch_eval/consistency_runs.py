@@ -18,7 +18,7 @@ import numpy as np
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
 from perch_eval.arguments import count, exit_code, output_folder
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import counted
 from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
@@ -55,12 +55,8 @@ def run(scenario_name: str, runs: int, first_seed: int = 100) -> tuple[list[Cons
     """
     motion = flights.motion_of(load_scenario(scenario_name), first_seed)  # its phases are those of every run
     seeds = range(first_seed, first_seed + runs)
-    progress = Progress(runs, what="perches")
-    found: dict[int, _Run] = {}
-    for (_, seed), one in in_processes(_fly, [(scenario_name, seed) for seed in seeds]):
-        found[seed] = one
-        progress.add(True)
-    progress.close()
+    flights_under_way = in_processes(_fly, [(scenario_name, seed) for seed in seeds])
+    found = {seed: one for (_, seed), one in counted(flights_under_way, runs, what="perches")}
     flown = [found[seed] for seed in seeds]
     n = min(len(one.track.times) for one in flown)
     times = flown[0].track.times[:n]

@@ -12,7 +12,7 @@ from pathlib import Path
 from perch_eval.arguments import command_parser, count, exit_code, output_folder
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import counted
 from perch_eval.campaign.results import Results, RunResult, worst
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
@@ -81,13 +81,10 @@ def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None
              for run in campaign.runs if run.number not in finished]
     print(f"{campaign.name}: {len(tasks)} of {len(campaign.runs)} runs to fly on {campaign.engine}, "
           + (f"Dask {cluster}" if cluster else f"{jobs} process{'es' if jobs > 1 else ''}"), flush=True)
-    progress = Progress(len(campaign.runs), len(finished), sum(r.cause == SUCCESS for r in known))
-    try:
-        for result in (on_cluster(tasks, cluster) if cluster else in_pool(tasks, jobs)):
-            results.add(result)
-            progress.add(result.cause == SUCCESS)
-    finally:
-        progress.close()
+    flown = on_cluster(tasks, cluster) if cluster else in_pool(tasks, jobs)
+    good = sum(r.cause == SUCCESS for r in known)
+    for result in counted(flown, len(campaign.runs), lambda r: r.cause == SUCCESS, already=len(finished), good_already=good):
+        results.add(result)
 
 
 def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TextIO
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from typing import Any, TextIO, TypeVar
+
+T = TypeVar("T")
 
 
 class Progress:
@@ -13,28 +17,28 @@ class Progress:
     def __init__(self, total: int | None, already: int = 0, good_already: int = 0, what: str = "runs", out: TextIO | None = None,
                  period: float = 10.0) -> None:
         self._total, self._done, self._good, self._already = total, already, good_already, already
-        self._what, self._out, self._period = what, out or sys.stderr, period
-        self._began = self._shown = time.monotonic()
+        self._what, self._out, self._judged = what, out or sys.stderr, already > 0
         self._terminal = self._out.isatty()
+        self._period = 0.1 if self._terminal else period
+        self._began = self._shown = time.monotonic()
 
-    def add(self, good: bool) -> None:
-        """One more is finished."""
+    def add(self, good: bool | None = None) -> None:
+        """One more is finished; None: nobody judges it."""
         self._done += 1
-        self._good += good
+        self._good += bool(good)
+        self._judged |= good is not None
         now = time.monotonic()
-        if self._terminal:
-            self._out.write(f"\r\x1b[2K{self.line(now)}")
+        if now - self._shown >= self._period or self._done == self._total:
+            self._shown = now
+            self._out.write(f"\r\x1b[2K{self.line(now)}" if self._terminal else f"{self.line(now)}\n")
             self._out.flush()
-        elif now - self._shown >= self._period or self._done == self._total:
-            print(self.line(now), file=self._out, flush=True)
-        self._shown = now if not self._terminal and now - self._shown >= self._period else self._shown
 
     def line(self, now: float) -> str:
         """The line at a time of the monotonic clock."""
         fresh, elapsed = self._done - self._already, max(now - self._began, 1e-9)
         rate = fresh / elapsed
         text = f"  {self._done}" + ("" if self._total is None else f"/{self._total}") + f" {self._what}"
-        if self._done:
+        if self._done and self._judged:
             text += f", {self._good} good ({100 * self._good / self._done:.0f} %)"
         if fresh:
             text += f", {60 * rate:.1f} per minute"
@@ -46,6 +50,14 @@ class Progress:
         """End the line."""
         if self._terminal and self._done > self._already:
             self._out.write("\n")
+
+
+def counted(found: Iterable[T], total: int, good: Callable[[T], bool | None] = lambda _: None, **options: Any) -> Iterator[T]:
+    """What is found, counted on its way; further options are those of `Progress`."""
+    with closing(Progress(total, **options)) as progress:
+        for one in found:
+            yield one
+            progress.add(good(one))
 
 
 def span(seconds: float) -> str:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, carry_out
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import counted
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.workers import dead, in_processes
 from perch_eval.evaluation.sections import Effort
@@ -41,13 +41,12 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
     known: dict[str, dict[str, Any]] = {} if effort.fresh else dict(rows_of(file))
     missing = [job for job in jobs if key(job) not in known]
     before = [known[key(job)] for job in jobs if key(job) in known]
-    progress = Progress(len(jobs), len(before), sum(map(good, before)), name.replace("_", " "))
+    found = counted(in_processes(work, missing, effort.jobs, dead), len(jobs), lambda one: good(one[1]), already=len(before),
+                    good_already=sum(map(good, before)), what=name.replace("_", " "))
     with closing(Rows(file, known.items())) as rows:
-        for job, result in in_processes(work, missing, effort.jobs, dead):
+        for job, result in found:
             known[key(job)] = finite(result)
             rows.add((key(job), known[key(job)]))
-            progress.add(good(result))
-    progress.close()
     return [known[key(job)] for job in jobs]
 
 

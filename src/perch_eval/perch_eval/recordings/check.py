@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -16,17 +16,17 @@ from perch_eval.recordings.recording import Event, Recording
 DAY = 86_400_000_000_000  # [ns]
 
 
-def check(recording: Recording, watched: Callable[[Iterator[Event]], Iterator[Event]] = lambda events: events) -> Report:
+def check(recording: Recording, events: Iterator[Event] | None = None) -> Report:
     """Read a recording once and judge it.
 
     Args:
         recording: what is judged, against its sensor file where it has one.
-        watched: what the events pass through, for a progress bar.
+        events: the recording's, where somebody counts them on their way.
     """
     report, sensors = Report(), recording.sensors
     stamps, samples = [], []
     lookers = {name: Looker(n) for name, n in recording.images.items()}
-    for event in watched(recording.events()):
+    for event in events or recording.events():
         if isinstance(event.value, ImuSample):
             stamps.append(event.value.stamp)
             samples.append((*event.value.w_B, *event.value.f_B))

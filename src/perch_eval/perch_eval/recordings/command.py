@@ -27,7 +27,7 @@ from perch_eval.recordings.gallery import Gallery
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Choice, Perception
 from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
-from perch_eval.recordings.recording import Reading, Recording
+from perch_eval.recordings.recording import Recording
 from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
 from perch_perception.images import ImageError
 from perch_perception.line_mapping import LineDetectionConfig
@@ -114,7 +114,7 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     file = args.out / "sensors.yaml"  # what was used, beside what came of it
     file.write_text(to_yaml(sensors, f"of {recording.path.name}"))
     perception = Perception(sensors, Choice(str(file), down, front, args.board, overrides, tuple(args.without)))
-    for event in Reading(recording).read(recording.events()):
+    for event in recording.read():
         perception.take(event)
     findings = check(recording)
     figures, rows, plots, vio = _figures(perception, truth)
@@ -270,7 +270,7 @@ def _write(folder: Path, title: str, content: dict[str, Any], rows: list[tuple[s
 
 def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
     board, gallery, problems, seen = load_board(args.board), Gallery(24), [], {}
-    for event in Reading(recording).read(recording.events()):
+    for event in recording.read():
         image = event.value
         if not isinstance(image, CameraImage):
             continue

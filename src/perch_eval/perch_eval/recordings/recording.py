@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from perch_core.errors import PerchError
 from perch_core.sensors import CameraSensor, Sensors
 from perch_core.urdf import optical_frame
 from perch_core.values import CameraImage, ImuSample
-from perch_eval.campaign.progress import Progress, span
+from perch_eval.campaign.progress import counted
 
 IMU = "imu"
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
@@ -39,25 +39,6 @@ class Event(NamedTuple):
     value: ImuSample | CameraImage
 
 
-class Reading(Progress):
-    """How far a recording has been read."""
-    def __init__(self, recording: Recording) -> None:
-        super().__init__(recording.samples + sum(recording.images.values()), what="messages")
-
-    def read(self, events: Iterable[Event]) -> Iterator[Event]:
-        """The events, counted on their way."""
-        for event in events:
-            yield event
-            self.add(True)
-        self.close()
-
-    def line(self, now: float) -> str:
-        """The bar, and the time that is left."""
-        share = min(1.0, self._done / (self._total or 1))
-        left = span((1.0 - share) / share * (now - self._began)) if share > 0.0 else "?"
-        return f"  [{'#' * round(30 * share):30}] {100 * share:3.0f} %, {self._done}/{self._total} {self._what}, {left} left"
-
-
 class Recording(ABC):
     """One recording.
 
@@ -77,6 +58,10 @@ class Recording(ABC):
     @abstractmethod
     def events(self) -> Iterator[Event]:
         """Everything in the order in which it arrived; each call begins anew."""
+
+    def read(self) -> Iterator[Event]:
+        """The events, counted on their way."""
+        return counted(self.events(), self.samples + sum(self.images.values()), what="messages")
 
     @property
     def truth(self) -> Path | None:

@@ -16,7 +16,6 @@ from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_eval.recordings.check import check
 from perch_eval.recordings.opening import open_recording
-from perch_eval.recordings.recording import Reading
 
 EXAMPLES = """examples:
   python3 scripts/sensors.py import kalibr camchain-imucam.yaml imu.yaml --out mine.yaml
@@ -105,7 +104,7 @@ def _renamed(sensors, args: argparse.Namespace):
 
 def _check(args: argparse.Namespace) -> int:
     recording = open_recording(args.recording, load_sensors(args.sensors) if args.sensors else None)
-    found = check(recording, Reading(recording).read)
+    found = check(recording, recording.read())
     width = max(len(finding.about) for finding in found.findings)
     for finding in found.findings:
         print(f"{finding.level:8} {finding.about:{width}}  {finding.text}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -11,14 +11,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from perch_core.errors import PerchError
+from perch_eval.campaign.progress import counted
 from perch_eval.replay.scene import Scene
 
 DPI = 80
 CODECS = ("vp09", "mp4v")  # browsers play the first, older players the second
 
 
-def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path,
-                    on_frame: Callable[[int, int], None] = lambda done, total: None) -> None:
+def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path) -> None:
     """Draw a scene at each time and write the frames.
 
     Args:
@@ -26,7 +26,6 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path,
         times: of the frames [s].
         fps: frames per second of the animation.
         path: ends in .gif or .mp4.
-        on_frame: told (frames done, frames in all).
 
     Raises:
         PerchError: another ending, or OpenCV has no encoder for MP4.
@@ -34,18 +33,17 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path,
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
     if path.suffix not in writers:
         raise PerchError(f"{path}: the ending is neither .gif nor .mp4")
-    writers[path.suffix](path, fps, _frames(scene, times, on_frame))
+    writers[path.suffix](path, fps, counted(_frames(scene, times), len(times), what="frames"))
 
 
-def _frames(scene: Scene, times: np.ndarray, on_frame: Callable[[int, int], None]) -> Iterator[np.ndarray]:
+def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:
     """Pictures, (height, width, 3) RGB."""
     scene.figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(scene.figure)
-    for k, time in enumerate(times):
+    for time in times:
         scene.draw(float(time))
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        on_frame(k + 1, len(times))
 
 
 def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:

@@ -85,7 +85,7 @@ def _animate(args: argparse.Namespace, scene: Scene, start: float, end: float, p
     step = args.speed / args.fps
     times = start + step * np.arange(max(1, round((end - start) / step)))
     print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
-    write_animation(scene, times, args.fps, path, _progress)
+    write_animation(scene, times, args.fps, path)
     print(f"animation: {path}")
 
 
@@ -111,8 +111,3 @@ def write_plots(view: FlightView, folder: Path) -> None:
     for name, draw in figures.items():
         if data := draw(view):
             (folder / f"{name}.png").write_bytes(base64.b64decode(data))
-
-
-def _progress(done: int, total: int) -> None:
-    if sys.stderr.isatty():
-        print(f"\r  {done}/{total}", end="" if done < total else "\n", file=sys.stderr, flush=True)
