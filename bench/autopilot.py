@@ -135,14 +135,14 @@ def levelled(vehicle: str, axis: int, tilt: float, rate: float) -> float:
         body.loop.close()
 
 
-def held_without_link(watched: float = 1.5) -> float:
-    """How long the firmware goes on turning the body as it was told last, from when the link is cut, at most `watched` [s]."""
+def held_without_link() -> float:
+    """How long the firmware goes on turning the body as it was told last, from when the link is cut, at most 1.5 s [s]."""
     body = Body(load_vehicle(SCENARIO.vehicle))
     try:
         body.hover()
         body.found(np.array([1.0, 0.0, 0.0]), 0.0, 2.0)
         begin, body.loop.severed = body.time, True
-        while body.plant.w[0] > 1.0 and body.time < begin + watched:
+        while body.plant.w[0] > 1.0 and body.time < begin + 1.5:
             body.step(True, (2.0, 0.0, 0.0))
         return body.time - begin
     finally:

@@ -280,7 +280,7 @@ def test_two_flights_are_on_one_page(recorded, tmp_path, monkeypatch):
     channels["odometry"] = [(t, state._replace(p_WB=tuple(np.add(state.p_WB, (0.0, 0.05, 0.0))))) for t, state in channels["odometry"]]
     record(b / "flight.mcap", channels)
     with monkeypatch.context() as patch:
-        patch.setattr("perch_eval.plots.encode", lambda *_: "not looked at")
+        patch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
         build_report(b, load_scenario("surface_90"), 7, "perched", "held <by velcro>", 2.0, 4.0)
     page = tmp_path / "pages" / "ab.html"
     assert comparison.main([str(a), str(b / "flight.mcap"), "--names", "<one>", "other", "--out", str(page)]) == 0
@@ -291,14 +291,14 @@ def test_two_flights_are_on_one_page(recorded, tmp_path, monkeypatch):
     assert rows["outcome"] == ["-", "perched", ""] and rows["seed"] == ["-", "7", ""] and rows["message"][1] == "held &lt;by velcro&gt;"
     assert rows["tilt error at contact [deg]"][:2] == ["at most 15", "-"], "limits of the material are those of the report"
     assert text.count("data:image/png;base64,") == 5 and "<one>" not in text
-    monkeypatch.setattr("perch_eval.plots.encode", lambda *_: "not drawn again")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
     assert comparison.main([str(a), str(a), "--out", str(page)]) == 0
     assert compared(page.read_text())[1] == "The two are the same flight"
 
 
 @pytest.mark.parametrize("page", ["report", "comparison"])
 def test_a_flight_can_be_turned_on_a_page_that_needs_no_network(page, reported, tmp_path, monkeypatch):
-    monkeypatch.setattr("perch_eval.plots.encode", lambda *_: "not looked at")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
     folder, _ = reported
     file = folder / "report.html"
     if page == "comparison":

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from perch_eval.in_process.stand_ins import NoParameters
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import Estimate, UkfConfig
-from perch_perception.vio import VioConfig, VioPoseEstimate, VioResult
+from perch_perception.vio import VioPoseEstimate, VioResult
 from perch_perception.vio.start import TOLD_SIGMA
 from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_mount
@@ -35,6 +35,7 @@ from perch_sim.lockstep.schedule import Arrival
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import Scenario
 
+STRIDE = 5        # samples between states of the estimator that are kept
 TRANSPORT = 0.02  # from the middle of an exposure to the arrival of its image [s]
 Tamper = Callable[[float, int, np.ndarray], list[tuple[int, np.ndarray]]]
 """A frame (time [s], stamp [ns], image) to those that arrive, (stamp, image): none, others, several."""
@@ -218,11 +219,11 @@ class _Repeated(Component[NoParameters]):
 
 
 class _Estimator(StateEstimator):
-    """Keeps its whole state at every `stride`-th sample from `begin` [s] on, and the NIS of each state that it has used."""
+    """Keeps its whole state at every `STRIDE`-th sample from `begin` [s] on, and the NIS of each state that it has used."""
 
-    def __init__(self, config: UkfConfig, begin: float, stride: int) -> None:
-        super().__init__(config)  # type: ignore[arg-type]  # the name of the estimator is nothing to itself
-        self._from, self._stride, self._samples = round(begin * 1e9), stride, 0
+    def __init__(self, begin: float) -> None:
+        super().__init__(UkfConfig())  # type: ignore[arg-type]  # the name of the estimator is nothing to itself
+        self._from, self._samples = round(begin * 1e9), 0
         self.states: list[tuple[int, Estimate]] = []  # number of the sample
         self.nis: list[float] = []
 
@@ -232,26 +233,25 @@ class _Estimator(StateEstimator):
         super().on_imu(sample)
         if self._estimator.status.accepted > accepted:
             self.nis.append(self._estimator.status.nis)
-        if sample.stamp >= self._from and self._samples % self._stride == 0:
+        if sample.stamp >= self._from and self._samples % STRIDE == 0:
             assert self._estimator.estimate is not None
             self.states.append((self._samples, self._estimator.estimate))
         self._samples += 1
 
 
-def run_vio(flight: Flight, config: VioConfig = VioConfig(), tamper: Tamper | None = None, tamper_imu: TamperImu | None = None,
+def run_vio(flight: Flight, tamper: Tamper | None = None, tamper_imu: TamperImu | None = None,
             begin: float = 0.0) -> list[VioStep]:
     """VIO over a flight.
 
     Args:
         flight: its data.
-        config: VIO's settings.
         tamper: what becomes of frames on their way.
         tamper_imu: what becomes of IMU samples on theirs.
         begin: VIO is switched on there [s], and told the pose of that moment, as wrong as the flight has it.
     """
     standing = flight.motion.sample(np.array([begin])).p_WB[0] - (0.0, 0.0, load_vehicle(flight.vehicle).standing_height)
     vio = _Vio(VioComponentConfig(
-        **{f.name: getattr(config, f.name) for f in fields(VioConfig)}, vehicle=flight.vehicle,
+        vehicle=flight.vehicle,
         start_position=tuple((standing + flight.told_wrong[:3]).tolist()), start_yaw_deg=float(np.degrees(flight.told_wrong[3]))))
     vehicle = _Vehicle(flight, begin, tamper=tamper, tamper_imu=tamper_imu)
     _run(Loop(vehicle, {"vio": vio}, {"vio": Task(0.0)}, {}), vehicle)
@@ -292,12 +292,11 @@ class EstimatorTrack:
     health: tuple[EstimatorHealth, ...] = ()
 
 
-def run_estimator(flight: Flight, steps: list[VioStep], config: UkfConfig = UkfConfig(), latency: float = 0.040,
-                  begin: float = 0.7, stride: int = 5) -> EstimatorTrack:
+def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, begin: float = 0.7) -> EstimatorTrack:
     """The estimator on a flight's IMU and on VIO's states, which count `latency` [s] after their exposure, or with the next sample."""
     stamps = {middle: stamp for middle, stamp, _ in flight.frames}
     states = {stamps[s.time]: _state(s.result.estimate) for s in steps if s.result.estimate is not None and s.time in stamps}
-    estimator, vehicle = _Estimator(config, begin, stride), _Vehicle(flight, transport=min(TRANSPORT, latency))
+    estimator, vehicle = _Estimator(begin), _Vehicle(flight, transport=min(TRANSPORT, latency))
     loop = Loop(vehicle, {"estimator": estimator, "vio": _Repeated(states)}, {"estimator": Task(), "vio": Task(latency)}, {})
     _run(loop, vehicle)
     truth, readings, q = flight.truth, flight.readings, flight.truth.q_WB

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -62,9 +66,13 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), classes: Sequ
     return f"<table>{first}{''.join(lines)}</table>" if lines else ""
 
 
-def image(png: str, title: str = "") -> str:
-    """A figure [PNG in base64]; empty where there is none."""
-    return f'<img alt="{text(title)}" src="data:image/png;base64,{png}">' if png else ""
+def image(figure: Figure | None, title: str = "") -> str:
+    """A figure; empty where there is none."""
+    if figure is None:
+        return ""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=95)
+    return f'<img alt="{text(title)}" src="data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}">'
 
 
 def images(pictures: Iterable[tuple[str, np.ndarray]], width: int = 640) -> str:

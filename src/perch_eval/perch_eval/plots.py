@@ -1,9 +1,7 @@
-"""The figures of a flight, or of several flights side by side, over the perch: PNG in base64, for a page."""
+"""The figures of a flight, or of several flights side by side, over the perch."""
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -35,17 +33,8 @@ Panel = tuple[str, list[Line]]
 """Label of the y axis with its unit, and curves."""
 
 
-def encode(figure: Figure) -> str:
-    """A figure as PNG in base64, for a page; it fills its size."""
-    buffer = io.BytesIO()
-    if figure.get_layout_engine() is None:
-        figure.set_layout_engine("constrained")
-    figure.savefig(buffer, format="png", dpi=95)
-    return base64.b64encode(buffer.getvalue()).decode()
-
-
 def panels(views: Views, content: Sequence[Panel], columns: int, height: float = 2.4, bounds: Sequence[float] = (),
-           span: tuple[float, float] | None = None) -> str:
+           span: tuple[float, float] | None = None) -> Figure:
     """Panels over time. Times of one flight are its own, those of several count from the start of each perch.
 
     Args:
@@ -59,7 +48,7 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
     alone, rows = len(views) == 1, -(-len(content) // columns)
     low, high = span or (min(view.start - _zero(views, view) for view in views) - BEFORE,
                          max(view.end - _zero(views, view) for view in views) + AFTER)
-    figure = Figure(figsize=(12, height * rows))
+    figure = Figure(figsize=(12, height * rows), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for axis, (label, lines) in zip(grid.flat, content):
         for line in lines:
@@ -76,7 +65,7 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
         grid[0, 0].legend(fontsize=8)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]" if alone else "time since the perch began [s]; dotted: its end")
-    return encode(figure)
+    return figure
 
 
 def _zero(views: Views, view: FlightView) -> float:
@@ -102,7 +91,7 @@ def _states(views: Views, pick: Callable[[States], np.ndarray], estimate: bool =
             if states is not None]
 
 
-def tracking_figure(*views: FlightView) -> str:
+def tracking_figure(*views: FlightView) -> Figure:
     """Position and velocity over time (the paper's Fig. 5)."""
     def content(axis: int) -> list[Panel]:
         return [(f"{'xyz'[axis]} [m]", _states(views, lambda states: states.p[:, axis])),
@@ -111,7 +100,7 @@ def tracking_figure(*views: FlightView) -> str:
     return panels(views, [panel for axis in range(3) for panel in content(axis)], 2)
 
 
-def rates_figure(*views: FlightView) -> str:
+def rates_figure(*views: FlightView) -> Figure:
     """Body rates (the paper's Fig. 6) and tilt."""
     def content(axis: int) -> Panel:
         return f"rate {'xyz'[axis]} [deg/s]", _states(views, lambda states: np.degrees(states.w[:, axis]), estimate=False)
@@ -120,7 +109,7 @@ def rates_figure(*views: FlightView) -> str:
     return panels(views, [*map(content, range(3)), ("tilt of b3 [deg]", tilts)], 2)
 
 
-def thrust_figure(*views: FlightView) -> str:
+def thrust_figure(*views: FlightView) -> Figure:
     """Collective thrust against its bounds [M:eq16]."""
     reached: list[Line] = []
     commanded: list[Line] = []
@@ -138,11 +127,11 @@ def thrust_figure(*views: FlightView) -> str:
     return panels(views, [("thrust [N]", lines)], 1, 2.8, bounds)
 
 
-def error_figure(view: FlightView) -> str:
-    """Estimation error with its own 3-sigma bounds over the whole flight; empty where there is no estimate."""
+def error_figure(view: FlightView) -> Figure | None:
+    """Estimation error with its own 3-sigma bounds over the whole flight; None where there is no estimate."""
     estimate = view.estimate
     if estimate is None:
-        return ""
+        return None
     running = [t for t, health in view.flight.values("estimator/status") if health.state == RUNNING]
     began = running[0] if running else estimate.t[0]  # before, the filter knows nothing: kilometres of sigma
     shown = [(t, state) for t, state in view.flight.values("odometry") if t >= began][::10]
@@ -154,7 +143,7 @@ def error_figure(view: FlightView) -> str:
         span=(float(began), float(estimate.t[-1])))
 
 
-def distance_figure(*views: FlightView) -> str:
+def distance_figure(*views: FlightView) -> Figure:
     """Distances of reference and estimate from the truth through the perch."""
     def lines(kind: str) -> list[Line]:
         found = []
@@ -168,9 +157,9 @@ def distance_figure(*views: FlightView) -> str:
     return panels(views, [(f"{kind} - truth [cm]", lines(kind)) for kind in ("reference", "estimate")], 2)
 
 
-def path_figure(*views: FlightView) -> str:
+def path_figure(*views: FlightView) -> Figure:
     """Side view of the perch with the thrust direction as arrows (the paper's Fig. 5, right)."""
-    figure = Figure(figsize=(12, 5))
+    figure = Figure(figsize=(12, 5), layout="constrained")
     axis = figure.subplots()
     along = _horizontal(views[0])
     if views[0].pad is not None:
@@ -191,7 +180,7 @@ def path_figure(*views: FlightView) -> str:
     axis.set(xlabel="along the perch [m]", ylabel="z [m]")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
-    return encode(figure)
+    return figure
 
 
 def _horizontal(view: FlightView) -> np.ndarray:

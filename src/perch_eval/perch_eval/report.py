@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from perch_control.modes import Command
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
@@ -135,12 +136,12 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
             ("ended at", f"{report['simulated_time_s']:.2f} s of simulated time"), ("flight hash", report["flight_hash"][:16])]
 
 
-def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tuple[str, str]]:
-    """Titles and PNG in base64."""
-    figures = []
+def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tuple[str, Figure | None]]:
+    """Titles and figures."""
+    figures: list[tuple[str, Figure | None]] = []
     if inspection is not None:
-        figures += [("Reference and flown path", plots.encode(paths_figure(inspection))),
-                    ("Clearance, reprojection error and visibility of the watched line", plots.encode(metrics_figure(inspection)))]
+        figures += [("Reference and flown path", paths_figure(inspection)),
+                    ("Clearance, reprojection error and visibility of the watched line", metrics_figure(inspection))]
     if view is not None:
         figures += [("Tracking and estimation through the perch", plots.tracking_figure(view)),
                     ("Path, seen from the side", plots.path_figure(view)), ("Body rates and tilt", plots.rates_figure(view)),
@@ -166,7 +167,7 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
         section("Timeline", table((f"{t:.3f} s", words) for t, words in _timeline(flight))),
         section("Flight in 3-D", scene_3d([view]) if view is not None else "", "not recorded"),
         section("What the cameras saw", clip(flight), "No images were recorded."),
-        *(section(name, image(png, name)) for name, png in _figures(view, inspection)),
+        *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
         section("Durations that the nodes measured", table(timings)), section("Last diagnostics", table(nodes)),
         heading=Html(f'{text(title)}: <span class="{good}">{text(report["outcome"])}</span>'))

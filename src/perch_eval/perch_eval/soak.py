@@ -82,9 +82,9 @@ def sample(pid: int) -> Sample:
     return Sample(round(process.memory_info().rss / 1e6, 3), process.num_fds(), process.num_threads())
 
 
-def slope(values: Sequence[float], settled: int = SETTLED) -> float | None:
+def slope(values: Sequence[float]) -> float | None:
     """Growth per 100 flights after the first ones, by least squares; None: too few to tell."""
-    rest = np.asarray(values[settled:], float)
+    rest = np.asarray(values[SETTLED:], float)
     return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
 
 

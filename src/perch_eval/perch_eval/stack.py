@@ -7,7 +7,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -49,16 +49,14 @@ class Stack:
     Args:
         programs: what to start, in order.
         log_dir: receives `<program>.log` of each.
-        environment: variables on top of the caller's.
         on_line: receives (program name, line) for each line of output, from several threads.
     """
 
-    def __init__(self, programs: Sequence[Program], log_dir: Path, environment: Mapping[str, str] | None = None,
+    def __init__(self, programs: Sequence[Program], log_dir: Path,
                  on_line: Callable[[str, str], None] = lambda name, line: None) -> None:
         self._programs = tuple(programs)
         self._log_dir = log_dir
-        self._environment = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_LOG_DIR": str(log_dir),
-                             **(environment or {})}
+        self._environment = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_LOG_DIR": str(log_dir)}
         self._on_line = on_line
         self._memory = SharedMemory()
         self._ready = False

@@ -12,11 +12,10 @@ from scipy.stats import binomtest
 
 @dataclass(frozen=True)
 class Rate:
-    """Successes out of trials with the Wilson score interval."""
+    """Successes out of trials with the Wilson score interval of 95 %."""
 
     successes: int
     trials: int
-    confidence: float = 0.95
 
     @property
     def value(self) -> float:
@@ -28,7 +27,7 @@ class Rate:
         """Wilson score interval: sensible at 0 and at 1, too; (0, 1) without trials."""
         if not self.trials:
             return 0.0, 1.0
-        found = binomtest(self.successes, self.trials).proportion_ci(self.confidence, method="wilson")
+        found = binomtest(self.successes, self.trials).proportion_ci(0.95, method="wilson")
         return float(found.low), float(found.high)
 
     def __str__(self) -> str:

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.results import RunResult
-from perch_eval.plots import encode
 from perch_eval.statistics import Rate
 
 BINS = 6
@@ -43,7 +42,7 @@ def _key(value: Any) -> float | str:
     return value if isinstance(value, str) else float(value)
 
 
-def success_map(found: Sequence[RunResult], x: str, y: str) -> str:
+def success_map(found: Sequence[RunResult], x: str, y: str) -> Figure:
     """Success rate over two varied quantities, with the counts in each cell."""
     across, up = Axis([r.values[x] for r in found]), Axis([r.values[y] for r in found])
     good, total = np.zeros((len(up.labels), len(across.labels))), np.zeros((len(up.labels), len(across.labels)))
@@ -64,10 +63,10 @@ def success_map(found: Sequence[RunResult], x: str, y: str) -> str:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     figure.colorbar(image, label="success rate")
-    return encode(figure)
+    return figure
 
 
-def success_curve(found: Sequence[RunResult], name: str) -> str:
+def success_curve(found: Sequence[RunResult], name: str) -> Figure:
     """Success rate over one varied quantity with 95 % Wilson intervals."""
     axis = Axis([r.values[name] for r in found])
     cells = [[r for r in found if axis.cell(r.values[name]) == k] for k in range(len(axis.labels))]
@@ -83,10 +82,10 @@ def success_curve(found: Sequence[RunResult], name: str) -> str:
     axes.set_xlabel(name)
     axes.set_ylabel("success rate")
     axes.grid(alpha=0.3)
-    return encode(figure)
+    return figure
 
 
-def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]]) -> str:
+def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]]) -> Figure:
     """Histograms of metrics, successes against failures.
 
     Args:
@@ -110,4 +109,4 @@ def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]
                   label=["perched", "failed"])
         axes.axvline(float(np.median(everything)), color="k", lw=0.8, ls="--")
     figure.axes[0].legend(fontsize=8)
-    return encode(figure)
+    return figure

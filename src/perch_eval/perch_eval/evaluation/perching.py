@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 import multiprocessing
 import tempfile
@@ -108,12 +107,12 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     scenario = load_scenario("surface_90")
     trace = fly(scenario, 1, Sensing(**SENSING), linger=0.5)
     view = FlightView.of(trace.flight, load_vehicle(scenario.vehicle))
-    for section, name, data, caption in (
+    for section, name, figure, caption in (
             (five, "m_fig_5_tracking.png", plots.tracking_figure(view), "Position and velocity over time"),
             (five, "m_fig_5_path.png", plots.path_figure(view), "Path from the side with b3 as arrows"),
             (five, "m_fig_5_thrust.png", plots.thrust_figure(view), "Thrust against its bounds"),
             (six, "m_fig_6.png", plots.rates_figure(view), "Body rates and tilt")):
-        (effort.out / name).write_bytes(base64.b64decode(data))
+        figure.savefig(effort.out / name, dpi=95)
         section.figures.append((name, caption))
     five.show("outcome of seed 1", f"{trace.outcome}: {trace.message}")
     contact = [c for c in trace.contacts if c.body == "pad"]

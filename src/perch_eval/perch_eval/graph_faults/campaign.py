@@ -8,6 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,7 @@ def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
         old.unlink()
     code = digest()
     try:
-        return {**fly(case, _server(), folder, commit()).as_json(), "code": code}
+        return {**asdict(fly(case, _server(), folder, commit())), "code": code}
     except PerchError as error:
         return f"not flown: {error}"
 

@@ -13,7 +13,6 @@ from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight
 from perch_eval.flight_view import ESTIMATE, TRUTH, WANTED
 from perch_eval.metrics import perch_window
-from perch_eval.plots import encode
 
 
 @dataclass(frozen=True)
@@ -68,16 +67,16 @@ def answers_figure(answers: Sequence[Answer], names: Sequence[str] = ()) -> Figu
     return figure
 
 
-def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> str:
+def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> Figure | None:
     """Commands of rates and thrust through the perch, what the IMU reads, and the answer of the model that the vehicle file has.
 
     Returns:
-        PNG in base64; empty where the vehicle takes no rates, or the flight has none.
+        None where the vehicle takes no rates, or the flight has none.
     """
     sent = [(t, c) for t, c in flight.values("rates_thrust_command") if c.armed]
     imu, window = flight.values("imu/data_raw"), perch_window(flight)
     if len(sent) < 2 or len(imu) < 2 or window is None:
-        return ""
+        return None
     a, command_t, t = vehicle.actuation, np.array([time for time, _ in sent]), np.array([time for time, _ in imu])
     command = np.array([(*np.degrees(c.w_B), c.thrust) for _, c in sent])
     measured = np.array([(*np.degrees(sample.w_B), sample.f_B[2]) for _, sample in imu])
@@ -88,4 +87,4 @@ def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> str:
         model = lagged(gain * np.interp(t - a.delay - period, command_t, command[:, i]), lag, period)
         answers.append(Answer(title, unit, t[shown], np.interp(t[shown], command_t, command[:, i]), measured[shown, i], model[shown]))
         names.append(f"model: gain {gain:.3f}, lag {1e3 * lag:.0f} ms, delay {1e3 * a.delay:.0f} ms")
-    return encode(answers_figure(answers, names))
+    return answers_figure(answers, names)

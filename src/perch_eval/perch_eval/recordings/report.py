@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from perch_eval.page import image, images, section, table
 from perch_eval.page import page as document
-from perch_eval.plots import encode
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
 from perch_eval.recordings.gallery import Shown
@@ -40,7 +39,7 @@ def page(title: str, summary: Sequence[tuple[str, str]], findings: Sequence[Find
     """
     sensors = table(((f.level, f.about, f.text) for f in findings), classes=[f.level for f in findings])
     lines = ((f"{node}: {level}", message, f"{n} times" if n > 1 else "") for (node, level, message), n in log.items())
-    return document(title, table(summary), *(section(name, image(encode(figure), name)) for name, figure in figures.items()),
+    return document(title, table(summary), *(section(name, image(figure, name)) for name, figure in figures.items()),
                     *(section(name, images((f"{1e-9 * one.stamp:.3f} s: {one.caption}", one.pixels) for one in shown))
                       for name, shown in pictures.items()),
                     section("The sensors", sensors), section("Log of the components", table(lines)))

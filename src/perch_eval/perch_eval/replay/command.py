@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import base64
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
@@ -105,9 +105,9 @@ def span(view: FlightView, start: float | None, end: float | None, before: float
 def write_plots(view: FlightView, folder: Path) -> None:
     """The figures of the flight's report as PNG files."""
     folder.mkdir(parents=True, exist_ok=True)
-    figures: dict[str, Callable[[FlightView], str]] = {
+    figures: dict[str, Callable[[FlightView], Figure | None]] = {
         "tracking": plots.tracking_figure, "path": plots.path_figure, "rates": plots.rates_figure, "thrust": plots.thrust_figure,
         "estimation_error": plots.error_figure}
     for name, draw in figures.items():
-        if data := draw(view):
-            (folder / f"{name}.png").write_bytes(base64.b64decode(data))
+        if figure := draw(view):
+            figure.savefig(folder / f"{name}.png", dpi=95)

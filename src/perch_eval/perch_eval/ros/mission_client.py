@@ -24,6 +24,7 @@ from perch_sim.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
 """Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
+STALL = 60.0            # without progress or an answer of the mission [s]
 START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
 LOOK = 0.5              # between looks whether the mission that took the goal is still there [s]
 NAMED = 5.0             # time that stands still for so long is explained [s]
@@ -118,7 +119,7 @@ class MissionClient(GraphNode):
         return self._process.get(node)
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
-            check: Callable[[], None] = lambda: None, stall: float = 60.0) -> FlightResult:
+            check: Callable[[], None] = lambda: None, stall: float = STALL) -> FlightResult:
         """Send the goal and wait for its end; when it has been under way for the scenario's time limit it is cancelled.
 
         Args:
@@ -174,12 +175,11 @@ class MissionClient(GraphNode):
             outcome = "timeout"
         return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - progress.began, progress.start)
 
-    def depart(self, check: Callable[[], None] = lambda: None, stall: float = 60.0) -> tuple[bool, str]:
+    def depart(self, check: Callable[[], None] = lambda: None) -> tuple[bool, str]:
         """Have a perched vehicle leave for a hover.
 
         Args:
             check: called often; may raise to end the wait.
-            stall: wall-clock time without an answer after which it has failed [s].
 
         Returns:
             Whether it hovers, and the mission's words.
@@ -189,9 +189,9 @@ class MissionClient(GraphNode):
         """
         client = self.node.create_client(Trigger, "depart")
         try:
-            self._spin_until(client.service_is_ready, check, stall, "the mission does not offer depart")
+            self._spin_until(client.service_is_ready, check, STALL, "the mission does not offer depart")
             answer = client.call_async(Trigger.Request())
-            self._spin_until(answer.done, check, stall, "the mission does not answer to depart")
+            self._spin_until(answer.done, check, STALL, "the mission does not answer to depart")
             return answer.result().success, answer.result().message
         finally:
             self.node.destroy_client(client)
