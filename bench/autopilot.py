@@ -9,6 +9,7 @@ has reached the supervisor. Needs the firmware (`python3 scripts/betaflight.py b
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,11 +74,9 @@ def moments() -> dict[str, float]:
     loop, kept = begun()
     touched: list[float] = []
     loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
-    try:
+    with closing(loop):
         while not any(phase == "perched" for _, phase, _ in loop.trace.phases):
             loop.step()
-    finally:
-        loop.close()
     at = {phase: time for time, phase, _ in reversed(loop.trace.phases)}
     at["contact"] = min(time for time in touched if time > at["tracking"])
     return {name: at[phase] + offset for name, (phase, offset) in PHASES.items()}
@@ -94,7 +93,7 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
     loop, kept = begun()
     touched: list[float] = []
     loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
-    try:
+    with closing(loop):
         while loop.time < at:
             loop.step()
         kept.kill() if kill else setattr(kept, "cut", True)
@@ -104,8 +103,6 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
         while loop.time < until and not touched:
             rows.append((loop.time - last, float(tilt_degrees(loop.vehicle.simulation.state.q_WB)), kept.watchdog.mode))
             loop.step()
-    finally:
-        loop.close()
     t, tilt = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     modes = [row[2] for row in rows]
 
@@ -123,7 +120,7 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
 def levelled(vehicle: str, axis: int, tilt: float, rate: float) -> float:
     """When a body in free air is level after the last command [s]."""
     body = Body(load_vehicle(vehicle))
-    try:
+    with closing(body.loop):
         body.hover()
         body.found(np.eye(3)[axis], tilt, rate)
         last, body.loop.cut, above = body.loop.heard, True, 0.0
@@ -131,28 +128,24 @@ def levelled(vehicle: str, axis: int, tilt: float, rate: float) -> float:
             body.step(True)
             above = body.time - last if body.tilt > LEVEL else above
         return above
-    finally:
-        body.loop.close()
 
 
 def held_without_link() -> float:
     """How long the firmware goes on turning the body as it was told last, from when the link is cut, at most 1.5 s [s]."""
     body = Body(load_vehicle(SCENARIO.vehicle))
-    try:
+    with closing(body.loop):
         body.hover()
         body.found(np.array([1.0, 0.0, 0.0]), 0.0, 2.0)
         begin, body.loop.severed = body.time, True
         while body.plant.w[0] > 1.0 and body.time < begin + 1.5:
             body.step(True, (2.0, 0.0, 0.0))
         return body.time - begin
-    finally:
-        body.loop.close()
 
 
 def taken_over(at: float) -> float:
     """From the pilot's switch to the first cycle in which the motors stand, as his arming switch is off [s]."""
     loop, kept = begun()
-    try:
+    with closing(loop):
         while loop.time < at:
             loop.step()
         kept.radio[4], kept.radio[6], begin = OFF, OFF, loop.time
@@ -161,8 +154,6 @@ def taken_over(at: float) -> float:
             if loop.time > begin + 1.0:
                 return float("inf")
         return loop.time - begin
-    finally:
-        loop.close()
 
 
 def figures(quick: bool) -> list[Figure]:

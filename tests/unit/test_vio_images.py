@@ -1,7 +1,7 @@
 """VIO on rendered images of a whole perch, and under every fault of camera and IMU."""
 
 import functools
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 from perch_core.values import ImuSample
 from perch_core.vehicle import load_vehicle
 from perch_eval import estimation_flight as flights
+from perch_eval.perch_motion import Motion
 from perch_perception.ukf import Health
 from perch_perception.vio import FrameOutcome, VioConfig
 from perch_perception.vio import tracker as tracking
@@ -155,12 +156,22 @@ def test_starts_in_motion():
 
 # -- faults --------------------------------------------------------------------------------------------------------------
 
+def tampered(flight, frames=lambda t, stamp, image: [(stamp, image)], imu=lambda t, sample: sample):
+    """A flight with other frames, at a time [s] none, one or several (stamp [ns], image), and with other IMU samples or none."""
+    samples = [imu(float(t), flight.sample(k)) for k, t in enumerate(flight.truth.times)]
+    kept = [k for k, sample in enumerate(samples) if sample is not None]
+    gyro, accel = (np.array([getattr(samples[k], name) for k in kept]) for name in ("w_B", "f_B"))
+    truth = Motion(*(getattr(flight.truth, item.name)[kept] for item in fields(Motion)))
+    return replace(flight, frames=tuple((t, *one) for t, stamp, image in flight.frames for one in frames(t, stamp, image)), truth=truth,
+                   readings=replace(flight.readings, gyro=gyro, accel=accel, gyro_bias=flight.readings.gyro_bias[kept],
+                                    accel_bias=flight.readings.accel_bias[kept]))
+
 
 def test_a_covered_camera_is_reported_and_survived():
     cover = (HOVER, HOVER + 0.5)
-    steps = flights.run_vio(until(4.5), tamper=lambda t, stamp, image: [
-        (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)], tamper_imu=lambda t, sample: (
-        sample._replace(w_B=(sample.w_B[0] + 0.05 * np.sin(180.0 * t), *sample.w_B[1:])) if HOVER <= t < cover[1] else sample))  # rotors shake
+    steps = flights.run_vio(tampered(until(4.5), lambda t, stamp, image: [
+        (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)], lambda t, sample: (
+        sample._replace(w_B=(sample.w_B[0] + 0.05 * np.sin(180.0 * t), *sample.w_B[1:])) if HOVER <= t < cover[1] else sample)))  # rotors shake
     assert_sane(steps)
     inside = [s for s in steps if cover[0] + 0.2 < s.time < cover[1]]
     assert inside and all(s.result.outcome is FrameOutcome.BLIND and s.result.estimate is None for s in inside)
@@ -188,7 +199,7 @@ def test_a_blurred_frame_does_no_harm():
             image = cv2.GaussianBlur(image, (0, 0), 12.0)
         return [(stamp, image)]
 
-    steps = flights.run_vio(until(4.2), tamper=tamper)
+    steps = flights.run_vio(tampered(until(4.2), tamper))
     assert blurred
     assert_sane(steps)
     clean = {s.time: s for s in undisturbed()}
@@ -199,7 +210,7 @@ def test_a_blurred_frame_does_no_harm():
 
 def test_dropped_frames_cost_little():
     counter = iter(range(10_000))
-    steps = flights.run_vio(until(4.5), tamper=lambda t, stamp, image: [] if next(counter) % 3 == 0 else [(stamp, image)])
+    steps = flights.run_vio(tampered(until(4.5), lambda t, stamp, image: [] if next(counter) % 3 == 0 else [(stamp, image)]))
     assert_sane(steps)
     assert steps[-1].result.outcome is FrameOutcome.TRACKING
     assert np.linalg.norm(steps[-1].error[:3]) < 0.08
@@ -214,7 +225,7 @@ def test_duplicated_and_disordered_frames_are_refused_and_change_nothing():
         old = [previous[-4]] if len(previous) > 4 else []
         return [(stamp, image), (stamp, image), *old]
 
-    steps = flights.run_vio(short, tamper=tamper)
+    steps = flights.run_vio(tampered(short, tamper))
     refused = [s for s in steps if s.result.outcome is FrameOutcome.NOT_NEWER]
     assert len(refused) > len(short.frames)
     assert all("not newer" in s.result.message for s in refused)
@@ -224,7 +235,7 @@ def test_duplicated_and_disordered_frames_are_refused_and_change_nothing():
 
 
 def test_a_future_stamp_is_refused():
-    steps = flights.run_vio(until(1.5), tamper=lambda t, stamp, image: [(stamp + 3_000_000_000, image), (stamp, image)])
+    steps = flights.run_vio(tampered(until(1.5), lambda t, stamp, image: [(stamp + 3_000_000_000, image), (stamp, image)]))
     assert {s.result.outcome for s in steps[::2]} == {FrameOutcome.FUTURE}
     assert steps[-1].result.estimate is not None
 
@@ -232,7 +243,7 @@ def test_a_future_stamp_is_refused():
 @pytest.mark.parametrize("image", [np.zeros((240, 320), np.uint8), np.zeros((480, 640, 3), np.uint8),
                                    np.zeros((480, 640), np.float32)])
 def test_an_image_of_another_kind_is_refused(image):
-    steps = flights.run_vio(until(1.2), tamper=lambda t, stamp, _: [(stamp, image)])
+    steps = flights.run_vio(tampered(until(1.2), lambda t, stamp, _: [(stamp, image)]))
     assert {s.result.outcome for s in steps} == {FrameOutcome.BAD_IMAGE}
 
 
@@ -250,7 +261,7 @@ def test_imu_faults_leave_a_finite_estimate_with_a_larger_covariance(fault, leng
     def tamper_imu(t: float, sample: ImuSample):
         return fault(sample) if HOVER <= t < HOVER + length else sample
 
-    steps = flights.run_vio(until(4.2), tamper_imu=tamper_imu)
+    steps = flights.run_vio(tampered(until(4.2), imu=tamper_imu))
     assert_sane(steps)
     clean = {s.time: s for s in undisturbed()}
     hit = next(s for s in steps if s.time > HOVER + length and s.result.estimate is not None)
@@ -264,8 +275,8 @@ def test_a_lost_filter_says_so_and_starts_again_in_motion(monkeypatch):
     """Blind for so long that velocity is unknown (the bound is lowered for the test): lost, then found by motion."""
     monkeypatch.setattr("perch_perception.vio.odometry._LOST_VELOCITY", 0.03)
     cover = (1.9, 2.6)
-    steps = flights.run_vio(until(4.4), tamper=lambda t, stamp, image: [
-        (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)])
+    steps = flights.run_vio(tampered(until(4.4), lambda t, stamp, image: [
+        (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)]))
     assert_sane(steps)
     lost = next(s for s in steps if s.result.outcome is FrameOutcome.LOST)
     assert "velocity" in lost.result.message and lost.result.estimate is None

@@ -7,7 +7,6 @@ simulator's, the motion is exact (`perch_motion`), and nothing of the truth reac
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,10 +36,6 @@ from perch_sim.scenario import Scenario
 
 STRIDE = 5        # samples between states of the estimator that are kept
 TRANSPORT = 0.02  # from the middle of an exposure to the arrival of its image [s]
-Tamper = Callable[[float, int, np.ndarray], list[tuple[int, np.ndarray]]]
-"""A frame (time [s], stamp [ns], image) to those that arrive, (stamp, image): none, others, several."""
-TamperImu = Callable[[float, ImuSample], ImuSample | None]
-"""An IMU sample at a time [s] to the one that arrives, or None."""
 DURATIONS = {1.7: 1.8, 3.0: 2.0}  # of the perch by distance: 570-700 deg/s at 90 deg [m -> s]
 
 
@@ -145,10 +140,9 @@ class _Vehicle(Component[NoParameters]):
     camera_info = Output(CameraModel, "camera_down/camera_info")
     image = Output(CameraImage, "camera_down/image_raw")
 
-    def __init__(self, flight: Flight, begin: float = 0.0, transport: float = TRANSPORT, tamper: Tamper | None = None,
-                 tamper_imu: TamperImu | None = None) -> None:
+    def __init__(self, flight: Flight, begin: float = 0.0, transport: float = TRANSPORT) -> None:
         super().__init__(NoParameters())
-        self._flight, self._transport, self._tamper, self._tamper_imu = flight, transport, tamper, tamper_imu
+        self._flight, self._transport = flight, transport
         self._k = int(np.searchsorted(flight.truth.times, begin))
         self._frames = iter([frame for frame in flight.frames if frame[0] >= begin])
         self._coming = next(self._frames, None)
@@ -164,24 +158,20 @@ class _Vehicle(Component[NoParameters]):
         at = float(self._flight.truth.times[self._k])
         sample = self._flight.sample(self._k)
         self._k, self.time = self._k + 1, sample.stamp
-        arriving = sample if self._tamper_imu is None else self._tamper_imu(at, sample)
-        if arriving is not None:
-            self.imu(arriving)
+        self.imu(sample)
         arrivals = []
         while self._coming is not None and self._coming[0] + self._transport <= at:
-            arrivals += self._show(*self._coming)
+            arrivals.append(self._show(*self._coming))
             self._coming = next(self._frames, None)
         return arrivals
 
-    def _show(self, middle: float, stamp: int, pixels: np.ndarray) -> list[Arrival]:
-        camera, frame, arrivals = self._flight.mount.camera, optical_frame("down"), []
-        for arriving, shown in self._tamper(middle, stamp, pixels) if self._tamper is not None else [(stamp, pixels)]:
-            image = _Frame(arriving, frame, shown.shape[1], shown.shape[0], "mono8", shown)
-            image.middle = middle
-            self.camera_info(CameraModel(arriving, frame, camera))
-            self.image(image)
-            arrivals.append(Arrival("down", arriving, round(middle * 1e9), image))
-        return arrivals
+    def _show(self, middle: float, stamp: int, pixels: np.ndarray) -> Arrival:
+        frame = optical_frame("down")
+        image = _Frame(stamp, frame, pixels.shape[1], pixels.shape[0], "mono8", pixels)
+        image.middle = middle
+        self.camera_info(CameraModel(stamp, frame, self._flight.mount.camera))
+        self.image(image)
+        return Arrival("down", stamp, round(middle * 1e9), image)
 
 
 class _Vio(VioComponent):
@@ -239,21 +229,13 @@ class _Estimator(StateEstimator):
         self._samples += 1
 
 
-def run_vio(flight: Flight, tamper: Tamper | None = None, tamper_imu: TamperImu | None = None,
-            begin: float = 0.0) -> list[VioStep]:
-    """VIO over a flight.
-
-    Args:
-        flight: its data.
-        tamper: what becomes of frames on their way.
-        tamper_imu: what becomes of IMU samples on theirs.
-        begin: VIO is switched on there [s], and told the pose of that moment, as wrong as the flight has it.
-    """
+def run_vio(flight: Flight, begin: float = 0.0) -> list[VioStep]:
+    """VIO over a flight; it is switched on at `begin` [s], and told the pose of that moment, as wrong as the flight has it."""
     standing = flight.motion.sample(np.array([begin])).p_WB[0] - (0.0, 0.0, load_vehicle(flight.vehicle).standing_height)
     vio = _Vio(VioComponentConfig(
         vehicle=flight.vehicle,
         start_position=tuple((standing + flight.told_wrong[:3]).tolist()), start_yaw_deg=float(np.degrees(flight.told_wrong[3]))))
-    vehicle = _Vehicle(flight, begin, tamper=tamper, tamper_imu=tamper_imu)
+    vehicle = _Vehicle(flight, begin)
     _run(Loop(vehicle, {"vio": vio}, {"vio": Task(0.0)}, {}), vehicle)
     return [VioStep(middle, result, cost, _vio_error(flight, result)) for middle, result, cost in vio.frames]
 

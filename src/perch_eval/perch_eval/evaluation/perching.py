@@ -20,6 +20,7 @@ from perch_eval.campaign.specification import Run
 from perch_eval.evaluation.kept import flown
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.flight_view import FlightView
+from perch_eval.in_process import Sensing, fly
 from perch_eval.statistics import Rate, Spread
 from perch_sim.scenario import load_scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -100,8 +101,6 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
 
 def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section]:
     """Fig. 5 and 6 from the first seed at 90 deg, 1.7 m, with the figures of all seeds beside the paper's."""
-    from perch_eval.in_process import Sensing, fly
-
     five = Section("m_fig_5", "[M] Fig. 5: tracking, localisation and thrust at 90 deg, 1.7 m", "Seed 1; truth, estimate and reference.")
     six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
     scenario = load_scenario("surface_90")
@@ -135,7 +134,6 @@ def _engines() -> Section:
     """One flight on the real nodes against the same flight in process."""
     from perch_eval.demo import fly as fly_on_the_stack
     from perch_eval.nodes import ALL_NODES
-    from perch_eval.in_process import Sensing, fly
     from perch_eval.ros.recorded_flight import RecordedFlight
 
     out = Section("engines", "The engine flies what the nodes fly",

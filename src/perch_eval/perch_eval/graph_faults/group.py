@@ -50,7 +50,7 @@ class Group:
         if case.fault not in PROCESS:
             channels = TALKERS[case.node]
             self._commands[case.node][1][1:1] = [text for channel in channels for text in ("-r", f"{channel}:={DIRECT}/{channel}")]
-            self._commands["relay"] = "perch_eval.graph_faults.relay_node:Relay", [*channels, "--ros-args"]
+            self._commands["relay"] = "perch_eval.graph_faults.relay_node:main", [*channels, "--ros-args"]
             self.nodes.add("/relay")
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []

@@ -95,22 +95,18 @@ class RelayNode(Node):
             self._timer.reset()
 
 
-class Relay:
-    """The executable."""
-
-    @staticmethod
-    def main() -> None:
-        """Pass on the channels of the command line until SIGINT or SIGTERM."""
-        end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
-        stop = StopSignal()
-        join(sys.argv)
-        node, executor = RelayNode(sys.argv[1:end]), EventsExecutor()
-        executor.add_node(node)
-        stop.patient = True
-        spin_until_stopped(executor, stop)
-        node.destroy_node()
-        rclpy.try_shutdown()
+def main() -> None:
+    """Pass on the channels of the command line until SIGINT or SIGTERM."""
+    end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
+    stop = StopSignal()
+    join(sys.argv)
+    node, executor = RelayNode(sys.argv[1:end]), EventsExecutor()
+    executor.add_node(node)
+    stop.patient = True
+    spin_until_stopped(executor, stop)
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 if __name__ == "__main__":
-    Relay.main()
+    main()

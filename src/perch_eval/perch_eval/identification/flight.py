@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +36,7 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
     """
     flight = ScriptedFlight(replace(scenario, vehicle=vehicle), seed, without=("powerline_mapper", "perching_planner", "powerline_planner"))
     mission, controller = flight.mission, flight.controller.flight
-    try:
+    with closing(flight.loop):
         flight.run(flight.arm() + 0.1)
         place, yaw = mission.p_WB, 0.0
         for offset, turn, duration in (((0.0, 0.0, HEIGHT), 0.0, 2.5), *(
@@ -45,6 +46,4 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
             flight.run(flight.time + duration + LEAD + PAUSE)
             if controller.state is not State.HOVERING:
                 raise PerchError(f"the vehicle does not fly by its file: {controller.flown.message}; correct its mass or its lags")
-    finally:
-        flight.loop.close()
     return flight.loop.trace.flight
