@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 from .environment import variables
 from .errors import SetupError
-from .layout import ROOT, VENV, VENV_PYTHON
+from .layout import VENV, VENV_PYTHON
 from .prepare import prepare
 
 _ENTERED = "PERCH_ENTERED"
@@ -39,7 +39,8 @@ def enter(*extras: str) -> None:
     try:
         environment = variables(prepare(extras=() if _HELP & set(sys.argv) else extras))
     except SetupError as error:
-        sys.exit(_say(error))
+        print(f"perch: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
     except KeyboardInterrupt:
         print("\nperch set-up: interrupted; the next start goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)
@@ -70,11 +71,3 @@ def quiet_on_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before or signal.SIG_DFL)
-
-
-def _say(error: SetupError) -> int:
-    print(f"perch: {error}", file=sys.stderr)
-    return error.exit_code
-
-
-__all__ = ["INTERRUPTED", "ROOT", "enter", "leave_quietly_on_interrupt", "quiet_on_interrupt", "run"]

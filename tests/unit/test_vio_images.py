@@ -37,8 +37,7 @@ def until(time):
     """The same flight, cut off."""
     whole = flight()
     n = int(np.searchsorted(whole.truth.times, time))
-    truth = replace(whole.truth, **{name: getattr(whole.truth, name)[:n] for name in (
-        "times", "p_WB", "v_WB", "a_WB", "R_WB", "w_WB_B", "f_B")})
+    truth = Motion(*(getattr(whole.truth, item.name)[:n] for item in fields(Motion)))
     return replace(whole, truth=truth, frames=tuple(f for f in whole.frames if f[0] < time - 0.03))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -81,10 +81,7 @@ class Flight:
     def states(self, channel: str) -> States | None:
         """The states of a channel of odometry, in the order of their stamps."""
         found: list[OdometryState] = sorted((value for _, value in self.values(channel)), key=lambda state: state.stamp)
-        if len(found) < 2:
-            return None
-        return States(seconds(np.array([s.stamp for s in found], dtype=np.int64)), np.array([s.p_WB for s in found]),
-                      np.array([s.q_WB for s in found]), np.array([s.v_WB for s in found]), np.array([s.w_B for s in found]))
+        return _states(found, "p_WB", "q_WB", "v_WB", "w_B")
 
     def known_states(self, channel: str) -> States:
         """As `states`, where the flight must have them.
@@ -105,10 +102,7 @@ class Flight:
     def reference(self) -> States | None:
         """What the controller wanted at each step while it followed a trajectory."""
         found: list[ControlReference] = [value for _, value in self.values("controller/reference")]
-        if len(found) < 2:
-            return None
-        return States(seconds(np.array([r.stamp for r in found], dtype=np.int64)), np.array([r.p for r in found]),
-                      np.array([r.q for r in found]), np.array([r.v for r in found]), np.array([r.w for r in found]))
+        return _states(found, "p", "q", "v", "w")
 
     def digest(self, until: float) -> str:
         """SHA-256 over the values of every state, command and estimate up to a time [s] (the `flight_hash`)."""
@@ -119,6 +113,14 @@ class Flight:
                 if t <= until:
                     total.update(np.array(numbers(value), float).tobytes())
         return total.hexdigest()
+
+
+def _states(found: Sequence[Any], *names: str) -> States | None:
+    """Of values with a stamp and these four fields; None: too few."""
+    if len(found) < 2:
+        return None
+    stamps = np.array([value.stamp for value in found], dtype=np.int64)
+    return States(seconds(stamps), *(np.array([getattr(value, name) for value in found]) for name in names))
 
 
 def numbers(value: Any) -> list[float]:

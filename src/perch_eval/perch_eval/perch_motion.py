@@ -37,12 +37,11 @@ class PerchMotionConfig:
 
 @dataclass(frozen=True)
 class Motion:
-    """A true motion at n times: p_WB, v_WB, a_WB, w_WB_B, f_B (specific force in B) (n, 3); R_WB (n, 3, 3)."""
+    """A true motion at n times: p_WB, v_WB, w_WB_B, f_B (specific force in B) (n, 3); R_WB (n, 3, 3)."""
 
     times: np.ndarray
     p_WB: np.ndarray
     v_WB: np.ndarray
-    a_WB: np.ndarray
     R_WB: np.ndarray
     w_WB_B: np.ndarray
     f_B: np.ndarray
@@ -132,9 +131,8 @@ class PerchMotion:
         derivatives = [path(times) for path in self._path]
         states = [flat_to_state(p, v, a, j, s, 0.0, 0.0, 0.0, 1.0) for p, v, a, j, s in zip(*derivatives)]
         R = np.array([s.R_WB for s in states])
-        a = derivatives[2]
-        f = np.einsum("nji,nj->ni", R, a + np.array([0, 0, GRAVITY]))
-        return Motion(np.asarray(times), derivatives[0], derivatives[1], a, R, np.array([s.w_WB_B for s in states]), f)
+        f = np.einsum("nji,nj->ni", R, derivatives[2] + np.array([0, 0, GRAVITY]))
+        return Motion(np.asarray(times), derivatives[0], derivatives[1], R, np.array([s.w_WB_B for s in states]), f)
 
 
 def read_imu(motion: Motion, imu: ImuConfig, rng: np.random.Generator) -> ImuReadings:

@@ -13,7 +13,7 @@ from perch_eval.arguments import command_parser, count, exit_code, output_folder
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
 from perch_eval.campaign.progress import counted
-from perch_eval.campaign.results import Results, RunResult, worst
+from perch_eval.campaign.results import Results, RunResult, flight_folder, worst
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
 from perch_eval.statistics import Rate
@@ -91,15 +91,10 @@ def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
     """Fly the worst flights once more, with a recording and a report each: the same seed gives the same flight."""
     by_number = {run.number: run for run in campaign.runs}
     for result in worst(found, campaign.keep_worst):
-        folder = flight_folder(out, result.number)
+        folder = out / flight_folder(result.number)
         if not (folder / "report.html").exists() and campaign.engine in ENGINES:
             run = by_number[result.number]
             carry_out(Task(run, campaign.mapping(run), campaign.engine, campaign.sensing, str(folder)))
-
-
-def flight_folder(out: Path, number: int) -> Path:
-    """Folder of a kept flight."""
-    return out / "flights" / f"run_{number:05d}"
 
 
 def summary(found: list[RunResult]) -> str:

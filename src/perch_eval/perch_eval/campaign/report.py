@@ -8,7 +8,7 @@ from pathlib import Path
 
 from perch_eval.campaign import figures
 from perch_eval.campaign.causes import MEANING, SUCCESS
-from perch_eval.campaign.results import RunResult, worst
+from perch_eval.campaign.results import RunResult, flight_folder, worst
 from perch_eval.campaign.specification import Campaign
 from perch_eval.metrics import FIGURES
 from perch_eval.page import Html, image, page, section, table, text
@@ -74,18 +74,14 @@ def _spreads(found: Sequence[RunResult], present: dict[str, tuple[str, float]]) 
 
 def _flights(found: Sequence[RunResult], folder: Path) -> str:
     shown = [r for r in found if r.cause != SUCCESS][:200]
-    kept = [r for r in found if r.cause == SUCCESS and (folder / _report(r)).exists()]
+    kept = [r for r in found if r.cause == SUCCESS and (folder / flight_folder(r.number) / "report.html").exists()]
     return table(((Html(_link(r, folder)), r.seed, r.cause, r.message, ", ".join(f"{k} {_short(v)}" for k, v in r.values.items()))
                   for r in (*shown, *kept)), ("run", "seed", "cause", "message", "conditions"))
 
 
-def _report(result: RunResult) -> str:
-    return f"flights/run_{result.number:05d}/report.html"
-
-
 def _link(result: RunResult, folder: Path) -> str:
-    name = f"run {result.number}"
-    return f'<a href="{_report(result)}">{name}</a>' if (folder / _report(result)).exists() else name
+    name, report = f"run {result.number}", flight_folder(result.number) / "report.html"
+    return f'<a href="{report}">{name}</a>' if (folder / report).exists() else name
 
 
 def _short(value: object) -> str:

@@ -97,6 +97,11 @@ def _unreadable(path: Path, error: Exception) -> ResultsError:
     return ResultsError(f"{path} cannot be read as results ({error}): choose another --out")
 
 
+def flight_folder(number: int) -> Path:
+    """Of a kept flight, in the campaign's folder."""
+    return Path("flights", f"run_{number:05d}")
+
+
 def severity(result: RunResult) -> float:
     """How far from a good contact a flight was; larger is worse. Flights without a contact count by their tracking."""
     m = result.metrics

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core import so3
+from perch_eval import consistency
 from perch_eval.recordings.recording import RecordingError
 from perch_eval.recordings.trajectory import Trajectory
 
@@ -96,8 +97,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
     turn = so3.quat_log(so3.quat_multiply(estimate.q, so3.quat_conjugate(so3.quat_multiply(so3.quat_from_matrix(R), true.q))))
     nees = np.full(len(error), np.nan)
     if covariances is not None:
-        P = covariances[kept] + 1e-12 * np.eye(3)
-        nees[1:] = np.einsum("ni,ni->n", error[1:], np.linalg.solve(P[1:], error[1:, :, None])[..., 0])
+        nees[1:] = consistency.nees(error[1:], covariances[kept][1:] + 1e-12 * np.eye(3))
     delta = max(0.1, round(0.1 * true.length, 1))
     ate, ate_deg, rpe, rpe_deg, scale = _by_evo(estimate, true, delta)
     return Evaluation(duration=1e-9 * float(true.stamps[-1] - true.stamps[0]), path=true.length, ate=ate, ate_deg=ate_deg, rpe=rpe,

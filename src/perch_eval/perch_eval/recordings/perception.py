@@ -60,10 +60,8 @@ class Frame:
         stamp: of the image [ns].
         outcome: name of the `FrameOutcome`.
         features, used, refused: tracks, and observations that changed the state or were refused.
-        nis, nis_dimension: of all observations.
         restarts: so far.
         cost: CPU time [s].
-        message: for people.
     """
 
     stamp: int
@@ -71,11 +69,8 @@ class Frame:
     features: int
     used: int
     refused: int
-    nis: float
-    nis_dimension: int
     restarts: int
     cost: float
-    message: str
 
 
 class _Vio(VioComponent):
@@ -92,9 +87,7 @@ class _Vio(VioComponent):
         super().use(image)
         r = self.result
         assert r is not None  # of this frame
-        self.frames.append(
-            Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, float(r.nis), r.nis_dimension, r.restarts,
-                  time.process_time() - begin, r.message))
+        self.frames.append(Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, r.restarts, time.process_time() - begin))
         text = f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used"
 
         def shown() -> Shown | None:
