@@ -28,8 +28,8 @@ from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.specification import RUNS_MAX, Campaign, load_campaign
 from perch_eval.flyable import check_flight
 from fuzzing.report import Report
-from perch_eval.in_process.parameters import COMPONENTS, component_class, nested
-from perch_eval.node_launch import HOST_PARAMETERS, flattened, parameters_in
+from perch_eval.in_process.parameters import COMPONENTS, component_class
+from perch_eval.node_launch import HOST_PARAMETERS, parameters_in
 from perch_planner.powerline.problem import PowerlineProblem
 from perch_planner.problem_file import read_problem
 from perch_sim.scenario import Scenario, load_scenario
@@ -73,9 +73,9 @@ def load(kind: str, path: Path) -> Any:
             problem = config.from_mapping(PowerlineProblem, mapping, str(path))
             return problem, problem.request(load_vehicle(problem.vehicle))
         return read_problem(mapping, str(path))
-    parameters = flattened(parameters_in(path, path.stat().st_mtime_ns))
+    parameters = config.flattened(parameters_in(path, path.stat().st_mtime_ns))
     own = {name: value for name, value in parameters.items() if name not in HOST_PARAMETERS}
-    return config.from_mapping(component_class(kind.removeprefix("parameters."), own).config_type, nested(own), str(path))
+    return config.from_mapping(component_class(kind.removeprefix("parameters."), own).config_type, config.nested(own), str(path))
 
 
 def judge(kind: str, content: bytes) -> str:
