@@ -22,6 +22,7 @@ from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run, scenario_of
 from perch_eval.flight import Flight
+from perch_eval.in_process import Sensing, fly
 from perch_eval.metrics import figures, flight_metrics
 from perch_sim.scenario import Scenario
 
@@ -41,7 +42,7 @@ class Task:
     run: Run
     scenario: dict[str, Any]
     engine: str
-    sensing: dict[str, str]
+    sensing: Sensing
     keep: str = ""
 
 
@@ -85,10 +86,8 @@ def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float =
         measure: further figures of the flight.
         linger: flown on after its end [s].
     """
-    from perch_eval.in_process import Sensing, fly
-
     scenario = scenario_of(task.scenario, f"run {task.run.number}")
-    trace = fly(scenario, task.run.seed, Sensing(**task.sensing), 0.5 if task.keep else linger)
+    trace = fly(scenario, task.run.seed, task.sensing, 0.5 if task.keep else linger)
     vehicle = load_vehicle(scenario.vehicle)
     metrics = figures(flight_metrics(trace.flight, vehicle, trace.end_time), trace.end_time)
     if task.keep:

@@ -48,7 +48,7 @@ def _facts(campaign: Campaign, found: Sequence[RunResult], rate: Rate) -> str:
     wall = sum(r.wall_time for r in found)
     return table([
         ("successes", f"{rate} (95 % Wilson interval)"), ("flown", f"{len(found)} of {len(campaign.runs)} runs"),
-        ("engine", campaign.engine + (f", cameras: vio {campaign.sensing['vio']}, target {campaign.sensing['target']}"
+        ("engine", campaign.engine + (f", cameras: vio {campaign.sensing.vio}, target {campaign.sensing.target}"
                                       if campaign.engine == "in_process" else "")),
         ("time of the workers", f"{wall:.0f} s, {wall / max(len(found), 1):.1f} s per flight"),
         ("varied", "; ".join(f"{name}: {d.kind} {list(d.values)}" for name, d in campaign.vary.items()) or "the seed"),

@@ -12,7 +12,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from perch_core.errors import ConfigError
 from perch_core.vehicle import Vehicle
 from perch_eval.campaign.distributions import LARGEST_SEED, Distribution, parse, parse_seed
 from perch_eval.flyable import check_flight, check_names
+from perch_eval.in_process import Sensing
 from perch_eval.in_process.parameters import check_parameters
 from perch_sim.scenario import Scenario
 from perch_sim.scenario_files import scenario_mapping
@@ -34,14 +35,6 @@ RUNS_MAX = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensingChoice:
-    """Which cameras the in-process engine renders."""
-
-    vio: str = choice("model", options=("model", "rendered"))
-    target: str = choice("model", options=("model", "rendered"))
-
-
-@dataclass(frozen=True, kw_only=True)
 class _File:
     """A campaign's file."""
 
@@ -49,7 +42,7 @@ class _File:
     description: str = text("")
     scenario: str = text("surface_90", doc="name in config/scenarios, or a file")
     engine: str = choice("in_process", options=("in_process", "stack"))
-    sensing: SensingChoice = part(SensingChoice)
+    sensing: Sensing = part(Sensing)
     runs: int = quantity(100, low=1, high=RUNS_MAX, doc="flights; with grids: flights per grid point")
     seed: int = quantity(1, low=0, high=LARGEST_SEED, doc="of the campaign: draws and the flights' seeds come from it")
     vary: dict[str, Any] = text(None, doc="name -> distribution")
@@ -81,7 +74,7 @@ class Campaign:
     name: str
     description: str
     engine: str
-    sensing: dict[str, str]
+    sensing: Sensing
     axes: tuple[str, ...]
     keep_worst: int
     base: dict[str, Any]
@@ -128,14 +121,13 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     if len(content.map) not in (0, 2):
         raise ConfigError(str(file), "map", f"needs two names, has {len(content.map)}")
     engine = engine or content.engine
-    sensing = {"vio": content.sensing.vio, "target": content.sensing.target}
     flights = math.prod([runs or content.runs, *(len(d.values) for d in vary.values() if d.kind == "grid")])
     if flights > RUNS_MAX:
         raise ConfigError(str(file), "runs", f"{flights} flights on all points of the grids are more than {RUNS_MAX}")
     drawn = _draw(vary, runs or content.runs, content.seed)
     axes = content.map or tuple(mappable[:2])
-    decisive = json.dumps([engine, sensing, base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
-    campaign = Campaign(content.name, content.description, engine, sensing, axes if len(axes) == 2 else (),
+    decisive = json.dumps([engine, asdict(content.sensing), base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
+    campaign = Campaign(content.name, content.description, engine, content.sensing, axes if len(axes) == 2 else (),
                         content.keep_worst, base, vary, drawn, hashlib.sha256(decisive.encode()).hexdigest())
     _check(campaign, str(file))
     return campaign

@@ -37,7 +37,7 @@ RMSE = {"surface_60": ((0.0500, 0.0325, 0.1509), (0.0145, 0.0851, 0.0714)),
         "surface_60_far": ((0.0378, 0.0732, 0.1321), (0.0401, 0.0714, 0.0452)),
         "surface_90": ((0.0503, 0.0539, 0.1081), (0.0314, 0.0533, 0.0405)),
         "surface_90_far": ((0.0948, 0.0360, 0.0911), (0.0660, 0.0045, 0.0485))}
-SENSING = {"vio": "rendered", "target": "rendered"}
+SENSING = Sensing(vio="rendered", target="rendered")
 PEAK_RATE, PEAK_ACCELERATION = 600.0, 10.0  # [deg/s], [m/s^2]
 
 
@@ -104,7 +104,7 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     five = Section("m_fig_5", "[M] Fig. 5: tracking, localisation and thrust at 90 deg, 1.7 m", "Seed 1; truth, estimate and reference.")
     six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
     scenario = load_scenario("surface_90")
-    trace = fly(scenario, 1, Sensing(**SENSING), linger=0.5)
+    trace = fly(scenario, 1, SENSING, linger=0.5)
     view = FlightView.of(trace.flight, load_vehicle(scenario.vehicle))
     for section, name, figure, caption in (
             (five, "m_fig_5_tracking.png", plots.tracking_figure(view), "Position and velocity over time"),
@@ -151,7 +151,7 @@ def _engines() -> Section:
             out.missing("greatest difference of position", "", f"the stack did not fly: {error}")
             return out
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:  # loads the same sources as the nodes
-            trace = pool.submit(fly, load_scenario(file), 1, Sensing(**SENSING)).result()
+            trace = pool.submit(fly, load_scenario(file), 1, SENSING).result()
     rows = trace.flight.known_states("ground_truth/odometry")
     if states is None or len(states.t) < len(rows.t):
         out.claim("greatest difference of position", f"{0 if states is None else len(states.t)} of {len(rows.t)} steps on the stack "

@@ -19,13 +19,14 @@ from perch_eval.campaign.specification import Run
 from perch_eval.evaluation.kept import flown
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
+from perch_eval.in_process import Sensing
 from perch_eval.metrics import touch_of
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
 from perch_sim.scenario_files import scenario_mapping
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
-RENDERED = {"vio": "rendered", "target": "rendered"}
+RENDERED = Sensing(vio="rendered", target="rendered")
 WITHOUT_GRIP = ("line_80", "line_20", "line_180")  # are flown with a gripper that never closes, too: all must recover
 SEEDS_WITHOUT_GRIP = 3
 AROUND = 1.5  # the map is judged within this of the target point [m]

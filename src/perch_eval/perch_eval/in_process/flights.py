@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perch_core.component import Component
+from perch_core.config import choice
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, seconds
 from perch_eval.goal import goal_of, outcome_of
@@ -26,6 +27,7 @@ from perch_sim.scenario import Scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
 
 PATIENCE = 15 * NANOSECONDS  # for a cancelled flight to come to its end [ns]
+LOOKS = ("model", "rendered")
 PLANNERS = {"surface": "perching_planner", "powerline": "powerline_planner"}
 
 
@@ -33,13 +35,13 @@ PLANNERS = {"surface": "perching_planner", "powerline": "powerline_planner"}
 class Sensing:
     """Which cameras' images are rendered and looked at; who looks through the others is replaced by an error model."""
 
-    vio: str = "model"
-    target: str = "model"
+    vio: str = choice("model", options=LOOKS)
+    target: str = choice("model", options=LOOKS)
 
     def __post_init__(self) -> None:
         for name in ("vio", "target"):
-            if getattr(self, name) not in ("model", "rendered"):
-                raise PerchError(f"sensing.{name}: {getattr(self, name)!r} is not one of model, rendered")
+            if getattr(self, name) not in LOOKS:
+                raise PerchError(f"sensing.{name}: {getattr(self, name)!r} is not one of {', '.join(LOOKS)}")
 
 
 def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, replace: Mapping[str, Component[Any]] | None = None,
