@@ -2,7 +2,7 @@
 
 import io
 
-from perch_eval.campaign.progress import Progress
+from perch_eval.campaign.progress import Progress, counted
 
 
 def lines(total: int | None) -> str:
@@ -15,3 +15,9 @@ def lines(total: int | None) -> str:
 def test_the_rest_is_told_where_the_total_is_known():
     assert lines(4) == "  2/4 flights, 1 good (50 %), 2.0 per minute, 60 s left"
     assert lines(None) == "  2 flights, 1 good (50 %), 2.0 per minute"
+
+
+def test_what_nobody_judges_is_counted_on_its_way():
+    out = io.StringIO()
+    assert list(counted(iter("abc"), 3, what="messages", out=out)) == ["a", "b", "c"]
+    assert out.getvalue().startswith("  3/3 messages, ") and "good" not in out.getvalue() and out.getvalue().count("\n") == 1

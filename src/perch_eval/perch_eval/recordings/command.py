@@ -189,17 +189,8 @@ def _figures(perception: Perception, truth: Trajectory | None) -> tuple[dict[str
     if frames:
         plots["Tracks"] = report.frames_figure(frames)
     if perception.sightings:
-        seen = [s for s in perception.sightings if s.pose_camera is not None]
-        rms = [s.reprojection_rms for s in seen]
-        figures["target"] = {
-            "images": len(perception.sightings),
-            "found": len(seen),
-            "poses": len(perception.targets),
-            "reprojection_rms_px": float(np.median(rms)) if rms else np.nan,
-            **_spread(perception)
-        }
-        rows.append(("board", f"found in {len(seen)} of {len(perception.sightings)} images" +
-                     (f", residual {np.median(rms):.2f} px" if rms else "") + _spread_words(figures["target"])))
+        figures["target"], words = _board(perception)
+        rows.append(("board", words))
     if perception.lines is not None:
         figures["powerlines"] = len(perception.lines.lines)
         rows.append(("powerlines", f"{len(perception.lines.lines)} segments" +
@@ -207,14 +198,19 @@ def _figures(perception: Perception, truth: Trajectory | None) -> tuple[dict[str
     return figures, rows, plots, vio
 
 
-def _spread(perception: Perception) -> dict[str, float]:
-    """By how much the board, which does not move, moves in the map [m]."""
+def _board(perception: Perception) -> tuple[dict[str, float], str]:
+    """What is told of the board, which does not move: for JSON and in words."""
+    seen = [s for s in perception.sightings if s.pose_camera is not None]
+    figures = {"images": len(perception.sightings), "found": len(seen), "poses": len(perception.targets), "reprojection_rms_px": np.nan}
+    words = f"found in {len(seen)} of {len(perception.sightings)} images"
+    if seen:
+        figures["reprojection_rms_px"] = rms = float(np.median([s.reprojection_rms for s in seen]))
+        words += f", residual {rms:.2f} px"
     p = np.array([target.p_WS for target in perception.targets]).reshape(-1, 3)
-    return {"spread_m": float(np.sqrt(((p - np.median(p, axis=0))**2).sum(axis=1).mean()))} if len(p) > 1 else {}
-
-
-def _spread_words(figures: dict[str, Any]) -> str:
-    return f"; its place in the map scatters by {100 * figures['spread_m']:.1f} cm rms" if "spread_m" in figures else ""
+    if len(p) > 1:
+        figures["spread_m"] = spread = float(np.sqrt(((p - np.median(p, axis=0))**2).sum(axis=1).mean()))
+        words += f"; its place in the map scatters by {100 * spread:.1f} cm rms"
+    return figures, words
 
 
 def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
