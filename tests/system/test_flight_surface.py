@@ -98,7 +98,7 @@ def test_the_page_is_complete(flight):
 @pytest.fixture
 def crowd(ros_domain, monkeypatch) -> Iterator[list[subprocess.Popen]]:
     """A foreign publisher on every topic, a viewer and two who measure rates, in the domain that the next demo flies in."""
-    monkeypatch.setattr(demo, "reserved_domain", lambda: contextlib.nullcontext(ros_domain))
+    monkeypatch.setattr(demo, "own_domain", lambda: contextlib.nullcontext(ros_domain))
     stranger = subprocess.Popen([sys.executable, str(Path(__file__).parent / "stranger.py")], stdout=subprocess.PIPE, text=True,
                                 env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")))})
     scripts = [("run_node.py", "viewer", "--ros-args", "-p", "port:=0"), *(("topic.py", "hz", *topic) for topic in WATCHED)]
