@@ -134,7 +134,7 @@ def test_moving_pads_are_met_where_they_are(inclination, velocity):
     target = surface(inclination)
     problem = PerchProblem(StartState(HOVER.p, v=(0.5, 0.0, 0.0)), target, target_velocity=np.array(velocity))
     planned = checked(problem)
-    expected = target.p_WS + np.array(velocity) * planned.duration + VEHICLE.perch_offset * target.normal
+    expected = target.p_WS + np.array(velocity) * planned.duration + (VEHICLE.perch_offset - PerchSettings().contact_depth) * target.normal
     assert planned.trajectory.sample(planned.duration).p == pytest.approx(expected, abs=1e-9)
 
 

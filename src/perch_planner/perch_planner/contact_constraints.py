@@ -198,7 +198,7 @@ class Contact:
             least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
         self.velocity = problem.target_velocity
         self.points = problem.points.copy()
-        self.points[-1] += perch_offset * R_WS[:, 2]
+        self.points[-1] += (perch_offset - settings.contact_depth) * R_WS[:, 2]
         fixed = [(k, order, value) for k, waypoint in enumerate(problem.waypoints, start=1)
                  for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)) if value is not None]
         derivatives = tuple(map(np.array, zip(*fixed))) if fixed else _NO_DERIVATIVES
