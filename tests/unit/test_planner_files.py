@@ -47,7 +47,7 @@ def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
     z, vz = (np.array([float(row[key]) for row in rows]) for key in ("z", "vz"))
     assert t[-1] == pytest.approx(written["duration"])
     assert np.gradient(z, t)[5:-5] == pytest.approx(vz[5:-5], abs=2e-3)
-    assert float(rows[-1]["z"]) == pytest.approx(1.2) and float(rows[-1]["x"]) == pytest.approx(1.68)
+    assert float(rows[-1]["z"]) == pytest.approx(1.2) and float(rows[-1]["x"]) == pytest.approx(1.66)
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 

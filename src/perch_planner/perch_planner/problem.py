@@ -101,7 +101,7 @@ class PerchProblem:
 
     Attributes:
         start: flat outputs at time 0.
-        surface: the surface at time 0; the vehicle touches it perch_offset in front of its centre, with b3 = s3.
+        surface: the surface at time 0; the vehicle ends at perch_offset in front of its centre, with b3 = s3.
         waypoints: places to pass, in order; in W, also with a moving target.
         target_velocity: constant velocity of the surface in W [m/s], shape (3,).
         segment_times: first guess of the segment durations [s], one more than waypoints; None: chosen by the planner.
@@ -135,12 +135,12 @@ class PerchParameters:
     """Parameters of the planner: `config/perching_planner.yaml`."""
 
     impact_acceleration: float = quantity(3.3, unit="m/s^2", above=0.0, high=100.0, doc="alpha of [M:eq11]")
-    impact_speed_min: float = quantity(0.5, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3, at the end of the plan")
-    impact_speed_max: float = quantity(0.6, unit="m/s", low=0.0, high=20.0, doc="v_max of [M:eq14], along -s3")
-    contact_depth: float = quantity(0.02, unit="m", low=0.0, high=0.2,
-                                    doc="the plan ends so far behind the surface: a vehicle that an error holds back touches it, too")
+    impact_speed_min: float = quantity(0.65, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3, contact_delay after the planned contact")
+    impact_speed_max: float = quantity(0.75, unit="m/s", low=0.0, high=20.0, doc="v_max of [M:eq14], along -s3")
+    contact_delay: float = quantity(0.03, unit="s", low=0.0, high=0.2,
+                                    doc="speed and slip are bounded for a contact that comes so late: an error of 2 cm holds it up by this")
     tangential_speed_max: float = quantity(0.3, unit="m/s", above=0.0, high=20.0, doc="slip over the surface at contact")
-    tube_time: float = quantity(0.15, unit="s", low=0.0, high=2.0, doc="t_k of [M:eq15]")
+    tube_time: float = quantity(0.12, unit="s", low=0.0, high=2.0, doc="t_k of [M:eq15]")
     thrust_reserve: float = quantity(0.9, above=0.0, high=1.0, doc="share of the vehicle's thrust that a plan may use")
     rotor_margin: float = quantity(0.0, low=-1e3, high=0.4, doc="share of a rotor's range kept free at both its ends; negative: of what lies beyond")
     speed_max: float = quantity(12.0, unit="m/s", above=0.0, doc="bound on the speed in W")

@@ -25,7 +25,7 @@ CONE_DEG = 40.0           # the feedback turns the thrust no further from the re
 CONE_CONTACT_DEG = 5.0    # the same at a contact: at its thrust 10 cm of error would tilt the vehicle by 12 deg [deg]
 CONTACT_WINDOW = 0.3      # before the contact, over which the cone narrows to that: the thrust is low by then [s]
 CONTACT_MISS = 0.02       # a contact trajectory is refused where the law misses its end by more on the model [m]
-CONTACT_SPEED_MISS = 0.05 # the same for the velocity [m/s]
+CONTACT_SPEED_MISS = 0.05  # the same for the velocity [m/s]
 THRUST_FLOOR = 0.8        # specific thrust below which a direction is noise [m/s^2]
 ACCELERATION_MAX = 250.0  # bound of the commanded angular acceleration: what the rotors of snapdragon.yaml can do [rad/s^2]
 FEEDBACK_RATE = 0.0       # share of the feedback's own derivative in the commanded rates: an estimated velocity is too noisy for it
@@ -101,8 +101,8 @@ class GeometricController(Law):
         """As `Law.check_contact`, by a flight on the model of the vehicle (`contact_check.py`)."""
         distance, speed = miss(source, self)
         if distance > CONTACT_MISS or speed > CONTACT_SPEED_MISS:
-            raise TrajectoryRefused(f"the geometric law would miss the contact by {100 * distance:.1f} cm and {speed:.2f} m/s on the model: "
-                                    "the rotors' lag; an overhang is flown by the NMPC (controller.type)")
+            raise TrajectoryRefused(f"on its model the geometric law misses the contact by {100 * distance:.1f} cm and {speed:.2f} m/s: "
+                                    "the rotors cannot follow this plan; the NMPC (controller.type: nmpc) may fly it")
 
     def end_on_model(self, start: np.ndarray, rotors: RotorEstimate, table: np.ndarray) -> np.ndarray:
         """State in which this controller ends a contact trajectory on the nominal vehicle.
