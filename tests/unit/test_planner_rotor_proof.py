@@ -20,7 +20,8 @@ T = np.linspace(-1.0, 1.0, 201)
 small = st.floats(-2.0, 2.0)
 FUNCTIONS = {
     "mul": (taylor_models.mul, lambda a, b: a * b), "add": (taylor_models.add, lambda a, b: a + b), "sub": (taylor_models.sub, lambda a, b: a - b),
-    "sine": (lambda a, b: taylor_models.sine(a), lambda a, b: np.sin(a)), "cosine": (lambda a, b: taylor_models.cosine(a), lambda a, b: np.cos(a)),
+    "sine": (lambda a, b: taylor_models.sine(a, np.sin(a[0]), np.cos(a[0])), lambda a, b: np.sin(a)),
+    "cosine": (lambda a, b: taylor_models.sine(a, np.cos(a[0]), -np.sin(a[0])), lambda a, b: np.cos(a)),
     "times": (lambda a, b: taylor_models.times(-1.7, a), lambda a, b: -1.7 * a),
 }
 
