@@ -9,15 +9,15 @@ near to what is attained, they are halved.
 
 from __future__ import annotations
 
-from math import comb, cos, factorial, sin
+from math import comb, cos, perm, sin
 
 import numpy as np
 
 from perch_core import bernstein
 from perch_core.arrays import Array, Vector3
 from perch_core.jit import compiled
-from perch_core.vehicle import GRAVITY
 from perch_planner.bounds import largest, smallest, split
+from perch_planner.rotor_thrusts import motion
 from perch_planner.taylor_models import (
     ROUNDING, ZERO, Taylor, Vector, add, axpy, cross, dot, greatest, inverse_root, least, mul, scale, sine, sub, times, vector_add)
 
@@ -34,8 +34,9 @@ _EXPANSION = np.hstack([comb(14, k) * (0.5 / _LANES) ** k * np.diff(np.eye(_POWE
                         for k in range(_POWERS)])
 """From Bernstein coefficients to coefficients of the powers of t in [-1, 1] around the middle of each lane: by power, then by lane."""
 
-_FALLING = np.array([[factorial(k) / factorial(max(k - n, 0)) for n in range(_POWERS)] for k in range(_POWERS)])
-"""Factor of the n-th derivative of the k-th power."""
+_ELEVATED = [perm(14, n) * bernstein.elevate(np.diff(np.eye(_POWERS), n), 14) for n in range(5)]
+_DERIVATIVES = np.hstack(_ELEVATED[2:]), np.hstack(_ELEVATED[:3])
+"""As `rotor_thrusts.bases_at`, but to Bernstein coefficients of degree 14 instead of values."""
 
 # Places in the work array: 12 models of the inputs, sine and cosine of the yaw, 4 models of the wrench, 4 rows of bounds.
 _TURN, _WRENCH, _BOUNDS = 48 * _LANES, 64 * _LANES, 80 * _LANES
@@ -43,31 +44,24 @@ _FIRST = 16
 
 
 @compiled
-def _numbers(rows: Array, half: float, powers: Array, work: Array) -> None:
-    """Models of the specific force, jerk and snap by component, and of yaw, rate and acceleration, in each lane.
+def _numbers(rows: Array, powers: Array, work: Array) -> None:
+    """Models in each lane.
 
     Args:
-        rows: Bernstein coefficients of position and yaw, shape (4, 15).
-        half: of a lane's length [s].
-        powers: receives coefficients of the powers, shape (4, 15 lanes).
-        work: receives the models, in units of `half`: 12, each with its 4 numbers for all lanes.
+        rows: Bernstein coefficients, shape (12, 15).
+        powers: receives coefficients of the powers, shape (12, 15 lanes).
+        work: receives the models, each with its 4 numbers for all lanes.
     """
     np.dot(rows, _EXPANSION, powers)
-    for d in range(4):
-        for n in range(3):
-            order, at = n + 2 if d < 3 else n, 4 * _LANES * (3 * d + n)
-            unit = half**-order
-            for term in range(3):
-                k = order + term
-                for lane in range(_LANES):
-                    work[at + _LANES * term + lane] = unit * _FALLING[k, k] * powers[d, _LANES * k + lane]
-            for lane in range(_LANES):
-                reach = 0.0
-                for k in range(order + 3, _POWERS):
-                    reach += _FALLING[k, order + 2] * abs(powers[d, _LANES * k + lane])
-                work[at + 3 * _LANES + lane] = unit * reach
-    for lane in range(_LANES):
-        work[6 * 4 * _LANES + lane] += GRAVITY
+    for n in range(12):
+        at = 4 * _LANES * n
+        for lane in range(_LANES):
+            work[at + lane], work[at + _LANES + lane] = powers[n, lane], powers[n, _LANES + lane]
+            work[at + 2 * _LANES + lane] = 2.0 * powers[n, 2 * _LANES + lane]
+            reach = 0.0
+            for k in range(3, _POWERS):
+                reach += k * (k - 1) * abs(powers[n, _LANES * k + lane])
+            work[at + 3 * _LANES + lane] = reach
 
 
 @compiled(inline=True)
@@ -80,7 +74,7 @@ def _number(work: Array, n: int, lane: int) -> Taylor:
 @compiled(inline=True)
 def _vector(work: Array, n: int, lane: int) -> Vector:
     """The n-th derivative of the specific force."""
-    return _number(work, n, lane), _number(work, n + 3, lane), _number(work, n + 6, lane)
+    return _number(work, 3 * n, lane), _number(work, 3 * n + 1, lane), _number(work, 3 * n + 2, lane)
 
 
 @compiled(inline=True)
@@ -169,19 +163,19 @@ def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: floa
         proved, `holds` is False, and the others are thrusts that are attained.
     """
     tight, proved_low, proved_high = _TIGHT * (high - low), lowest, highest
-    powers, work = np.empty((4, _POWERS * _LANES)), np.empty(_BOUNDS + 4 * _LANES)
+    powers, work = np.empty((12, _POWERS * _LANES)), np.empty(_BOUNDS + 4 * _LANES)
     found = work[_BOUNDS:].reshape((4, _LANES))
-    rows, length = np.empty((_DEPTH + 2, 4, _POWERS)), np.empty(_DEPTH + 2)
+    rows, length = np.empty((_DEPTH + 2, 12, _POWERS)), np.empty(_DEPTH + 2)
     nodes = 0
     for i in range(len(durations) - 1, -1, -1):  # backwards: the end asks most of the rotors
-        rows[0, :3], rows[0, 3], length[0] = coefficients[i], yaw[i], durations[i]
+        rows[0], length[0] = motion(coefficients[i], yaw[i], durations[i], _DERIVATIVES), durations[i]
         top = 1
         while top > 0:
             top -= 1
             nodes += 1
             open_halves = 3  # bit by bit: left, right
             if length[top] <= _LONGEST:
-                _numbers(rows[top], 0.5 * length[top] / _LANES, powers, work)
+                _numbers(rows[top], powers, work)
                 _enclose(work, mass, J, mixing)
                 for lane in range(_LANES):
                     if found[2, lane] > -np.inf:
@@ -198,8 +192,8 @@ def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: floa
                 continue
             if top >= _DEPTH or nodes >= _NODES:
                 return False, lowest, highest
-            for d in range(4):
-                split(rows[top, d], rows[top + 1, d])
+            for n in range(12):
+                split(rows[top, n], rows[top + 1, n])
             length[top] = length[top + 1] = 0.5 * length[top]
             if open_halves == 1:
                 rows[top] = rows[top + 1]
