@@ -55,14 +55,14 @@ def _timed(law) -> tuple[list[float], list[float]]:
 
 
 def figures(quick: bool) -> list[Figure]:
-    """Times of a step, of a rehearsal, and of the NMPC in flight."""
+    """Times of a step, of the check of a contact, and of the NMPC in flight."""
     law, rotors = _geometric(), RotorEstimate((1260.0,) * 4, (1260.0,) * 4)
     state = (0.1, 0.0, 1.1, 0.2, 0.0, 0.0, 0.05, 0.0, 0.0, 0.99875, 0.1, 0.2, 0.0)
     packed = FlatReference(perch("surface_90_1.7m").trajectory).setpoint(1.5).packed
     step = measure(lambda: law.step(state, packed, rotors), repetitions=2000 if quick else 20000)
     source = FlatReference(perch("surface_90_1.7m").trajectory)
-    rehearsal = measure(lambda: law.prepare(source, True), repetitions=5 if quick else 50)
-    out = [figure("geometric step", "us", 1e6 * step, bar=10.0), figure("rehearsal of a perch", "ms", 1e3 * rehearsal)]
+    check = measure(lambda: law.check_contact(source), repetitions=5 if quick else 50)
+    out = [figure("geometric step", "us", 1e6 * step, bar=10.0), figure("check of a contact trajectory", "ms", 1e3 * check)]
     for states, bars in ((13, ((0.3, "median <="), (0.6, "p99 <="))), (17, ((1.5, "p99 <="),))):
         law = _nmpc(states == 17)
         used, passed = _timed(law)

@@ -52,6 +52,7 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         s2=surface.R_WS[:, 1], s3=surface.normal, v_S=problem.target_velocity, perch_offset=vehicle.perch_offset,
         mass=vehicle.mass, impact_acceleration=settings.impact_acceleration,
         impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
+        contact_delay=settings.contact_delay,
         tube=(settings.tube_time, TUBE_STEP, TUBE_SHARE, TUBE_FLOOR), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
         rotors=each)

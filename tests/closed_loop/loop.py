@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,32 +22,36 @@ from perch_control.nmpc import NmpcController, NmpcSettings
 from perch_control.parameters import ControllerChoice, ControllerParameters
 from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
+from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import OdometryState, seconds
 from perch_core.vehicle import ControlGains, Vehicle, load_vehicle
 from perch_eval.in_process import Loop as FlightLoop
+from perch_planner.planner import plan
+from perch_planner.problem import PerchProblem, PerchSettings, StartState
 from closed_loop.truth import TruthEstimator
 from perch_sim.lockstep import Task
 
 PERIOD = 0.002
 EVERY_STEP = ControllerChoice(standby=False, reference_period=PERIOD)
-_PLANS = Path(__file__).with_name("perches.json")
 
 
 @dataclass(frozen=True)
 class Perch:
-    """A perch of `perches.json`: plans of perch_planner for the snapdragon, from a hover at (0, 0, 1.2) m."""
+    """A plan as shipped for the snapdragon, from a hover at (0, 0, 1.2) m; `contact`: of the centre of mass, where the plate touches."""
 
     trajectory: FlatTrajectory
     normal: np.ndarray
     contact: np.ndarray
 
 
+@cache
 def perch(name: str) -> Perch:
-    """A stored plan: surface_90_1.7m, surface_90_3m, surface_60_1.7m, surface_60_3m."""
-    plan = json.loads(_PLANS.read_text())[name]
-    return Perch(FlatTrajectory(np.array(plan["durations"]), np.array(plan["coefficients"])),
-                 np.array(plan["normal"]), np.array(plan["contact"]))
+    """surface_<inclination [deg]>_<distance [m]>m: a surface at the height of the hover."""
+    inclination, distance = map(float, name.removeprefix("surface_").removesuffix("m").split("_"))
+    surface, vehicle = PerchSurface.from_inclination(np.array([distance, 0.0, 1.2]), np.radians(inclination)), load_vehicle("snapdragon")
+    planned = plan(PerchProblem(StartState((0.0, 0.0, 1.2)), surface), PerchSettings(), vehicle)
+    return Perch(planned.trajectory, surface.normal, surface.p_WS + vehicle.perch_offset * surface.normal)
 
 
 class Believed(TruthEstimator):
@@ -183,7 +186,7 @@ class Arrival:
 
 
 def fly_to_contact(plan: Perch, **options) -> tuple[Arrival, Loop]:
-    """From a hover, fly a stored perch, and measure the arrival at the plane of the pad."""
+    """From a hover, fly a perch, and measure the arrival at the plane of the pad."""
     loop = make_loop(**options)
     loop.begin_in_hover()
     loop.states.clear(), loop.references.clear()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from closed_loop.loop import fly_to_contact, make_loop, perch
+from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import EstimationError
-from perch_control.admission import AtEnd
+from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.modes import Command, State
 from perch_core.trajectory import rest_to_rest
 
@@ -30,17 +30,25 @@ def test_perch_at_90_deg_holds_with_estimation_errors(seed):
     assert np.all(arrival.rmse < 0.11)
 
 
-def test_without_rehearsal_the_vehicle_pushes_itself_off_the_wall():
-    """Why the rehearsal is there: stopping the rotation takes thrust that points away from the wall."""
-    from perch_control.geometric import GeometricController
-    from perch_core.vehicle import ControlGains, load_vehicle
+@pytest.mark.parametrize("name", PERCHES)
+def test_a_plan_is_flown_as_it_is_to_its_contact(name):
+    """What the plan has at the pad is what the vehicle arrives with: nobody aims anew."""
+    plan = perch(name)
+    end = plan.trajectory.sample(plan.trajectory.duration)
+    arrival, loop = fly_to_contact(plan)
+    assert arrival.normal_speed == pytest.approx(-end.v @ plan.normal, abs=0.05)
+    np.testing.assert_allclose(loop.plant.v, end.v, atol=0.06)
 
-    vehicle = load_vehicle("snapdragon")
-    plain = GeometricController(vehicle, ControlGains(contact_speed=0.0))
-    plan = perch("surface_90_1.7m")
-    without, _ = fly_to_contact(plan, law=plain)
-    rehearsed, _ = fly_to_contact(plan)
-    assert without.normal_speed < 0.2 < 0.4 < rehearsed.normal_speed
+
+def test_an_overhang_that_the_rotors_lag_spoils_is_refused_by_the_geometric_law_and_flown_by_the_nmpc():
+    plan = perch("surface_120_2m")
+    loop = make_loop()
+    loop.begin_in_hover()
+    with pytest.raises(TrajectoryRefused, match="misses the contact by .* the NMPC"):
+        loop.follow(plan.trajectory, AtEnd.CONTACT)
+    assert loop.controller.state is State.HOVERING
+    arrival, _ = fly_to_contact(plan, law=predictive())
+    assert arrival.holds, arrival
 
 
 @pytest.mark.parametrize("seed", range(3))

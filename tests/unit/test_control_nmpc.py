@@ -106,7 +106,7 @@ def test_reference_rows_are_those_of_their_times():
 
 
 @pytest.mark.parametrize("thrust_states", [False, True])
-def test_perch_in_closed_loop_needs_no_rehearsal(thrust_states):
+def test_perch_in_closed_loop(thrust_states):
     arrival, _ = fly_to_contact(perch("surface_90_1.7m"), law=predictive(thrust_states=thrust_states))
     assert arrival.holds, arrival
     assert np.all(arrival.rmse < 0.02)

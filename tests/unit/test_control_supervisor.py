@@ -210,12 +210,11 @@ def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
     np.testing.assert_allclose(mixed.setpoint(1.0).p, new.setpoint(1.0).p, atol=1e-12)
 
 
-@pytest.mark.parametrize("lasting", [False, True])
-def test_a_blend_at_one_time_is_the_blend_at_many_to_the_last_bit(lasting):
-    """The controller asks for one time, the rehearsal for all."""
+def test_a_blend_at_one_time_is_the_blend_at_many_to_the_last_bit():
+    """The controller asks for one time, the check of a contact for all."""
     source = FlatReference(rest_to_rest(np.zeros(3), np.array([1, 0, 0]), 0, 0, 2.0))
     offset = Polynomial(quintic((0.1, 0.2, 0.3), (1, 0, 0), (0, 2, 0), *np.zeros((3, 3)), 0.7), 0.7, (0.0, 0.0, 0.0))
-    mixed, times = Blend(source, 0.4, offset, lasting), np.array([0.0, 0.4, 0.73, 1.1, 1.9, 2.5])
+    mixed, times = Blend(source, 0.4, offset), np.array([0.0, 0.4, 0.73, 1.1, 1.9, 2.5])
     assert [mixed.setpoint(float(t)).packed for t in times] == [tuple(row.tolist()) for row in mixed.many(times)]
 
 

@@ -132,6 +132,19 @@ def test_a_reference_that_nobody_wants_is_not_made():
     assert not flight.references
 
 
+def test_it_does_not_arm_before_a_vehicle_takes_the_commands():
+    flight = Flight()
+    listening = False
+    flight.component.motor_command.asked = lambda: listening
+    flight.step(0.5)
+    flight.order(Command.ARM)
+    flight.step(0.1)
+    assert flight.state is State.DISARMED and "arm is refused: no vehicle takes the commands yet" in flight.said
+    assert not flight.motors[-1].armed
+    listening = True
+    flight.take_off()
+
+
 # -- silence -----------------------------------------------------------------------------------------------------------
 
 

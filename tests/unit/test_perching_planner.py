@@ -71,7 +71,7 @@ def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:
     need = Requirements(
         start=np.array([[0.0, 0.0, 1.4], rest, rest, rest]), start_yaw=(0.0, 0.0), waypoints=np.zeros((0, 3)), p_S=WALL.p_WS,
         s1=WALL.R_WS[:, 0], s2=WALL.R_WS[:, 1], s3=WALL.normal, v_S=rest, perch_offset=0.04, mass=0.25,
-        impact_acceleration=3.3, impact_speed=(0.4, 0.6), tangential_speed=0.3, tube=(0.15, 0.01, 0.1, 0.33),
+        impact_acceleration=3.3, impact_speed=(0.65, 0.75), tangential_speed=0.3, contact_delay=0.03, tube=(0.12, 0.01, 0.1, 0.33),
         thrust=limits["thrust"], body_rate=limits["body_rate"][1], speed=limits["speed"][1], height=limits["height"],
         extension=0.15)
     assert verify(plan.trajectory.durations, plan.trajectory.coefficients, need, step=1e-3) == []
@@ -88,7 +88,7 @@ def test_options_of_a_request_replace_the_parameters(ask: Asked) -> None:
 @pytest.mark.parametrize("inclination", [0.0, 15.0, 30.0, 45.0, 60.0, 90.0])
 def test_a_surface_that_faces_up_is_met_from_above(ask: Asked, inclination: float) -> None:
     """The plate does not pass through the surface on its way to it."""
-    pad = PerchSurface.from_inclination(np.array([2.2, 0.0, 0.5]), math.radians(inclination))
+    pad = PerchSurface.from_inclination(np.array([2.2, 0.0, 0.6]), math.radians(inclination))
     plan = ask(request(pad))
     assert plan.success, plan.message
     t = np.linspace(0.0, plan.trajectory.duration, 2000)

@@ -14,7 +14,7 @@ from perch_planner.paper import paper_m
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 
 VEHICLE = load_vehicle("snapdragon")
-SETTINGS = PerchSettings(thrust_max=4.5)
+SETTINGS = PerchSettings(thrust_max=4.5, impact_speed_min=0.5, impact_speed_max=0.6, contact_delay=0.0)  # of which the paper knows nothing
 BOUNDS = 4.0 * VEHICLE.thrust_min / VEHICLE.mass, 4.5 / VEHICLE.mass
 
 

@@ -75,7 +75,7 @@ def solved(made, rows, solver: str = "daqp") -> np.ndarray:
 def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
     """The program that flies has the optimum of the paper's. [M:eq4-8]"""
     asked, durations = problem(60.0, waypoints), np.array(durations)
-    settings = PerchSettings(objective=objective, tangential_speed_max=20.0)  # which the paper leaves free
+    settings = PerchSettings(objective=objective, tangential_speed_max=20.0, contact_delay=0.0)  # of which the paper knows nothing
     contact = Contact(asked, settings, VEHICLE.perch_offset)
     same, default = (solved(*program(contact, durations, order, everywhere)[:2]) for everywhere in (True, False))
     chosen = paper_m.position_program(asked, settings, VEHICLE, durations)

@@ -13,10 +13,9 @@ from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder, limits
 from perch_core.vehicle import Vehicle
 
-_LONGEST_PERCH = 120.0  # the way to a contact is rehearsed, period by period [s]
 _EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
 _LATEST = 0.5           # the oldest start that is flown: a plan is of the present [s]
-START_GAP = 0.35       # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
+START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
 
@@ -59,8 +58,6 @@ def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
     trajectory, duration = order.trajectory, order.trajectory.duration
     if said := limits.problem(order):
         raise TrajectoryRefused(said)
-    if order.at_end == AtEnd.CONTACT and duration > _LONGEST_PERCH:
-        raise TrajectoryRefused(f"lasts {duration:g} s; at most {_LONGEST_PERCH:g} s is allowed")
     if not order.recovery_start <= duration + 1e-6:
         raise TrajectoryRefused(f"recovery_start {order.recovery_start} s is not within the trajectory's {duration:.3f} s")
     if isinstance(trajectory, FlatTrajectory):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 from functools import lru_cache
+from typing import Any
 
-from perch_core.component import Component, Diagnostics, Input, Output, Service, Wake
+from perch_core.component import Component, Diagnostics, Emitter, Input, Output, Service, Wake
 from perch_core.errors import ConfigError, PerchError
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample,
@@ -14,7 +15,7 @@ from perch_core.values.limits import problem
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
-from perch_control.modes import Command, State, StepResult
+from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import Setpoint
 from perch_control.stamp_guard import Stamp, StampGuard
@@ -66,6 +67,9 @@ class Controller(Component[ControllerParameters]):
         super().__init__(config)
         vehicle = load_vehicle(config.vehicle)
         self._takes_rates = vehicle.actuation.type == "rates_and_thrust"
+        commands: dict[str, Emitter[Any]] = {"rotor_speeds": self.motor_command, "rates_and_thrust": self.rates_thrust,
+                                             "attitude_and_thrust": self.attitude_thrust}
+        self._to_vehicle = commands[vehicle.actuation.type]
         self._assembly = Assembly(config, vehicle)
         self._stamps = StampGuard()
         self._spoken: int | None = None   # the host's time at which an input was last known to have come [ns]
@@ -185,6 +189,8 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
             return
         try:
+            if command.command == Command.ARM and not self._to_vehicle.wanted:
+                raise CommandRefused("arm is refused: no vehicle takes the commands yet")
             self.flight.command(Command(command.command), command.reason[:_WORDS])
         except ValueError as error:  # CommandRefused, or no such command
             self.flight.refused(str(error))

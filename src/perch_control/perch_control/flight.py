@@ -16,7 +16,6 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
 from perch_control.geometric import packed_vehicle
 from perch_control.geometric.step import predicted
-from perch_control.guidance import Running
 from perch_control.inner_loop import Later
 from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
@@ -139,7 +138,7 @@ class FlightController:
         _check_flying(x, "hover")
         if x.mode is State.RECOVERING:  # it ends in a hover, and must not be cut short
             return x
-        return self._schedule.leave(x, f"hover{why}", self.law) or stopped(x, f"hover{why}")
+        return self._schedule.leave(x, f"hover{why}") or stopped(x, f"hover{why}")
 
     def _arm(self, x: FlightState, why: str) -> FlightState:
         if x.mode is State.ARMED or x.flying:
@@ -172,8 +171,9 @@ class FlightController:
         check_start(order, x.now, x.expected(max(order.start, x.now)))
         if order.at_end is AtEnd.CONTACT and x.mode is State.HOVERING and self.compensator is not None:
             x = self.flown = self._thrust.adopted(x, self.law, self.compensator)
-        running = Running(x.source, order.start - x.start) if x.mode is State.TRACKING and order.start >= x.now else None
-        self._schedule.put(order, self.law.prepare(order.source, order.at_end is AtEnd.CONTACT, running))
+        if order.at_end is AtEnd.CONTACT:
+            self.law.check_contact(order.source)
+        self._schedule.put(order)
 
     def keep_ready(self, order: Order) -> None:
         """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
@@ -187,7 +187,7 @@ class FlightController:
         """End whatever is flown in a hover, through a recovery where the vehicle is tilted. Returns what is done."""
         x = self.flown
         if x.mode in (State.TRACKING, State.HOVERING):
-            left = self._schedule.leave(x, reason, self.law)
+            left = self._schedule.leave(x, reason)
             if left is None:
                 self._schedule.drop()
             self.flown = left or stopped(x, reason)
@@ -212,7 +212,7 @@ class FlightController:
         """Leave a trajectory by a planned way out, or brake; where even the hardest brake would end in the surface, go on."""
         if x.mode is not State.TRACKING:
             return x
-        return self._schedule.leave(x, reason, self.law) or (x if committed(x) else stopped(x, f"hover: {reason}"))
+        return self._schedule.leave(x, reason) or (x if committed(x) else stopped(x, f"hover: {reason}"))
 
     def descend(self, message: str, moving: bool = True) -> None:
         """Descend without position from now on; `moving`: the velocity can be trusted."""
@@ -260,7 +260,7 @@ class FlightController:
             elif verdict.jumped:
                 x = stayed(x, verdict.reason)
         if x.blind is None:
-            x = self._schedule.activated(x, self.law)
+            x = self._schedule.activated(x)
             if x.flying:
                 x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator))
         return self._answered(x)

@@ -121,19 +121,17 @@ def quintic(p0, v0, a0, p1, v1, a1, duration: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Blend:
-    """A reference with an offset: one that dies away (a new reference is reached without a jump), or one that grows.
+    """A reference with an offset that dies away: a new reference is reached without a jump.
 
     Attributes:
         source: the reference.
         start: its time at which the offset begins [s].
         offset: what is added, over the time since `start`.
-        lasting: the offset goes on past its end instead of being over.
     """
 
     source: Source
     start: float
     offset: Polynomial
-    lasting: bool = False
 
     @property
     def duration(self) -> float:
@@ -143,41 +141,17 @@ class Blend:
     def many(self, times: np.ndarray) -> np.ndarray:
         """Setpoints at many times [s] of the reference, packed, shape (n, 33)."""
         out, since = packed_many(self.source, times), times - self.start
-        acting = since >= 0.0 if self.lasting else (since >= 0.0) & (since < self.offset.duration)
+        acting = (since >= 0.0) & (since < self.offset.duration)
         out[acting, :15] += self.offset.many(since[acting])[:, :15]
         return out
 
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s] of the reference, as `many` has it."""
         x, since = self.source.setpoint(t), t - self.start
-        if since < 0.0 or not (self.lasting or since < self.offset.duration):
+        if not 0.0 <= since < self.offset.duration:
             return x
         moved = (tuple(map(add, *pair)) for pair in zip(x[:5], self.offset.setpoint(since)))
         return Setpoint._make((*moved, *x[5:]))
-
-
-@dataclass(frozen=True)
-class Running:
-    """A running reference, and the time on it at which another one shall take over [s]."""
-
-    source: Source
-    time: float
-
-    @property
-    def setpoint(self) -> Setpoint:
-        """Where it is then."""
-        return self.source.setpoint(self.time)
-
-    @property
-    def carried(self) -> np.ndarray:
-        """The lasting offset with which it ends (position, velocity), shape (2, 3); zero without one."""
-        source = self.source
-        while isinstance(source, Blend):
-            if source.lasting:
-                end = source.offset.setpoint(source.duration - source.start)
-                return np.array([end.p, end.v])
-            source = source.source
-        return np.zeros((2, 3))
 
 
 def blended(old: Setpoint, source: Source, start: float, end: float) -> Source:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from perch_core.vehicle import Vehicle
 from perch_control.period import NOMINAL_PERIOD
 from perch_control.rotor_lag import RotorEstimate
 
 if TYPE_CHECKING:
-    from perch_control.guidance import Running
     from perch_control.parameters import ControllerParameters
-    from perch_control.reference import Following
+    from perch_control.reference import Following, Source
 
 NO_COMPENSATION = (0.0,) * 6
 
@@ -86,9 +85,12 @@ class Law(ABC):
     def lines(self, lines: tuple[tuple[float, ...], ...]) -> None:
         """Powerlines to look at and to keep away from: (centre, direction, half length, radius), 8 floats each, the watched one first."""
 
-    def prepare(self, source: Any, contact: bool, running: Running | None = None) -> Any:
-        """The reference to follow for a trajectory, which ends in a contact or not, and takes over from a running reference."""
-        return source
+    def check_contact(self, source: Source) -> None:
+        """Refuse a trajectory to a contact that this law cannot follow with this vehicle.
+
+        Raises:
+            TrajectoryRefused: with how it would end.
+        """
 
     @abstractmethod
     def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,

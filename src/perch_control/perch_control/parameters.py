@@ -42,8 +42,6 @@ class GainParameters:
     attitude: Vector3 | None = _of_vehicle("attitude")
     rate: Vector3 | None = _of_vehicle("rate")
     lead: float | None = _of_vehicle("lead")
-    contact_speed: float | None = _of_vehicle("contact_speed")
-    contact_overshoot: float | None = _of_vehicle("contact_overshoot")
 
 
 @dataclass(frozen=True, kw_only=True)

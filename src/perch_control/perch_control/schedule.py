@@ -7,10 +7,8 @@ from math import inf
 from perch_control.admission import AtEnd, Order, check_joints
 from perch_control.flight_state import FlightState
 from perch_control.guidance import blended
-from perch_control.law import Law
 from perch_control.maneuvers import tracked
 from perch_control.modes import State
-from perch_control.reference import Source
 
 _EARLY = 0.01      # stamps that are nearer than this are the same [s]
 _MOST = 50         # ways out that are kept
@@ -21,7 +19,7 @@ class Schedule:
     """Owns what is pending; starts it when its time has come."""
 
     def __init__(self) -> None:
-        self._pending: tuple[Order, Source, str] | None = None  # a trajectory, the reference made from it, and why it is a way out
+        self._pending: tuple[Order, str] | None = None  # a trajectory, and why it is a way out
         self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
 
     @property
@@ -29,9 +27,9 @@ class Schedule:
         """Whether a trajectory is to follow."""
         return self._pending is not None
 
-    def put(self, order: Order, source: Source) -> None:
-        """The next trajectory, by the reference made from it."""
-        self._pending = order, source, ""
+    def put(self, order: Order) -> None:
+        """The next trajectory."""
+        self._pending = order, ""
 
     def drop(self) -> None:
         """Nothing is to follow."""
@@ -47,7 +45,7 @@ class Schedule:
         known = (x.trajectory_id, order.id)  # the next trajectory has ways out before it is flown
         self._ways_out = [o for o in self._ways_out if o.id in known and o.start >= x.now][-_MOST:] + [order]
 
-    def leave(self, x: FlightState, reason: str, law: Law) -> FlightState | None:
+    def leave(self, x: FlightState, reason: str) -> FlightState | None:
         """Leave a trajectory by the next way out that was planned of it; None where none is near.
 
         Until that recovery starts the trajectory is flown on, for `_LEAVE_TIME` at most: braking out of a tilted attitude at
@@ -63,14 +61,15 @@ class Schedule:
         start = min([o.start for o in ways] + [own])  # a plan may end in a recovery of its own
         if start - x.now > _LEAVE_TIME:
             return None
-        self._pending = next(((o, law.prepare(o.source, False), reason) for o in ways if o.start == start), None)
+        self._pending = next(((o, reason) for o in ways if o.start == start), None)
         return x._replace(message=f"{reason}; planned recovery in {start - x.now:.2f} s")
 
-    def activated(self, x: FlightState, law: Law) -> FlightState:
+    def activated(self, x: FlightState) -> FlightState:
         """Start the pending trajectory when its time has come, or the recovery that was planned for this vehicle at the wire."""
         if self._pending is None:
-            return self._left_the_wire(x, law)
-        order, source, leaving = self._pending
+            return self._left_the_wire(x)
+        order, leaving = self._pending
+        source = order.source
         resting = x.mode in (State.ARMED, State.ATTACHED)
         if not (resting or x.mode in (State.TRACKING, State.HOVERING)):
             self._pending = None
@@ -82,7 +81,7 @@ class Schedule:
             return tracked(x, order, source if resting else blended(x.expected(x.now), source, begin, end), leaving)
         return x
 
-    def _left_the_wire(self, x: FlightState, law: Law) -> FlightState:
+    def _left_the_wire(self, x: FlightState) -> FlightState:
         """Where the appended recovery is due, take the one that is kept ready for then: it begins where the vehicle is by now.
 
         Nothing is blended: the reference comes to the vehicle, and the way from there is clear of the wire.
@@ -92,4 +91,4 @@ class Schedule:
             return x
         own = order.start + order.recovery_start
         way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= x.now), None)
-        return x if way is None else tracked(x, way, law.prepare(way.source, False))
+        return x if way is None else tracked(x, way, way.source)

@@ -44,7 +44,7 @@ class FlatState:
     thrust_rate: float
 
 
-@compiled
+@compiled(inline=True)
 def direction_derivatives(f: Numbers, df: Numbers, ddf: Numbers) -> tuple[Vector3, Vector3, Vector3]:
     """Unit vector along f with its first and second derivative."""
     k = 1.0 / norm(f)
@@ -56,15 +56,20 @@ def direction_derivatives(f: Numbers, df: Numbers, ddf: Numbers) -> tuple[Vector
     return u, du, ddu
 
 
-@compiled
-def heading_derivatives(yaw: float, yaw_rate: float, yaw_acc: float) -> tuple[Vector3, Vector3, Vector3]:
-    """b2_des = (-sin yaw, cos yaw, 0) with its first and second derivative. [M:eq12]"""
-    sy, cy = sin(yaw), cos(yaw)
+@compiled(inline=True)
+def turned_heading(sy: float, cy: float, yaw_rate: float, yaw_acc: float) -> tuple[Vector3, Vector3, Vector3]:
+    """b2_des = (-sin yaw, cos yaw, 0) with its first and second derivative from sine and cosine of the yaw. [M:eq12]"""
     return ((-sy, cy, 0.0), (-cy * yaw_rate, -sy * yaw_rate, 0.0),
             (sy * yaw_rate * yaw_rate - cy * yaw_acc, -cy * yaw_rate * yaw_rate - sy * yaw_acc, 0.0))
 
 
 @compiled
+def heading_derivatives(yaw: float, yaw_rate: float, yaw_acc: float) -> tuple[Vector3, Vector3, Vector3]:
+    """b2_des with its first and second derivative. [M:eq12]"""
+    return turned_heading(sin(yaw), cos(yaw), yaw_rate, yaw_acc)
+
+
+@compiled(inline=True)
 def commanded_frame(f: Numbers, df: Numbers, ddf: Numbers, h: Numbers, dh: Numbers, ddh: Numbers
                     ) -> tuple[Vector3, Vector3, Vector3, Vector3, Vector3]:
     """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [defines M:eq10, M:eq12, M:eq13]

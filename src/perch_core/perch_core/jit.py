@@ -49,21 +49,22 @@ def _package(file: Path) -> Path:
 @overload
 def compiled(kernel: Kernel) -> Kernel: ...
 @overload
-def compiled(*, nogil: bool) -> Callable[[Kernel], Kernel]: ...
-def compiled(kernel: Any = None, *, nogil: bool = False) -> Any:
+def compiled(*, nogil: bool = False, inline: bool = False) -> Callable[[Kernel], Kernel]: ...
+def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -> Any:
     """Decorator: the kernel compiled by numba with an on-disk cache, or the kernel itself.
 
-    With `nogil` it runs without the interpreter lock, which pays for kernels of milliseconds beside other threads.
+    With `nogil` it runs without the interpreter lock, which pays for kernels of milliseconds beside other threads. With `inline` it
+    becomes a part of the kernels that call it: a loop over such calls, without branches, takes several elements at a time.
 
     Without `fastmath`: results must not depend on how a compiler groups a sum. The plain function stays reachable, see
     `interpreted`. A kernel may call kernels of its own package and of perch_core.
     """
     if kernel is None:
-        return partial(compiled, nogil=nogil)
+        return partial(compiled, nogil=nogil, inline=inline)
     if njit is None:
         kernel.py_func = kernel
         return kernel
-    out = njit(cache=True, error_model="numpy", nogil=nogil)(kernel)
+    out = njit(cache=True, error_model="numpy", nogil=nogil, forceinline=inline)(kernel)
     # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
     # unseen. The hash of all sources with kernels takes the place of that file's date.
     index: Any = getattr(getattr(out, "_cache", None), "_cache_file", None)

@@ -115,16 +115,13 @@ class Actuation:
 @dataclass(frozen=True, kw_only=True)
 class ControlGains:
     """How the vehicle is flown: gains of [M:eq2] per unit of mass and inertia, k_x = m position, k_v = m velocity, k_R = J attitude and
-    k_Omega = J rate, and the contact that its holding mechanism needs."""
+    k_Omega = J rate."""
 
     position: Vector3 = quantity((7.0, 7.0, 9.0), unit="1/s^2", low=0.0, high=200.0, doc="axes of W")
     velocity: Vector3 = quantity((4.5, 4.5, 5.5), unit="1/s", low=0.0, high=100.0, doc="axes of W")
     attitude: Vector3 = quantity((420.0, 420.0, 60.0), unit="1/s^2", low=0.0, high=5000.0, doc="axes of B")
     rate: Vector3 = quantity((32.0, 32.0, 10.0), unit="1/s", low=0.0, high=500.0, doc="axes of B")
     lead: float = quantity(0.02, unit="s", low=0.002, high=0.2, doc="time in which the rotors reach the wanted thrust")
-    contact_speed: float = quantity(0.65, unit="m/s", low=0.0, high=2.0,
-                                    doc="least speed into a surface, which a rehearsal on the model sees to; 0: a contact is flown as planned")
-    contact_overshoot: float = quantity(0.02, unit="m", low=0.0, high=0.2, doc="the rehearsal aims so far behind the surface")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -87,9 +87,11 @@ def segment(file: Path) -> str:
 
 def _abandoned(segment: Path) -> bool:
     """Whether the maker of a segment has ended: while it lives, Fast DDS holds the lock of the file `<segment>_el`."""
+    if PORT.match(segment.name):  # the next participant takes it over
+        return False
     try:
         with Path(f"{segment}_el").open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return not PORT.match(segment.name)
+            return True
     except OSError:  # it is held, or there is none
         return False

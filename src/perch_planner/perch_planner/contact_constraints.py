@@ -77,8 +77,11 @@ def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Ar
 
 
 @compiled
-def _window(R_WS: Array, velocity: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
-    """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]"""
+def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
+    """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]
+
+    They hold after a change of the velocity by `later` [m/s], shape (3,): for a contact that comes late.
+    """
     count = 1 + len(_OCTAGON)
     directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
     for k in range(count):
@@ -88,7 +91,7 @@ def _window(R_WS: Array, velocity: Array, least: float, most: float, tangential:
                 directions[k, d] = -R_WS[d, 2]
             else:
                 directions[k, d] = _OCTAGON[k - 1, 0] * R_WS[d, 0] + _OCTAGON[k - 1, 1] * R_WS[d, 1]
-            shift += directions[k, d] * velocity[d]
+            shift += directions[k, d] * (velocity[d] - later[d])
         lower[k] = shift + (least if k == 0 else -tangential)
         upper[k] = shift + (most if k == 0 else tangential)
     return directions, lower, upper
@@ -135,7 +138,7 @@ def tube_times(duration: float, tube_time: float, tube_step: float) -> Array:
 
 @compiled
 def _contact(points: Array, v: Array, a: Array, j: Array, places: Indices, orders: Indices, fixed: Array, R_WS: Array, velocity: Array,
-             alpha: float, share: float, floor: float, tube_time: float, tube_step: float, least: float, most: float, tangential: float
+             alpha: float, share: float, floor: float, tube_time: float, tube_step: float, delay: float, least: float, most: float, tangential: float
              ) -> tuple[Flags, Array, tuple[Array, Array, Array, Array, Array, Array]]:
     """Knots, tube and window of a problem, for a target that stands still. [defines M:eq11]
 
@@ -154,7 +157,7 @@ def _contact(points: Array, v: Array, a: Array, j: Array, places: Indices, order
     for q in range(len(places)):
         given[places[q], orders[q]], values[places[q], orders[q]] = True, fixed[q]
     lower, upper = tube_bounds(acceleration, share, floor)
-    directions, window_lower, window_upper = _window(R_WS, velocity, least, most, tangential)
+    directions, window_lower, window_upper = _window(R_WS, velocity, delay * acceleration, least, most, tangential)
     return given, values, (tube_times(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
                            window_upper)
 
@@ -203,4 +206,5 @@ class Contact:
                  for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)) if value is not None]
         derivatives = tuple(map(np.array, zip(*fixed))) if fixed else _NO_DERIVATIVES
         self.problem = (self.points, start.v, start.a, start.j, *derivatives, R_WS, self.velocity, settings.impact_acceleration,
-                        TUBE_SHARE, TUBE_FLOOR, settings.tube_time, TUBE_STEP, least, most, settings.tangential_speed_max * _INSCRIBED - INSET)
+                        TUBE_SHARE, TUBE_FLOOR, settings.tube_time, TUBE_STEP, settings.contact_delay, least, most,
+                        settings.tangential_speed_max * _INSCRIBED - INSET)

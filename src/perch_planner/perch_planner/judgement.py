@@ -10,9 +10,12 @@ from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_planner.cutting import limit_cuts, thrust_cuts
 from perch_planner.linear_bounds import BoundArrays
-from perch_planner.plan_checks import check, thrust_extrema
+from perch_planner.plan_checks import HOLDS, ROTOR_THRUST, check, thrust_extrema
+from perch_planner.rotor_proof import prove_rotors
+from perch_planner.rotor_thrusts import RotorModel, sampled
 
 _CUT_REACH = 1.7  # peaks beyond this multiple of the limit are stretched before they are cut
+_LOOK = 0.9       # of the least thrust: where the first plan's is greater, its rotors are bounded together with the thrust
 
 
 class Question(NamedTuple):
@@ -29,6 +32,8 @@ class Question(NamedTuple):
         near: a thrust outside its range by less is cut together with the other limits [m/s^2].
         waypoints: peaks of the thrust in so many segments are stretched rather than cut; those after them only where they
             are high.
+        low_rotor, high_rotor: limits of a rotor's thrust [N].
+        rotors: of `rotor_thrusts.rotor_model`.
     """
 
     p_S: np.ndarray
@@ -45,6 +50,9 @@ class Question(NamedTuple):
     rate: float
     near: float
     waypoints: int
+    low_rotor: float
+    high_rotor: float
+    rotors: RotorModel
 
 
 class Judgement(NamedTuple):
@@ -53,12 +61,14 @@ class Judgement(NamedTuple):
     Attributes:
         coefficients: of the plan, shape (f, 3, 15) [m].
         extrema: of `plan_checks.thrust_extrema`.
-        results: of `plan_checks.check`, meaningless unless `checked`.
+        results: rows of `plan_checks.NAMES`, meaningless unless `checked`.
         least, most: proved extrema of the specific thrust [m/s^2].
         checked: the limits beside the thrust were looked at.
-        holds: all limits are proved.
+        kept: no rotor is known to leave its range.
+        holds: all limits are proved, if `kept` those of the rotors, too.
         stretch: a longer time promises more than cuts, and there are none.
-        cuts: linear bounds that were found.
+        cuts: linear bounds that were found beside those of rotors.
+        near: bounds of rotors that hold near the plan alone.
     """
 
     coefficients: np.ndarray
@@ -67,9 +77,11 @@ class Judgement(NamedTuple):
     least: float
     most: float
     checked: bool
+    kept: bool
     holds: bool
     stretch: bool
     cuts: int
+    near: int
 
 
 @compiled
@@ -82,7 +94,7 @@ def _better_stretched(extrema: Array, high: float, waypoints: int) -> bool:
 
 @compiled
 def judge(coefficients: Array, yaw: Array, durations: Array, question: tuple[Any, ...], patient: bool, later: bool
-          ) -> tuple[Array, Array, tuple[float, float, bool, bool, bool], BoundArrays, BoundArrays]:
+          ) -> tuple[Array, Array, tuple[float, float, bool, bool, bool, bool], BoundArrays, BoundArrays, Array]:
     """Check a plan, and find cuts against what breaks a limit.
 
     Args:
@@ -94,21 +106,29 @@ def judge(coefficients: Array, yaw: Array, durations: Array, question: tuple[Any
         later: this is not the first program: where the thrust is nearly in its range, the other limits count too.
 
     Returns:
-        (extrema, results, (least, most, checked, holds, stretch), thrust, other): as in `Judgement`; cuts of the thrust and
-        of the other limits, fields of `Bounds`.
+        (extrema, results, (least, most, checked, kept, holds, stretch), thrust, other, thrusts): as in `Judgement`; cuts of the thrust
+        and of the other limits, fields of `Bounds`; of `rotor_thrusts.sampled`, empty where the rotors were not looked at.
     """
-    p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints = question
+    (p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints, low_rotor, high_rotor,
+     rotors) = question
     extrema, least, most = thrust_extrema(coefficients, durations, low, high)
     broken = most > high or least < low
     stretch = broken and patient and _better_stretched(extrema, high, waypoints)
     checked = not broken or (later and not stretch and min(high - most, least - low) > -near)
-    results, where, holds = np.empty((5, 5)), np.full((5, 2), -1.0), False
+    results, where, holds, kept = np.empty((6, 5)), np.full((5, 2), -1.0), False, True
     if checked:
-        results, where, holds = check(coefficients, yaw, durations, extrema, p_S, v_S, s3, low, high, speed, low_height,
-                                      high_height, extension, clearance, rate)
+        results[:5], where, holds = check(coefficients, yaw, durations, extrema, p_S, v_S, s3, low, high, speed, low_height,
+                                          high_height, extension, clearance, rate)
+    thrusts = np.empty((0, 4, 0))
+    if checked or not (later or stretch or least < _LOOK * low):
+        thrusts, row = sampled(coefficients, yaw, durations, low_rotor, high_rotor, *rotors)
+        kept = low_rotor <= row[0] and row[2] <= high_rotor
+        if kept and holds:
+            kept, row[0], row[2] = prove_rotors(coefficients, yaw, durations, row[0], row[2], low_rotor, high_rotor, *rotors)
+        results[ROTOR_THRUST, :4], results[ROTOR_THRUST, HOLDS] = row, kept
     cut = not stretch and not holds
     thrust = thrust_cuts(coefficients, durations, extrema, low if cut else -np.inf, high if cut else np.inf, side)
     if not cut:
         where[:] = -1.0
     other = limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension)
-    return extrema, results, (least, most, checked, holds, stretch), thrust, other
+    return extrema, results, (least, most, checked, kept, holds, stretch), thrust, other, thrusts

@@ -66,7 +66,7 @@ def index(segment: int, k: int, first: int) -> int:
 
 
 @compiled
-def _scales(ratio: float) -> Array:
+def scales(ratio: float) -> Array:
     """Factors that turn unknowns (in time units) into coefficients of the functions of a segment, shape (15,)."""
     out = np.ones(FUNCTIONS)
     for k in range(HERMITE):
@@ -77,7 +77,7 @@ def _scales(ratio: float) -> Array:
 @compiled
 def functional(duration: float, unit: float, s: float, order: int) -> Array:
     """Factors of the segment's functions in the order-th time derivative at place s, shape (15,). [defines M:eq6]"""
-    row, scale = bernstein_row(DEGREE - order, s), _scales(duration / unit)
+    row, scale = bernstein_row(DEGREE - order, s), scales(duration / unit)
     out = np.zeros(FUNCTIONS)
     for i in range(len(row)):
         if row[i] != 0.0:
@@ -160,7 +160,7 @@ def _weigh(durations: Array, unit: float, first: Indices, role: Indices, basis: 
     out = np.zeros((n, m))
     for i in range(len(durations)):
         ratio = durations[i] / unit
-        scale, weight = _scales(ratio), ratio ** (1 - 2 * cost_order)
+        scale, weight = scales(ratio), ratio ** (1 - 2 * cost_order)
         count = FUNCTIONS if first[i] >= 0 else HERMITE
         for b in range(count):
             q = index(i, b, first[i])
@@ -266,7 +266,7 @@ def coefficients(program: ProgramArrays, w: Array) -> Array:
                     unknowns[d, q] += w[d * m + i] * spread[i, q]
     out = np.zeros((len(durations), 3, DEGREE + 1))
     for i in range(len(durations)):
-        scale = _scales(durations[i] / unit)
+        scale = scales(durations[i] / unit)
         for d in range(3):
             for k in range(FUNCTIONS if first[i] >= 0 else HERMITE):
                 share = scale[k] * unknowns[d, index(i, k, first[i])]

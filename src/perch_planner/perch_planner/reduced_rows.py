@@ -11,7 +11,7 @@ import numpy as np
 from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_planner.linear_bounds import BoundArrays
-from perch_planner.reduced_qp import ProgramArrays, functional, index
+from perch_planner.reduced_qp import ProgramArrays, functional, index, scales
 from perch_planner.reference_element import FUNCTIONS, HERMITE
 
 Rows = tuple[Array, Array, Array]
@@ -35,7 +35,22 @@ def _place(local: Array, segment: int, first: int, wide: Array, centre: Array, c
 
 
 @compiled
-def _normalise(rows: Array, lower: Array, upper: Array) -> None:
+def whitened(program: ProgramArrays, segment: int) -> Array:
+    """Factors of a segment's functions from w of one dimension, and from the constants of all three, shape (15, size + 3)."""
+    durations, first, unit, spread, centre = program
+    m, scale = len(spread), scales(durations[segment] / unit)
+    out = np.zeros((FUNCTIONS, m + 3))
+    for k in range(FUNCTIONS if first[segment] >= 0 else HERMITE):
+        n = index(segment, k, first[segment])
+        for i in range(m):
+            out[k, i] = scale[k] * spread[i, n]
+        for d in range(3):
+            out[k, m + d] = scale[k] * centre[n, d]
+    return out
+
+
+@compiled
+def normalise(rows: Array, lower: Array, upper: Array) -> None:
     """Scale rows and their bounds to unit length."""
     for r in range(len(rows)):
         squared = 0.0
@@ -68,7 +83,7 @@ def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
                     rows[r, d * m + k] += direction[q, d] * column[k]
                 low[r] -= direction[q, d] * constant[d]
                 high[r] -= direction[q, d] * constant[d]
-    _normalise(rows, low, high)
+    normalise(rows, low, high)
     return rows, low, high
 
 

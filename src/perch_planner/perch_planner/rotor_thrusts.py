@@ -13,23 +13,26 @@ It is smooth in acceleration, jerk and snap: its linearisation at the present pl
 from __future__ import annotations
 
 from functools import lru_cache
+from math import cos, perm, sin
 
 import numpy as np
 
 from perch_core import bernstein
 from perch_core.arrays import Array, Indices, Vector3, vector3
-from perch_core.flatness import commanded_frame, heading_derivatives
+from perch_core.flatness import commanded_frame, turned_heading
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_planner.bounds import time_derivative
-from perch_planner.linear_bounds import BoundArrays
+from perch_planner.reduced_qp import ProgramArrays
+from perch_planner.reduced_rows import Rows, normalise, whitened
+from perch_planner.reference_element import DEGREE, TABLES
 
 _COUNT = 49
 _FINER = 4  # samples from one place to the next, where a segment's thrusts come near a limit
 _SAMPLES = 0.5 - 0.5 * np.cos(np.pi * np.arange(_FINER * (_COUNT - 1) + 1) / (_FINER * (_COUNT - 1)))
 _PLACES = _SAMPLES[::_FINER].copy()  # where a rotor is bounded; dense at the ends, where polynomials turn fastest
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
+_NO_THRUST = -1e3   # [N] in its place
 _ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
 _STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
 _NEAR = 0.1         # rotors this near to a limit are bounded; share of the range
@@ -37,8 +40,6 @@ _KEEP = 2e-3        # bounds are set inside by this share of the range,
 _BETWEEN = 1.5      # and by this multiple of what was seen between the places
 
 
-Four = tuple[float, float, float, float]
-"""A number for each rotor."""
 RotorModel = tuple[float, Vector3, Array]
 """Mass [kg], principal inertias [kg m^2], wrench to rotor thrusts, shape (4, 4)."""
 
@@ -54,56 +55,60 @@ def _inverse(entries: tuple[float, ...]) -> Array:
     return np.ascontiguousarray(np.linalg.inv(np.reshape(entries, (4, 4))))
 
 
-@compiled
-def thrusts_of(f: Vector3, j: Vector3, s: Vector3, heading: Vector3, mass: float, J: Vector3, mixing: Array) -> Four:
-    """Rotor thrusts [N] of the specific force f, jerk and snap (3 floats each) and yaw with two derivatives; 4 floats."""
-    specific = norm(f)
-    h, dh, ddh = heading_derivatives(heading[0], heading[1], heading[2])
-    if specific < _FREE_FALL or norm(cross(h, f)) < _ALONG * specific:
-        return -1e3, -1e3, -1e3, -1e3
-    _, _, _, w, dw = commanded_frame(f, j, s, h, dh, ddh)
-    M = axpy(1.0, times(J, dw), cross(w, times(J, w)))
-    T = mass * specific
-    return (mixing[0, 0] * T + mixing[0, 1] * M[0] + mixing[0, 2] * M[1] + mixing[0, 3] * M[2],
-            mixing[1, 0] * T + mixing[1, 1] * M[0] + mixing[1, 2] * M[1] + mixing[1, 3] * M[2],
-            mixing[2, 0] * T + mixing[2, 1] * M[0] + mixing[2, 2] * M[1] + mixing[2, 3] * M[2],
-            mixing[3, 0] * T + mixing[3, 1] * M[0] + mixing[3, 2] * M[1] + mixing[3, 3] * M[2])
-
-
-def bases_at(places: Array) -> tuple[Array, ...]:
-    """Bernstein bases of degree 10 to 14 at places in [0, 1], each of shape (degree + 1, places)."""
-    return tuple(bernstein.basis(n, places).T.copy() for n in range(10, 15))
+def bases_at(places: Array) -> tuple[Array, Array]:
+    """From Bernstein coefficients to values at places in [0, 1]: second to fourth, and zeroth to second derivative, shapes (15, 3 places)."""
+    rows = [perm(14, n) * np.diff(np.eye(15), n) @ bernstein.basis(14 - n, places).T for n in range(5)]
+    return np.hstack(rows[2:]), np.hstack(rows[:3])
 
 
 _BASES, _FINE_BASES = bases_at(_PLACES), bases_at(_SAMPLES)
+_FUNCTIONS_AT = np.vstack([bernstein.basis(DEGREE - n, _PLACES) @ TABLES[n, :DEGREE + 1 - n] for n in range(2, 5)])
+"""Second to fourth derivative of the functions of the reference element at the places, shape (3 places, 15)."""
 
 
 @compiled
-def add_values(row: Array, basis: Array, out: Array) -> None:
-    """Add the values of a polynomial, given by Bernstein coefficients, at the places of a basis."""
-    for i in range(len(row)):
-        for k in range(basis.shape[1]):
-            out[k] += row[i] * basis[i, k]
-
-
-@compiled
-def motion(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, ...]) -> Array:
+def motion(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, Array]) -> Array:
     """Specific force, jerk and snap, yaw and its first two derivatives at the places of `bases_at`, shape (12, places)."""
-    out = np.zeros((12, bases[0].shape[1]))
-    for order in range(3):
-        rows, turn = time_derivative(coefficients, order + 2, duration), time_derivative(yaw.reshape((1, 15)), order, duration)
+    moved, turned = np.dot(coefficients, bases[0]), np.dot(yaw, bases[1])
+    count = len(turned) // 3
+    out = np.empty((12, count))
+    for n in range(3):
+        unit, slow = duration**-(n + 2), duration**-n
         for d in range(3):
-            add_values(rows[d], bases[2 - order], out[3 * order + d])
-        add_values(turn[0], bases[4 - order], out[9 + order])
-    out[2] += GRAVITY
+            for k in range(count):
+                out[3 * n + d, k] = unit * moved[d, n * count + k]
+        for k in range(count):
+            out[9 + n, k] = slow * turned[n * count + k]
+    for k in range(count):
+        out[2, k] += GRAVITY
     return out
 
 
 @compiled
-def thrusts_at(x: Array, k: int, mass: float, J: Vector3, mixing: Array) -> Four:
-    """Rotor thrusts [N] of column k of `motion`."""
-    return thrusts_of((x[0, k], x[1, k], x[2, k]), (x[3, k], x[4, k], x[5, k]), (x[6, k], x[7, k], x[8, k]),
-                      (x[9, k], x[10, k], x[11, k]), mass, J, mixing)
+def thrusts_along(x: Array, mass: float, J: Vector3, mixing: Array, out: Array) -> None:
+    """Rotor thrusts [N] at each place of `motion`, into `out`, shape (4, places); -1000 N in all where no attitude is defined.
+
+    The second loop has no branches: compiled, it takes several places at a time.
+    """
+    count = x.shape[1]
+    turn = np.empty((2, count))
+    for k in range(count):
+        turn[0, k], turn[1, k] = sin(x[9, k]), cos(x[9, k])
+    for k in range(count):
+        falls = norm((x[0, k], x[1, k], x[2, k])) < _FREE_FALL
+        f = (x[0, k], x[1, k], 1.0 if falls else x[2, k])
+        h, dh, ddh = turned_heading(turn[0, k], turn[1, k], x[10, k], x[11, k])
+        specific = norm(f)
+        _, _, _, w, dw = commanded_frame(f, (x[3, k], x[4, k], x[5, k]), (x[6, k], x[7, k], x[8, k]), h, dh, ddh)
+        M = axpy(1.0, times(J, dw), cross(w, times(J, w)))
+        undefined = falls | (norm(cross(h, f)) < _ALONG * specific)
+        out[0, k] = _NO_THRUST if undefined else mass * specific
+        for d in range(3):
+            out[1 + d, k] = 0.0 if undefined else M[d]
+    for k in range(count):
+        T, x_x, y_y, z_z = out[0, k], out[1, k], out[2, k], out[3, k]
+        for q in range(4):
+            out[q, k] = mixing[q, 0] * T + mixing[q, 1] * x_x + mixing[q, 2] * y_y + mixing[q, 3] * z_z
 
 
 @compiled
@@ -123,12 +128,11 @@ def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
 
 
 @compiled
-def _segment(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, ...], mass: float, J: Vector3, mixing: Array) -> Array:
+def _segment(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, Array], mass: float, J: Vector3, mixing: Array) -> Array:
     """Rotor thrusts of a segment at the places of `bases_at`, shape (4, places) [N]."""
     x = motion(coefficients, yaw, duration, bases)
     out = np.empty((4, x.shape[1]))
-    for k in range(x.shape[1]):
-        out[0, k], out[1, k], out[2, k], out[3, k] = thrusts_at(x, k, mass, J, mixing)
+    thrusts_along(x, mass, J, mixing, out)
     return out
 
 
@@ -169,64 +173,68 @@ def sampled(coefficients: Array, yaw: Array, durations: Array, low: float, high:
 
 
 @compiled
-def linear_bounds(thrusts: Array, row: Array, coefficients: Array, yaw: Array, durations: Array, low: float, high: float, mass: float,
-                  J: Vector3, mixing: Array) -> tuple[Indices, BoundArrays]:
+def _slopes(x: Array, mass: float, J: Vector3, mixing: Array, thrusts: Array) -> Array:
+    """Derivatives of the rotor thrusts with respect to specific force, jerk and snap, shape (9, 4, places)."""
+    out = np.empty((9, 4, x.shape[1]))
+    for e in range(9):
+        step = _STEPS[e // 3]
+        x[e] += step
+        thrusts_along(x, mass, J, mixing, out[e])
+        x[e] -= step
+        for q in range(4):
+            for k in range(x.shape[1]):
+                out[e, q, k] = (out[e, q, k] - thrusts[q, k]) / step
+    return out
+
+
+@compiled
+def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients: Array, yaw: Array, low: float, high: float, mass: float,
+               J: Vector3, mixing: Array) -> tuple[Indices, Rows]:
     """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:
+        program: fields of `ReducedProgram`.
         thrusts, row: of `sampled`; what lies beyond the limits between the places is made up for at the places.
-        coefficients, yaw, durations, mass, J, mixing: as for `sampled`.
+        coefficients, yaw, mass, J, mixing: as for `sampled`.
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        (keys, bounds): fields of `linear_bounds.Bounds`: for each rotor and place one bound on a sum of acceleration, jerk and
-        snap, and an ascending number of each that names segment, place and rotor. Terms of one derivative at one place stand
-        together.
+        (keys, rows): for each rotor and place near a limit an ascending number that names segment, place and rotor, and a row of w.
     """
-    near, keep = _NEAR * (high - low), _KEEP * (high - low)
+    durations, first, unit, spread, centre = program
+    near, keep, m = _NEAR * (high - low), _KEEP * (high - low), len(spread)
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
     below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
     chosen = (thrusts < low + near) | (thrusts > high - near)
     count = chosen.sum()
-    keys, owner = np.empty(count, np.int64), np.empty(3 * count, np.int64)
-    segments, orders = np.empty(3 * count, np.int64), np.empty(3 * count, np.int64)
-    places, direction = np.empty(3 * count), np.empty((3 * count, 3))
+    keys, rows = np.empty(count, np.int64), np.zeros((count, 3 * m))
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
-    r = t = 0
-    slopes = np.empty((4, 9))
+    r = 0
     for i in range(len(durations)):
         if not chosen[i].any():
             continue
         x = motion(coefficients[i], yaw[i], durations[i], _BASES)
+        slopes = _slopes(x, mass, J, mixing, thrusts[i])
+        values = np.dot(_FUNCTIONS_AT, whitened(program, i))
         for k in range(_COUNT):
-            if not (chosen[i, 0, k] or chosen[i, 1, k] or chosen[i, 2, k] or chosen[i, 3, k]):
-                continue
-            for e in range(9):
-                step, value = _STEPS[e // 3], x[e, k]
-                x[e, k] += step
-                moved = thrusts_at(x, k, mass, J, mixing)
-                x[e, k] = value
-                for q in range(4):
-                    slopes[q, e] = (moved[q] - thrusts[i, q, k]) / step
-            first = r
             for q in range(4):
                 if not chosen[i, q, k]:
                     continue
-                known = -thrusts[i, q, k] - GRAVITY * slopes[q, 2]  # the bound is on the acceleration
-                for e in range(9):
-                    known += slopes[q, e] * x[e, k]
+                known = -thrusts[i, q, k]
+                for n in range(3):
+                    at, part = n * _COUNT + k, durations[i] ** -(n + 2)
+                    for d in range(3):
+                        slope = slopes[3 * n + d, q, k]
+                        known += slope * (x[3 * n + d, k] - part * values[at, m + d])
+                        for c in range(m):
+                            rows[r, d * m + c] += slope * part * values[at, c]
+                    if n == 0:
+                        known -= slopes[2, q, k] * GRAVITY  # the program knows the acceleration
                 if thrusts[i, q, k] < low + near:
                     lower[r] = above + known
                 else:
                     upper[r] = below + known
                 keys[r] = (i * _COUNT + k) * 4 + q
                 r += 1
-            for order in range(3):
-                r = first
-                for q in range(4):
-                    if chosen[i, q, k]:
-                        owner[t], segments[t], places[t], orders[t] = r, i, _PLACES[k], order + 2
-                        for d in range(3):
-                            direction[t, d] = slopes[q, 3 * order + d]
-                        r, t = r + 1, t + 1
-    return keys, (owner, segments, places, orders, direction, lower, upper)
+    normalise(rows, lower, upper)
+    return keys, (rows, lower, upper)

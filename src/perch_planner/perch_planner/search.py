@@ -11,11 +11,9 @@ from perch_planner import refusals
 from perch_planner.contact_constraints import Contact
 from perch_planner.cutting import turning_side
 from perch_planner.judgement import Judgement, Question
-from perch_planner.linear_bounds import Bounds
 from perch_planner.plan_checks import BODY_RATE, HEIGHT, HOLDS, MAXIMUM, MINIMUM, SPEED
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
-from perch_planner.rotor_proof import prove_rotors
-from perch_planner.rotor_thrusts import linear_bounds, rotor_model, sampled
+from perch_planner.rotor_thrusts import rotor_model
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
     FINE, LAST_SEGMENT_MIN, allocate, lengthen_approach, split_finely, split_last, stretch_factor, with_last_segment)
@@ -86,8 +84,7 @@ class Search:
         self.question = Question(
             problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turning_side(self.end_yaw), self.low,
             self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _NEAR * self.high,
-            len(problem.waypoints))
-        self.rotors = rotor_model(vehicle)
+            len(problem.waypoints), *limits.rotor_thrust, rotor_model(vehicle))
         self.attempts: list[Attempt] = []
         self.acted = {"tangential_speed_max", "clearance_min"}
         """Settings whose limits had an influence on the search: those of rows that every program has, and those that plans left."""
@@ -111,7 +108,7 @@ class Search:
             return nothing
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
-        best, count, turning, duration = None, 0, False, float(durations.sum())
+        best, count, duration = None, 0, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= self._iterations_max:
                 break
@@ -120,29 +117,17 @@ class Search:
                 self._note(duration, np.nan, np.nan, count)
                 break
             self._note(duration, found.least, found.most, count)
+            if found.holds and found.kept:
+                return Outcome(durations, found.coefficients, yaw, found.results, True)
             self._remember(found)
             outcome = self._thrust(durations, found)
             if outcome and found.stretch:
                 return outcome
-            count += found.cuts
-            if found.checked:
-                low, high = self.limits.rotor_thrust
-                thrusts, row = sampled(found.coefficients, yaw, durations, low, high, *self.rotors)
-                kept = low <= row[0] and row[2] <= high
-                if kept and found.holds:
-                    kept, row[0], row[2] = prove_rotors(found.coefficients, yaw, durations, row[0], row[2], low, high, *self.rotors)
-                results, turning = np.vstack([found.results, [*row, kept]]), turning or not kept
-                if not kept:
-                    self.acted.add("rotor_margin")
-                if found.holds and kept:
-                    return Outcome(durations, found.coefficients, yaw, results, True)
-                if turning:
-                    keys, bounds = linear_bounds(thrusts, row, found.coefficients, yaw, durations, low, high, *self.rotors)
-                    program.replace(keys, Bounds(*bounds))
-                    count += len(keys)
-                outcome = outcome or Outcome(durations, found.coefficients, yaw, results)
+            count += found.cuts + found.near
+            if found.checked and not outcome:
+                outcome = Outcome(durations, found.coefficients, yaw, found.results)
             best = outcome
-            if not (found.cuts or turning):
+            if not (found.cuts or program.turning):
                 break
         # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
         return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or nothing
@@ -159,7 +144,7 @@ class Search:
 
     def _remember(self, found: Judgement) -> None:
         """Note which limits a plan leaves."""
-        left = {"thrust_min": found.least < self.low, "thrust_max": found.most > self.high}
+        left = {"thrust_min": found.least < self.low, "thrust_max": found.most > self.high, "rotor_margin": not found.kept}
         if found.checked:
             results, (floor, ceiling) = found.results, self.limits.height
             left |= {"speed_max": not results[SPEED, HOLDS], "body_rate_max": not results[BODY_RATE, HOLDS],

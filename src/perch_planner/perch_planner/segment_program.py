@@ -11,11 +11,12 @@ from perch_core.jit import compiled
 from perch_planner import solvers
 from perch_planner.contact_constraints import Contact, conditions
 from perch_planner.judgement import Judgement, Question, judge
-from perch_planner.linear_bounds import BoundArrays
+from perch_planner.plan_checks import ROTOR_THRUST
 from perch_planner.problem import PerchSettings
 from perch_planner.reduced_qp import ProgramArrays, assemble, coefficients
 from perch_planner.reduced_rows import Rows, rows_of, stacked
 from perch_planner.reference_element import GRAMS
+from perch_planner.rotor_thrusts import rotor_rows
 
 COST_ORDER = {"snap": 4, "jerk": 3}
 
@@ -30,20 +31,6 @@ def _prepare(durations: Array, velocity: Array, problem: tuple[Any, ...], everyw
 
 
 @compiled
-def _judged(program: ProgramArrays, rows: Rows, w: Array, yaw: Array, question: tuple[Any, ...], patient: bool, later: bool
-            ) -> tuple[tuple[Any, ...], Rows]:
-    """A solution's plan, what it is worth, and the rows with its cuts."""
-    plan = coefficients(program, w)
-    extrema, results, found, thrust, other = judge(plan, yaw, program[0], question, patient, later)
-    cuts = 0
-    for bounds in (thrust, other):
-        if len(bounds[-1]):
-            rows = stacked(rows, rows_of(program, bounds))
-            cuts += len(bounds[-1])
-    return (plan, extrema, results, *found, cuts), rows
-
-
-@compiled
 def _carried(keys: Indices, dual: Array, to: Indices) -> Array:
     """Multipliers of rows with ascending keys, for rows with other ascending keys; zero where there was none."""
     out, i = np.zeros(len(to)), 0
@@ -55,6 +42,37 @@ def _carried(keys: Indices, dual: Array, to: Indices) -> Array:
     return out
 
 
+@compiled
+def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: Array, yaw: Array, question: tuple[Any, ...], patient: bool,
+            later: bool, turning: bool) -> tuple[tuple[Any, ...], Rows, Indices, Array]:
+    """A solution's plan, what it is worth, and the next program.
+
+    Args:
+        program: fields of `ReducedProgram`.
+        rows: of the program that was solved; the last ones, one for each of `keys`, hold near its plan alone.
+        w, dual: its solution.
+        yaw, question, patient, later: as for `judgement.judge`.
+        turning: a rotor has left its range before.
+
+    Returns:
+        (fields of `Judgement`, rows and keys of the next program, multipliers where it may start).
+    """
+    plan = coefficients(program, w)
+    extrema, results, found, thrust, other, thrusts = judge(plan, yaw, program[0], question, patient, later)
+    fixed, cuts, kept = len(dual) - len(keys), 0, found[3]
+    always, near = (rows[0][:fixed], rows[1][:fixed], rows[2][:fixed]), (rows[0][fixed:], rows[1][fixed:], rows[2][fixed:])
+    for bounds in (thrust, other):
+        if len(bounds[-1]):
+            always = stacked(always, rows_of(program, bounds))
+            cuts += len(bounds[-1])
+    to, count = keys, 0
+    if len(thrusts) and (turning or not kept) and not (kept and found[4]):
+        to, near = rotor_rows(program, thrusts, results[ROTOR_THRUST], plan, yaw, question[-3], question[-2], *question[-1])
+        count = len(to)
+    start = np.concatenate((dual[:fixed], np.zeros(cuts), _carried(keys, dual[fixed:], to)))
+    return (plan, extrema, results, *found, cuts, count), stacked(always, near), to, start
+
+
 class SegmentProgram:
     """The reduced program (`reduced_qp`) of a perch with the durations of its segments [s], shape (f,), and its rows."""
 
@@ -63,33 +81,23 @@ class SegmentProgram:
         program, self._rows = _prepare(durations, contact.velocity, contact.problem, settings.objective == "jerk", GRAMS[cost_order],
                                        cost_order)
         self._program: ProgramArrays = (durations, *program)
-        self._local: Rows | None = None
-        self._keys: Indices = np.empty(0, np.int64)
-        self._dual: tuple[Array, Array] | None = None  # of the present rows, and of those that hold near the present plan
-
-    def replace(self, keys: Indices, bounds: BoundArrays) -> None:
-        """Set the bounds that hold near the present plan alone, instead of those set before; bounds of one key replace each other.
-
-        Args:
-            keys: ascending.
-            bounds: one for each key.
-        """
-        if self._dual is not None:
-            self._dual = self._dual[0], _carried(self._keys, self._dual[1], keys)
-        self._local, self._keys = rows_of(self._program, bounds), keys
+        self._keys: Indices = np.empty(0, np.int64)  # of rows that hold near the present plan alone
+        self._dual: Array | None = None
+        self.turning = False
+        """A rotor has left its range."""
 
     def judged(self, yaw: Array, patient: bool, later: bool) -> Judgement | None:
-        """Solve, judge the plan and add the cuts that were found; None where the program has no solution.
+        """Solve, judge the plan and add the bounds that were found; None where the program has no solution.
 
         Args:
             yaw, patient, later: as for `judgement.judge`.
         """
-        rows = self._rows if self._local is None else stacked(self._rows, self._local)
-        fixed = len(self._rows[1])
-        start = None if self._dual is None else np.concatenate((self._dual[0], np.zeros(fixed - len(self._dual[0])), self._dual[1]))
-        solution = solvers.least_norm(*rows, self._solver, start)
+        solution = solvers.least_norm(*self._rows, self._solver, self._dual)
         if not solution.solved:
             return None
-        self._dual = None if solution.dual is None else (solution.dual[:fixed], solution.dual[fixed:])
-        found, self._rows = _judged(self._program, self._rows, solution.w, yaw, self._question, patient, later)
-        return Judgement(*found)
+        dual = np.zeros(len(self._rows[1])) if solution.dual is None else solution.dual
+        fields, self._rows, self._keys, self._dual = _judged(self._program, self._rows, self._keys, solution.w, dual, yaw, self._question,
+                                                             patient, later, self.turning)
+        found = Judgement(*fields)
+        self.turning = self.turning or not found.kept
+        return found

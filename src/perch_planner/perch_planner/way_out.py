@@ -35,7 +35,7 @@ class _Hover(Contact):
         start = problem.start
         self.velocity, self.points = np.zeros(3), np.array([start.p, place])
         self.problem = (self.points, start.v, start.a, start.j, np.ones(3, np.int64), np.arange(1, 4), np.zeros((3, 3)), problem.surface.R_WS,
-                        self.velocity, settings.impact_acceleration, TUBE_SHARE, TUBE_FLOOR, 0.0, TUBE_STEP, -np.inf, np.inf, np.inf)
+                        self.velocity, settings.impact_acceleration, TUBE_SHARE, TUBE_FLOOR, 0.0, TUBE_STEP, 0.0, -np.inf, np.inf, np.inf)
 
 
 def hover_place(problem: PerchProblem, limits: Limits, duration: float) -> np.ndarray:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perch_control.admission import TrajectoryRefused
 from perch_control.allocation import mixing_columns
-from perch_control.geometric.rehearsal import flown, rehearsed
+from perch_control.geometric.contact_check import flown, miss
 from perch_control.geometric.step import control_step
-from perch_control.guidance import Running
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
-from perch_control.reference import Following
+from perch_control.reference import Following, Source
 from perch_control.rotor_lag import RotorEstimate
 from perch_core.vehicle import ControlGains, Vehicle
 
@@ -24,6 +24,8 @@ FEEDBACK_MAX = 8.0        # bound of the position feedback: what the weakest veh
 CONE_DEG = 40.0           # the feedback turns the thrust no further from the reference's: it cannot turn the vehicle over [deg]
 CONE_CONTACT_DEG = 5.0    # the same at a contact: at its thrust 10 cm of error would tilt the vehicle by 12 deg [deg]
 CONTACT_WINDOW = 0.3      # before the contact, over which the cone narrows to that: the thrust is low by then [s]
+CONTACT_MISS = 0.02       # a contact trajectory is refused where the law misses its end by more on the model [m]
+CONTACT_SPEED_MISS = 0.05  # the same for the velocity [m/s]
 THRUST_FLOOR = 0.8        # specific thrust below which a direction is noise [m/s^2]
 ACCELERATION_MAX = 250.0  # bound of the commanded angular acceleration: what the rotors of snapdragon.yaml can do [rad/s^2]
 FEEDBACK_RATE = 0.0       # share of the feedback's own derivative in the commanded rates: an estimated velocity is too noisy for it
@@ -95,32 +97,23 @@ class GeometricController(Law):
         """Fly a vehicle that differs from the one at the start in its thrust."""
         self.vehicle, self._vehicle = vehicle, packed_vehicle(vehicle)
 
-    def prepare(self, source, contact: bool, running: Running | None = None):
-        """The reference to follow for a trajectory: one that ends in contact is rehearsed and offset first.
+    def check_contact(self, source: Source) -> None:
+        """As `Law.check_contact`, by a flight on the model of the vehicle (`contact_check.py`)."""
+        distance, speed = miss(source, self)
+        if distance > CONTACT_MISS or speed > CONTACT_SPEED_MISS:
+            raise TrajectoryRefused(f"on its model the geometric law misses the contact by {100 * distance:.1f} cm and {speed:.2f} m/s: "
+                                    "the rotors cannot follow this plan; the NMPC (controller.type: nmpc) may fly it")
 
-        Args:
-            source: the trajectory.
-            contact: it ends in a contact.
-            running: reference from which it takes over; None: the vehicle is where the trajectory begins.
-        """
-        gains = self.gains
-        if not (contact and gains.contact_speed):
-            return source
-        return rehearsed(source, self.vehicle, self, gains.contact_speed, gains.contact_overshoot, running)
-
-    def rehearse(self, start: np.ndarray, rotors: RotorEstimate, table: np.ndarray, period: float,
-                 duration: float) -> np.ndarray:
+    def end_on_model(self, start: np.ndarray, rotors: RotorEstimate, table: np.ndarray) -> np.ndarray:
         """State in which this controller ends a contact trajectory on the nominal vehicle.
 
         Args:
             start: state at the beginning, shape (13,).
             rotors: rotors at the beginning.
-            table: setpoints `lead` ahead of each period, shape (n, 33).
-            period: control period [s].
-            duration: time from the beginning to the contact [s].
+            table: setpoints `lead` ahead of each period until the contact, shape (n, 33).
 
         Returns:
-            State at `duration`, shape (13,).
+            State at the contact, shape (13,).
         """
         return flown(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
-                     CONTACT_WINDOW, self.gains.lead, period, duration, self._vehicle)
+                     CONTACT_WINDOW, self.gains.lead, self.period, len(table) * self.period, self._vehicle)

@@ -236,8 +236,7 @@ class MissionMachine(ABC):
     def _lost(self, inputs: Inputs, outputs: Outputs) -> bool:
         """The controller fell back to recovery or descent while the mission was waiting in flight."""
         if inputs.controller is ControllerState.RECOVERING:
-            self._attempts_left = 1
-            self._missed(inputs, f"controller recovers: {inputs.controller_message}")
+            self._gave_up(inputs, f"controller recovers: {inputs.controller_message}")
             return True
         if inputs.controller in (ControllerState.LANDING, ControllerState.DISARMED):
             self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
@@ -252,9 +251,13 @@ class MissionMachine(ABC):
         """The controller hovers, but not where it was sent: it has recovered on the way."""
         if inputs.controller is not ControllerState.HOVERING or not self._moves.astray(inputs.time, inputs.state):
             return False
-        self._attempts_left = 1
-        self._missed(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
+        self._gave_up(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
         return True
+
+    def _gave_up(self, inputs: Inputs, why: str) -> None:
+        """The controller has left the way to the target: recover, without a further attempt."""
+        self._attempts_left = 1
+        self._missed(inputs, why)
 
     def _missed(self, inputs: Inputs, why: str) -> None:
         self._failure = why

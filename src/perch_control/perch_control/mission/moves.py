@@ -86,12 +86,15 @@ class Moves:
 
     def arrived(self, time: float, state: State) -> bool:
         """The last move has ended a while ago and the vehicle rests."""
-        return time > self.began + self.length + self.settings.settle_time and self.slow(state)
+        return self._over(time) and self.slow(state)
 
     def astray(self, time: float, state: State) -> bool:
         """The last move has ended a while ago, and the vehicle is elsewhere: a plan from the hover would begin too far away."""
-        return (time > self.began + self.length + self.settings.settle_time
-                and float(np.linalg.norm(state.p_WB - self.hover[0])) > START_GAP)
+        return self._over(time) and float(np.linalg.norm(state.p_WB - self.hover[0])) > START_GAP
+
+    def _over(self, time: float) -> bool:
+        """The last move has ended a while ago."""
+        return time > self.began + self.length + self.settings.settle_time
 
     def dwelt(self, time: float) -> bool:
         """The vehicle has looked around from here for long enough."""

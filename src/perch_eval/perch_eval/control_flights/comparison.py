@@ -72,10 +72,6 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
     assert wanted is not None
     during = (wanted.t >= begin) & (wanted.t <= min(end if maneuver == "perch" else np.inf, touched))
     times, p = wanted.t[during], wanted.p[during]
-    if maneuver == "perch":  # the controller's own reference differs from the plan by what its rehearsal adds
-        assert (plan := flight.plan) is not None
-        times = times[times >= plan.start_time]
-        p = np.array([plan.sample(t - plan.start_time).p for t in times])
     rmse = np.sqrt(np.mean((p - flown.known_states("ground_truth/odometry").at(times).p) ** 2, axis=0))
     return Compared(tuple(rmse.tolist()), _outcome(flight, maneuver))
 

@@ -1,4 +1,4 @@
-"""The rehearsal of a plan that continues a rehearsed one: replanning in flight must not cost what the rehearsal gained."""
+"""A plan that continues another in flight: the vehicle arrives as if there had been one plan only."""
 
 import numpy as np
 import pytest

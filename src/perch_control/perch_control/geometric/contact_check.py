@@ -1,0 +1,76 @@
+"""Whether the geometric law can fly a contact trajectory: its flight on the vehicle's model, compiled.
+
+A plan keeps the limits of the rotors' thrusts, and does not know their lag. Where b3 has to turn far and the thrust at the contact is
+low, as under an overhang, following the plan takes commands beyond the rotors' range: the law would end slower, faster or elsewhere
+than planned, in the same way each time. That is known before the flight.
+"""
+
+from __future__ import annotations
+
+from math import exp
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from perch_core.flatness import commanded_frame
+from perch_core.jit import compiled
+from perch_core.vector3 import quaternion_of
+from perch_core.vehicle import GRAVITY, Vehicle
+from perch_control.geometric.step import control_step, drag_compensation, predicted
+from perch_control.reference import Setpoint, Source, packed_many
+from perch_control.rotor_lag import RotorEstimate, approached, thrusts
+
+if TYPE_CHECKING:
+    from perch_control.geometric.controller import GeometricController
+
+SPAN = 1.5  # the last part of the trajectory is flown [s]
+
+
+@compiled
+def flown(start, speed, table, gains, limits, narrow, window, lead, period, duration, vehicle):
+    """State at the end of a flight of the geometric controller on the nominal vehicle; see `GeometricController.end_on_model`."""
+    state, command = start, speed
+    mass, J = vehicle[0][0], vehicle[0][1:4]
+    coefficient, _, _, tau = vehicle[1]
+    share = 1.0 if tau <= 0.0 else 1.0 - exp(-period / tau)
+    middle = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * period / tau)
+    none = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for k in range(table.shape[0]):
+        r = table[k]
+        reference = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12], r[13], r[14], r[15],
+                     r[16], r[17], r[18], r[19], r[20], r[21], r[22], r[23],
+                     r[24], r[25], r[26], r[27], r[28], r[29], r[30], r[31], r[32])
+        part = 1.0 if window <= 0.0 else min(max((duration - k * period - lead) / window, 0.0), 1.0)
+        cone = narrow + part * (limits[1] - narrow)
+        command = control_step(state, reference, speed, command, none, gains,
+                               (limits[0], cone, limits[2], limits[3], limits[4], limits[5]), lead, vehicle)[0]
+        f = thrusts(approached(speed, command, middle), coefficient)
+        felt = drag_compensation(state[6:10], state[3:6], vehicle[4], none)
+        state = predicted(state, f, felt, period, mass, J, vehicle[2])
+        speed = approached(speed, command, share)
+    return np.array(state)
+
+
+def miss(source: Source, controller: GeometricController) -> tuple[float, float]:
+    """By how much the law misses the end of a trajectory on the nominal vehicle, from its state `SPAN` before the end on.
+
+    Args:
+        source: the trajectory.
+        controller: the law, with its vehicle, gains and period.
+
+    Returns:
+        Distance from the planned end [m], and from its velocity [m/s].
+    """
+    T, period = source.duration, controller.period
+    n = int(min(SPAN, T) / period)
+    table = packed_many(source, T - n * period + np.arange(n) * period + controller.lead)
+    end, wanted = controller.end_on_model(*_on_reference(source.setpoint(T - n * period), controller.vehicle), table), source.setpoint(T)
+    return float(np.linalg.norm(end[0:3] - wanted.p)), float(np.linalg.norm(end[3:6] - wanted.v))
+
+
+def _on_reference(x: Setpoint, vehicle: Vehicle) -> tuple[np.ndarray, RotorEstimate]:
+    """State and rotors of a vehicle that is exactly on a setpoint."""
+    f = (x.a[0], x.a[1], x.a[2] + GRAVITY)
+    b1, b2, b3, w, _ = commanded_frame(f, x.j, x.s, x.h, x.dh, x.ddh)
+    speed = float(np.sqrt(vehicle.mass * np.linalg.norm(f) / 4.0 / vehicle.thrust_coefficient))
+    return np.array([*x.p, *x.v, *quaternion_of(b1, b2, b3), *w]), RotorEstimate((speed,) * 4, (speed,) * 4)
