@@ -169,7 +169,7 @@ def test_nees_on_exact_tracks_with_declared_noise():
 
     More draws, a wrong calibration and noises that are not as declared: `python tests/unit/simulated_tracks.py`.
     """
-    ends = [simulated_tracks.fly(name, seed, simulated_tracks.Setting()) for name in ("circle", "hand", "eight", "far") for seed in range(5)]
+    ends = [simulated_tracks.fly(name, seed, simulated_tracks.Setting(duration=4.0)) for name in ("circle", "hand", "eight", "far") for seed in range(5)]
     low, high = bounds(len(ends), 3)  # 0.59, 1.53
     for part, where in simulated_tracks.PARTS.items():
         assert low < np.mean([end.nees(where) for end in ends]) < high, part
