@@ -67,7 +67,7 @@ def run_tests(fast: bool, for_pytest: list[str]) -> int:
     if not fast and not for_pytest and PROCESSES > 2:
         print(f"{PROCESSES} processes share the tests; what the others print comes at the end", flush=True)
         share = Share(parts(test_files()), PROCESSES)
-        share.end(run_pytest(["-o", "console_output_style=classic"], share))
+        share.end(run_pytest(["-o", "console_output_style=classic"], share, Beforehand()))
     return run_pytest(["--ignore=tests/system", *for_pytest] if fast else for_pytest)
 
 
@@ -77,6 +77,16 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
 
     code = pytest.main(arguments, plugins)
     return {0: 0, 1: 1}.get(int(code), 2 if code == pytest.ExitCode.USAGE_ERROR else 1)
+
+
+class Beforehand:
+    """A plugin of pytest: the processes that fork scripts and nodes load their code while the tests are collected, on a core that is idle then."""
+
+    def pytest_sessionstart(self) -> None:
+        """The processes that share the tests share these, too."""
+        from system.forks import NODES, SCRIPTS, forks
+
+        forks(NODES), forks(SCRIPTS)
 
 
 class Share:

@@ -179,12 +179,15 @@ def in_effect(way: Way, original: Any, message: Any) -> bool:
     return before != after == now
 
 
+def plain_ways(message: Any) -> dict[str, Way]:
+    """What is wrong -> way, for each of the plainest ways in which a good message can be spoiled."""
+    return {f"{'.'.join(map(str, path))} is {word}": Way(path, how, new)
+            for path, kind, value in leaves(message) for word, how, new in _plain(kind, value)}
+
+
 def kinds(message: Any) -> Iterator[tuple[str, Any]]:
-    """(what is wrong, message) for each of the plainest ways in which a good message can be spoiled."""
-    for path, kind, value in leaves(message):
-        name = ".".join(map(str, path))
-        for word, how, new in _plain(kind, value):
-            yield f"{name} is {word}", spoilt(message, [Way(path, how, new)])
+    """(what is wrong, message) for each of the plainest ways."""
+    return ((wrong, spoilt(message, [way])) for wrong, way in plain_ways(message).items())
 
 
 def _plain(kind: str, value: Any) -> Iterator[tuple[str, str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import math
 from typing import Any
 
@@ -98,6 +99,7 @@ def _camera_info(frame: str) -> CameraInfo:
 
 
 def _image(frame: str) -> Image:
-    message = Image(height=HEIGHT, width=WIDTH, encoding="mono8", step=WIDTH, data=bytes(WIDTH * HEIGHT))
+    message = Image(height=HEIGHT, width=WIDTH, encoding="mono8", step=WIDTH)
+    message.data = array.array("B", bytes(WIDTH * HEIGHT))  # of bytes, ROS would check each
     message.header.frame_id = frame
     return message

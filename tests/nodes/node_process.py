@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,8 @@ from rcl_interfaces.srv import ListParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from system import forks
 
 PLAIN = Path(__file__).parent / "plain"
@@ -75,15 +78,25 @@ def nodes(names: Collection[str], folder: Path, namespaces: Mapping[str, str] | 
     assert not problems, "\n".join(problems)
 
 
-def wait_for(running: Collection[Running]) -> None:
-    """Wait until every node is in the graph with its services, which it offers when it works."""
+@contextmanager
+def watching() -> Iterator[tuple[Node, SingleThreadedExecutor]]:
+    """A node of this process beside those of the domain, and what runs its callbacks."""
     context = Context()
     rclpy.init(args=[], context=context)
     node = Node("watch", context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    missing = {one: node.create_client(ListParameters, f"{one.name}/list_parameters") for one in running}
     try:
+        yield node, executor
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def wait_for(running: Collection[Running]) -> None:
+    """Wait until every node is in the graph with its services, which it offers when it works."""
+    with watching() as (node, executor):
+        missing = {one: node.create_client(ListParameters, f"{one.name}/list_parameters") for one in running}
         for _ in range(round(PATIENCE / 0.05)):
             missing = {one: client for one, client in missing.items() if not client.service_is_ready()}
             if not missing:
@@ -92,9 +105,20 @@ def wait_for(running: Collection[Running]) -> None:
                 one.check()
             executor.spin_once(timeout_sec=0.05)
         raise AssertionError(f"{', '.join(one.name for one in missing)} did not come up")
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+
+
+def set_parameter(running: Collection[Running], name: str, value: object) -> None:
+    """Set a parameter of several nodes, each of which accepts it."""
+    with watching() as (node, executor):
+        clients = [AsyncParameterClient(node, one.name) for one in running]
+        for client in clients:
+            end = time.monotonic() + PATIENCE
+            while not client.services_are_ready():
+                assert time.monotonic() < end, "a node does not offer its parameters"
+                executor.spin_once(timeout_sec=0.02)
+            future = client.set_parameters([Parameter(name, value=value)])
+            executor.spin_until_future_complete(future, PATIENCE)
+            assert [result.successful for result in future.result().results] == [True]
 
 
 def plain(script: str, *arguments: str) -> dict:

@@ -11,7 +11,7 @@ import rclpy
 from nav_msgs.msg import Odometry
 from nodes.good import messages, requests
 from nodes.node_process import PATIENCE, Running, plain
-from nodes.spoiled import kinds
+from nodes.spoiled import kinds, plain_ways, spoilt
 from perch_core.ros import topics
 
 from rclpy.context import Context
@@ -111,9 +111,10 @@ class Stranger:
         stamp = self.stamp + PERIOD
         self._until(lambda: self._answered >= stamp or (self._go_on() and False), "a good sample is not answered")
 
-    def spoilt(self, topic: str) -> dict[str, object]:
-        """What is wrong -> message of the present that is wrong in that."""
-        return dict(kinds(messages(self.stamp + PERIOD // 2)[topic]))
+    def spoilt(self, topic: str, wrong: str) -> object:
+        """A message of the present that is wrong in something."""
+        message = messages(self.stamp + PERIOD // 2)[topic]
+        return spoilt(message, [plain_ways(message)[wrong]])
 
     def ask(self, kind, name: str, request):
         """The answer to a request."""
@@ -148,7 +149,7 @@ def test_what_is_wrong_is_said(stranger, graph):
         assert time.monotonic() < end, {topic: some[0] for topic, some in waiting.items()}
         for topic, some in waiting.items():
             begun.setdefault(topic, {name: len(graph[name].log) for name in some[0][1]})
-            stranger.publishers[topic].publish(stranger.spoilt(topic)[some[0][0]])
+            stranger.publishers[topic].publish(stranger.spoilt(topic, some[0][0]))
         stranger.go_on()
         time.sleep(AGAIN)
         for topic, some in list(waiting.items()):
@@ -162,7 +163,7 @@ def test_what_is_wrong_is_said(stranger, graph):
 
 def test_whatever_is_sent_every_node_goes_on(stranger, graph):
     for topic in stranger.topics:
-        for message in stranger.spoilt(topic).values():
+        for _, message in kinds(messages(stranger.stamp + PERIOD // 2)[topic]):
             stranger.publishers[topic].publish(message)
         stranger.go_on()
     seen = plain("states.py", "200", "200")
@@ -172,8 +173,8 @@ def test_whatever_is_sent_every_node_goes_on(stranger, graph):
 @pytest.mark.parametrize("name", ["plan_perch", "plan_powerline", "set_controller"])
 def test_every_request_is_answered(name, stranger, graph):
     kind, request = requests()[name]
-    for wrong, spoilt in kinds(request):
+    for wrong, message in kinds(request):
         if wrong.split()[-1] in ("nan", "zero", "empty", "huge", "nonsense", "largest"):
-            answer = stranger.ask(kind, name, spoilt)
+            answer = stranger.ask(kind, name, message)
             assert answer.success or (answer.error_code and answer.message), wrong
     assert stranger.ask(kind, name, request).success

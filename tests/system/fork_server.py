@@ -8,7 +8,9 @@ standard input, output and error, and one that receives `pid` and, when the scri
 
 from __future__ import annotations
 
+import gc
 import importlib
+import inspect
 import json
 import os
 import runpy
@@ -83,6 +85,8 @@ def become(arguments: list[str], environment: dict[str, str], files: list[int]) 
 if __name__ == "__main__":
     for name in sys.argv[2:]:
         importlib.import_module(name)
+    inspect.getmodule(inspect.currentframe())  # finds the files of all modules, once for all: the first line of a log asks for them
+    gc.collect(), gc.freeze()  # what is not looked through is not copied
     one = serve(socket.socket(fileno=int(sys.argv[1])))
     become(*one)
     runpy.run_path(sys.argv[0], run_name="__main__")

@@ -48,7 +48,7 @@ class Forks:
 
 @cache
 def forks(modules: Sequence[str]) -> Forks:
-    """One for each set of modules; it ends with this process."""
+    """One for each set of modules; it ends with this process, and with those that are forked from it and share it."""
     return Forks(modules)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rclpy
 from nodes.good import messages
-from nodes.spoiled import kinds
+from nodes.spoiled import plain_ways, spoilt
 from perch_core.ros import topics
 from perch_core.ros.node import StopSignal
 from rclpy.executors import SingleThreadedExecutor
@@ -38,8 +38,8 @@ class Stranger(Node):
         for topic, publisher in self._publishers.items():
             message = good.get(topic) or self._extra[topic].message()
             if self._rounds % 2 and topic in good:
-                wrong = list(kinds(message))
-                message = wrong[self._rounds // 2 % len(wrong)][1]
+                wrong = list(plain_ways(message).values())
+                message = spoilt(message, [wrong[self._rounds // 2 % len(wrong)]])
             publisher.publish(message)
         self._rounds += 1
 

@@ -17,6 +17,9 @@ from perch_eval.campaign.results import read_results
 HERE = Path(__file__).parent
 PATIENCE = 300.0  # only ever waited for in full when a test fails [s]
 
+COMMAND = "import sys; from perch_eval.campaign.command import main; sys.exit(main())"
+"""As `scripts/campaign.py`: the command is not the main module, which workers would load."""
+
 CAMPAIGN = """
 name: cheap
 scenario: surface_90
@@ -38,7 +41,7 @@ def campaign(tmp_path, monkeypatch):
     def command(engine: str, runs: int, *options: str) -> list[str]:
         file = tmp_path / "cheap.yaml"
         file.write_text(CAMPAIGN.format(runs=runs))
-        return [sys.executable, "-m", "perch_eval.campaign.command", str(file), "--engine", f"campaign_engines:{engine}",
+        return [sys.executable, "-c", COMMAND, str(file), "--engine", f"campaign_engines:{engine}",
                 "--jobs", "2", "--out", str(tmp_path / "out"), *options]
 
     return command

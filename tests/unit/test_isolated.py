@@ -75,18 +75,29 @@ def fail():
 """
 
 
-@pytest.fixture
-def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    (tmp_path / "isolated_jobs.py").write_text(JOBS)
-    monkeypatch.syspath_prepend(tmp_path)
-    import isolated_jobs
+@pytest.fixture(scope="module")
+def jobs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
+    folder = tmp_path_factory.mktemp("jobs")
+    (folder / "isolated_jobs.py").write_text(JOBS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        import isolated_jobs
 
-    yield isolated_jobs
-    del sys.modules["isolated_jobs"]
+        yield isolated_jobs
+        del sys.modules["isolated_jobs"]
 
 
 @pytest.fixture
 def runner(jobs: ModuleType) -> Iterator[IsolatedRunner]:
+    made = IsolatedRunner(partial(jobs.load, "kernels"))
+    assert made.wait_ready()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def lasting(jobs: ModuleType) -> Iterator[IsolatedRunner]:
+    """One for all tests after which it goes on."""
     made = IsolatedRunner(partial(jobs.load, "kernels"))
     assert made.wait_ready()
     yield made
@@ -116,16 +127,16 @@ def gone(pid: int) -> bool:
     return False
 
 
-def test_answers_come_from_a_child_that_has_what_was_preloaded_and_stays(runner: IsolatedRunner, jobs: ModuleType) -> None:
-    assert submit(runner, jobs.double, 21).result(120.0) == 42
-    first, second = (submit(runner, jobs.loaded).result(120.0) for _ in range(2))
+def test_answers_come_from_a_child_that_has_what_was_preloaded_and_stays(lasting: IsolatedRunner, jobs: ModuleType) -> None:
+    assert submit(lasting, jobs.double, 21).result(120.0) == 42
+    first, second = (submit(lasting, jobs.loaded).result(120.0) for _ in range(2))
     assert first == second and first[0] == ["kernels"]
-    assert os.getpid() not in first[1:] and first[2] == runner.pid
+    assert os.getpid() not in first[1:] and first[2] == lasting.pid
 
 
-def test_submit_returns_at_once_and_another_thread_tells_completion(runner: IsolatedRunner, jobs: ModuleType) -> None:
+def test_submit_returns_at_once_and_another_thread_tells_completion(lasting: IsolatedRunner, jobs: ModuleType) -> None:
     told, done = [], threading.Event()
-    stopped = submit(runner, jobs.hang, limit=0.3)
+    stopped = submit(lasting, jobs.hang, limit=0.3)
     assert not stopped.done()
     stopped.add_done_callback(lambda future: (told.append(threading.current_thread()), done.set()))
     assert done.wait(120.0) and told[0] is not threading.current_thread()
@@ -151,11 +162,11 @@ def test_jobs_may_come_while_the_runner_looks_through_those_that_wait(jobs: Modu
     runner.close()
 
 
-def test_a_job_is_stopped_at_its_limit_and_the_next_is_done(runner: IsolatedRunner, jobs: ModuleType) -> None:
+def test_a_job_is_stopped_at_its_limit_and_the_next_is_done(lasting: IsolatedRunner, jobs: ModuleType) -> None:
     for _ in range(3):
         with pytest.raises(JobStopped, match="hang: stopped after 0.2 s"):
-            submit(runner, jobs.hang, limit=0.2).result(120.0)
-        assert submit(runner, jobs.double, 1).result(120.0) == 2
+            submit(lasting, jobs.hang, limit=0.2).result(120.0)
+        assert submit(lasting, jobs.double, 1).result(120.0) == 2
 
 
 def test_a_limit_counts_from_the_submission_other_jobs_being_done_first(runner: IsolatedRunner, jobs: ModuleType) -> None:
@@ -170,12 +181,12 @@ def test_a_limit_counts_from_the_submission_other_jobs_being_done_first(runner: 
     ("unsendable", JobFailed, "cannot be sent"),
     ("fail", JobFailed, "IndexError: list index out of range"), ("refuse", PlanningRefusal, "too high"),
 ])
-def test_whatever_ends_a_job_is_a_typed_error_and_the_next_is_done(runner: IsolatedRunner, jobs: ModuleType, name: str, error: type,
+def test_whatever_ends_a_job_is_a_typed_error_and_the_next_is_done(lasting: IsolatedRunner, jobs: ModuleType, name: str, error: type,
                                                                    words: str) -> None:
     with pytest.raises(error, match=words) as raised:
-        submit(runner, getattr(jobs, name)).result(60)
+        submit(lasting, getattr(jobs, name)).result(60)
     assert isinstance(raised.value, PerchError)
-    assert submit(runner, jobs.double, 1).result(120.0) == 2
+    assert submit(lasting, jobs.double, 1).result(120.0) == 2
 
 
 def test_the_memory_of_a_job_is_bounded(jobs: ModuleType) -> None:
@@ -188,9 +199,9 @@ def test_the_memory_of_a_job_is_bounded(jobs: ModuleType) -> None:
         runner.close()
 
 
-def test_a_job_that_cannot_be_sent_says_so(runner: IsolatedRunner) -> None:
+def test_a_job_that_cannot_be_sent_says_so(lasting: IsolatedRunner) -> None:
     with pytest.raises(JobFailed, match="cannot be sent"):
-        submit(runner, lambda: 0).result(120.0)
+        submit(lasting, lambda: 0).result(120.0)
 
 
 def test_errors_with_several_arguments_survive_the_way() -> None:
@@ -242,8 +253,8 @@ def test_what_cannot_be_loaded_is_told(jobs: ModuleType) -> None:
         runner.close()
 
 
-def test_the_processes_end_with_a_caller_that_is_killed(tmp_path: Path, jobs: ModuleType) -> None:
-    caller = tmp_path / "caller.py"
+def test_the_processes_end_with_a_caller_that_is_killed(jobs: ModuleType) -> None:
+    caller = Path(str(jobs.__file__)).with_name("caller.py")
     caller.write_text("""
 import os, signal, isolated_jobs
 from perch_core.component import Job
@@ -260,9 +271,9 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert gone(int(ended.stdout))
 
 
-def test_ctrl_c_in_the_terminal_does_not_reach_the_processes(runner: IsolatedRunner, jobs: ModuleType) -> None:
-    assert os.getpgid(runner.pid) == runner.pid != os.getpgid(0)
-    child = submit(runner, jobs.loaded).result(120.0)[1]
-    for pid in (runner.pid, child):
+def test_ctrl_c_in_the_terminal_does_not_reach_the_processes(lasting: IsolatedRunner, jobs: ModuleType) -> None:
+    assert os.getpgid(lasting.pid) == lasting.pid != os.getpgid(0)
+    child = submit(lasting, jobs.loaded).result(120.0)[1]
+    for pid in (lasting.pid, child):
         os.kill(pid, signal.SIGINT)
-    assert submit(runner, jobs.loaded).result(120.0)[1] == child
+    assert submit(lasting, jobs.loaded).result(120.0)[1] == child

@@ -111,7 +111,7 @@ def test_history_interpolates_a_turning_climb():
 def test_gusts_have_the_strength_asked_for_and_drydens_memory():
     step, sigma = 0.05, 1.5
     field = WindField(Wind(steady=(0.0, 4.0, 0.0), gust_sigma=sigma), step, seeding.stream(1, "wind"))
-    gusts = np.array([field.next() for _ in range(200_000)]) - [0.0, 4.0, 0.0]
+    gusts = np.array([field.next() for _ in range(100_000)]) - [0.0, 4.0, 0.0]
     np.testing.assert_allclose(gusts.std(axis=0), sigma, rtol=0.05)
     # along the wind (y): exp(-V t / L); across (x): (1 - V t / 2L) exp(-V t / L), with L = 5 m
     lag = 10

@@ -34,7 +34,7 @@ class SimulatedTracks:
         face = rng.integers(0, 6, 3000)
         self.points[np.arange(3000), face // 2] = np.where(face % 2, high[face // 2], low[face // 2])
         self.active, self.next = {}, 0
-        self.slide, self.walked = None, {}  # settings of the walk; point -> (its walk [px], bearing and distance last)
+        self.slide, self.walked = None, np.full((3000, 6), np.nan)  # settings of the walk; of each point its walk [px], bearing and distance last
 
     def __call__(self, p_WB, R_WB, R_BC):
         X_C = ((self.points - p_WB) @ R_WB - MOUNT.p_BC) @ R_BC
@@ -51,13 +51,15 @@ class SimulatedTracks:
         return np.array(list(self.active.values()), int), pixels[where] + off
 
     def _walk(self, where, X_C):
-        d, before = np.linalg.norm(X_C, axis=1), self.walked
-        self.walked = {}
-        for w, u, length in zip(where.tolist(), X_C / d[:, None], d):
-            off, u_0, d_0 = before.get(w, (np.zeros(2), u, length))
-            q = self.slide.slide_turn**2 * np.arccos(np.clip(u @ u_0, -1, 1)) + self.slide.slide_zoom**2 * abs(np.log(length / d_0))
-            self.walked[w] = off + self.rng.normal(0, np.sqrt(q), 2), u, length
-        return np.array([self.walked[w][0] for w in where.tolist()]).reshape(-1, 2)
+        d, walked = np.linalg.norm(X_C, axis=1), self.walked
+        now = np.concatenate([np.zeros((len(where), 2)), X_C / d[:, None], d[:, None]], axis=1)
+        before = np.where(np.isnan(walked[where]), now, walked[where])
+        turn = np.arccos(np.clip(np.sum(now[:, 2:5] * before[:, 2:5], axis=1), -1, 1))
+        q = self.slide.slide_turn**2 * turn + self.slide.slide_zoom**2 * abs(np.log(d / before[:, 5]))
+        now[:, :2] = before[:, :2] + self.rng.normal(size=(len(where), 2)) * np.sqrt(q)[:, None]
+        walked[:] = np.nan
+        walked[where] = now
+        return now[:, :2]
 
 
 @dataclasses.dataclass
@@ -169,7 +171,7 @@ def test_nees_on_exact_tracks_with_declared_noise():
 
     More draws, a wrong calibration and noises that are not as declared: `python tests/unit/simulated_tracks.py`.
     """
-    ends = [simulated_tracks.fly(name, seed, simulated_tracks.Setting()) for name in ("circle", "hand", "eight", "far") for seed in range(5)]
+    ends = [simulated_tracks.fly(name, seed, simulated_tracks.Setting(duration=4.0)) for name in ("circle", "hand", "eight", "far") for seed in range(5)]
     low, high = bounds(len(ends), 3)  # 0.59, 1.53
     for part, where in simulated_tracks.PARTS.items():
         assert low < np.mean([end.nees(where) for end in ends]) < high, part

@@ -77,7 +77,7 @@ class Flown:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", [100.0, 200.0, 400.0, 1000.0])
+@pytest.mark.parametrize("rate", [100.0, 400.0, 1000.0])
 @pytest.mark.parametrize("begin", [0.0, 1.9], ids=["at rest", "in motion"])
 def test_large_biases_are_found(rate, begin):
     flown = Flown(rate, begin)

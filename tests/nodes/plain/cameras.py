@@ -1,6 +1,7 @@
 """A camera over a textured floor and one at a board of four AprilTags, both at rest, from plain publishers: nothing of perch is
 imported. `cameras.py raw|compressed` prints what came back as JSON. Nobody but the nodes themselves says where the vehicle is."""
 
+import array
 import json
 import sys
 import time
@@ -65,9 +66,9 @@ class Cameras(Node):
     def show(self, name: str, now) -> None:
         pixels, (images, infos) = self.images[name], self.cameras[name]
         if self.compressed:
-            image = CompressedImage(format="png", data=cv2.imencode(".png", pixels)[1].tobytes())
+            image = CompressedImage(format="png", data=array.array("B", cv2.imencode(".png", pixels)[1].tobytes()))
         else:
-            image = Image(height=HEIGHT, width=WIDTH, encoding="8UC1", step=WIDTH, data=pixels.tobytes())
+            image = Image(height=HEIGHT, width=WIDTH, encoding="8UC1", step=WIDTH, data=array.array("B", pixels.tobytes()))  # of bytes, ROS would check each
         info = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5)
         info.k = np.array([FOCAL, 0.0, WIDTH / 2 - 0.5, 0.0, FOCAL, HEIGHT / 2 - 0.5, 0.0, 0.0, 1.0])
         image.header.stamp = info.header.stamp = now

@@ -3,6 +3,7 @@
 The camera is that of config/vehicles/rpg.yaml: 9 cm below the centre, looking ahead; the wire is level, across, 4 m ahead, at 1.5 m.
 """
 
+import array
 import json
 import time
 
@@ -54,7 +55,7 @@ class Climb(Node):
         pixels = np.full((HEIGHT, WIDTH, 3), 120.0)
         pixels += covered[:, None, None] * (np.array([200.0, 30.0, 30.0]) - 120.0)
         image = Image(height=HEIGHT, width=WIDTH, encoding="rgb8", step=3 * WIDTH)
-        image.data = cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.uint8).tobytes()
+        image.data = array.array("B", cv2.GaussianBlur(pixels, (0, 0), 0.8).astype(np.uint8).tobytes())  # of bytes, ROS would check each
         info = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5)
         info.k = np.array([FOCAL, 0.0, WIDTH / 2, 0.0, FOCAL, HEIGHT / 2, 0.0, 0.0, 1.0])
         image.header.stamp = info.header.stamp = stamp
