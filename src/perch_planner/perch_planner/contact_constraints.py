@@ -80,7 +80,7 @@ def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Ar
 def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
     """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]
 
-    Those of the octagon hold after a change of the velocity by `later` [m/s], shape (3,): for a contact that comes late.
+    They hold after a change of the velocity by `later` [m/s], shape (3,): for a contact that comes late.
     """
     count = 1 + len(_OCTAGON)
     directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
@@ -91,7 +91,7 @@ def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: floa
                 directions[k, d] = -R_WS[d, 2]
             else:
                 directions[k, d] = _OCTAGON[k - 1, 0] * R_WS[d, 0] + _OCTAGON[k - 1, 1] * R_WS[d, 1]
-            shift += directions[k, d] * (velocity[d] - (later[d] if k > 0 else 0.0))
+            shift += directions[k, d] * (velocity[d] - later[d])
         lower[k] = shift + (least if k == 0 else -tangential)
         upper[k] = shift + (most if k == 0 else tangential)
     return directions, lower, upper

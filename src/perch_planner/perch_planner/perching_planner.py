@@ -159,7 +159,7 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: 
 
     A surface that faces up is fallen onto, and what falls through the whole tube with g s3_z - alpha has risen from below the surface
     before, unless alpha leaves so much that v_n is not yet reversed at the tube's beginning. Where nobody asks for another, half of
-    v_min is left there: alpha >= g s3_z - v_min / 2 t_k.
+    v_min is left there: alpha >= g s3_z - v_min / 2 (t_k + contact_delay).
 
     Raises:
         ConfigError: an option is out of its range.
@@ -173,7 +173,7 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: 
         changes["minimum_time"] = True
     if "impact_acceleration" not in changes and settings.tube_time > 0.0:
         slowest = changes.get("impact_speed_min", settings.impact_speed_min)
-        shed = 0.5 * slowest / settings.tube_time
+        shed = 0.5 * slowest / (settings.tube_time + settings.contact_delay)
         changes["impact_acceleration"] = max(settings.impact_acceleration, GRAVITY * float(surface.normal[2]) - shed)
     try:
         return config.replace(settings, **changes) if changes else settings
