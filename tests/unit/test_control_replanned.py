@@ -31,7 +31,7 @@ def arrival(plan, replans):
     for number, time in enumerate(replans):
         loop.run(start + time - 0.04 - loop.time)
         loop.follow(rest_of(plan.trajectory, time), AtEnd.CONTACT, id=3 + number)
-    loop.run(plan.trajectory.duration, until=lambda x: (x.plant.p - plan.contact) @ plan.normal <= 0)
+    loop.run(plan.trajectory.duration + 0.3, until=lambda x: (x.plant.p - plan.contact) @ plan.normal <= 0)
     v, n = loop.plant.v, plan.normal
     velocity = np.diff(np.array(loop.references), axis=0) / 0.002
     return -v @ n, np.linalg.norm(v - (v @ n) * n), np.abs(np.diff(velocity, axis=0)).max()

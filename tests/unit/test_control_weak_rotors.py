@@ -129,7 +129,7 @@ def test_weak_rotors_hover_on_what_is_left():
     assert loop.controller.flown.vehicle is loop.controller.vehicle is loop.controller.law.vehicle
 
 
-@pytest.mark.parametrize("before, state", [(0.45, State.LANDING), (0.25, State.TRACKING)])
+@pytest.mark.parametrize("before, state", [(0.45, State.LANDING), (0.2, State.TRACKING)])
 def test_weak_rotors_give_a_perch_up_until_the_vehicle_has_turned_to_the_wall(before, state):
     """Weak rotors do not recover from a missed contact; but a perch asks for a third of the weight at its end, and is flown to it."""
     plan = perch("surface_90_1.7m")
