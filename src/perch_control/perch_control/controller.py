@@ -66,7 +66,6 @@ class Controller(Component[ControllerParameters]):
         """
         super().__init__(config)
         vehicle = load_vehicle(config.vehicle)
-        self._takes_rates = vehicle.actuation.type == "rates_and_thrust"
         commands: dict[str, Emitter[Any]] = {"rotor_speeds": self.motor_command, "rates_and_thrust": self.rates_thrust,
                                              "attitude_and_thrust": self.attitude_thrust}
         self._to_vehicle = commands[vehicle.actuation.type]
@@ -87,7 +86,7 @@ class Controller(Component[ControllerParameters]):
 
     def warm_up(self) -> None:
         """Load the compiled code, and build the laws that take long."""
-        _rehearse(self.config)
+        _dry_run_once(self.config)
         if self.config.controller.standby:
             self._assembly.prepare_slow_laws(self.work, self.warn)
 
@@ -241,7 +240,7 @@ class Controller(Component[ControllerParameters]):
         loop = result.loop
         if loop is None:
             self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
-        elif self._takes_rates:
+        elif self._to_vehicle is self.rates_thrust:
             self.rates_thrust(RatesThrust(stamp, result.armed, loop.w_B, loop.thrust))
         else:
             self.attitude_thrust(AttitudeThrust(stamp, result.armed, loop.q_WB, loop.w_B, loop.thrust))
@@ -291,7 +290,7 @@ class Controller(Component[ControllerParameters]):
 
 
 @lru_cache(maxsize=4)
-def _rehearse(params: ControllerParameters) -> None:
+def _dry_run_once(params: ControllerParameters) -> None:
     """`dry_run`, once in a process: it loads what all controllers share."""
     vehicle = load_vehicle(params.vehicle)
     dry_run(vehicle, params.gain_set, params.flight)

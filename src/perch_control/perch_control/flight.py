@@ -169,9 +169,9 @@ class FlightController:
             raise TrajectoryRefused(f"the thrust margin in hover is {x.spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
         check_joints(order.source.trajectory)
         check_start(order, x.now, x.expected(max(order.start, x.now)))
-        if order.at_end is AtEnd.CONTACT and x.mode is State.HOVERING and self.compensator is not None:
-            x = self.flown = self._thrust.adopted(x, self.law, self.compensator)
         if order.at_end is AtEnd.CONTACT:
+            if x.mode is State.HOVERING and self.compensator is not None:
+                x = self.flown = self._thrust.adopted(x, self.law, self.compensator)
             self.law.check_contact(order.source)
         self._schedule.put(order)
 

@@ -158,6 +158,14 @@ def yaw_of(R_WB: Array) -> Array:
     return np.arctan2(-R_WB[..., 0, 1], R_WB[..., 1, 1])
 
 
+def nearest(A: Array) -> Array:
+    """The rotation next to a matrix, (3, 3), in the Frobenius norm: of a mean of rotations their chordal mean, of sum(a b^T) the R that
+    turns all b best into their a (Kabsch 1976)."""
+    U, _, Vt = np.linalg.svd(A)
+    R: Array = U * (1.0, 1.0, np.sign(np.linalg.det(U @ Vt))) @ Vt
+    return R
+
+
 def angle_between(a: Array, b: Array) -> Array:
     """Angle between vectors, accurate near 0 and pi, shapes (..., 3) -> (...) [rad]."""
     a, b = np.asarray(a, float), np.asarray(b, float)

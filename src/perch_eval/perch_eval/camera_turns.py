@@ -20,8 +20,7 @@ def rotation_between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     keep = np.ones(len(before), bool)
     R = np.eye(3)
     for _ in range(ROUNDS):
-        U, _, Vt = np.linalg.svd(before[keep].T @ after[keep])
-        R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        R = so3.nearest(before[keep].T @ after[keep])
         off = np.linalg.norm(before - after @ R.T, axis=1)
         keep = off <= 2.0 * np.median(off) + 1e-9
     return R

@@ -27,20 +27,20 @@ SPAN = 1.5  # the last part of the trajectory is flown [s]
 
 
 @compiled
-def flown(start, speed, table, gains, limits, narrow, window, lead, period, duration, vehicle):
+def flown(start, speed, table, gains, limits, narrow, window, lead, period, vehicle):
     """State at the end of a flight of the geometric controller on the nominal vehicle; see `GeometricController.end_on_model`."""
     state, command = start, speed
-    mass, J = vehicle[0][0], vehicle[0][1:4]
+    duration, mass, J = len(table) * period, vehicle[0][0], vehicle[0][1:4]
     coefficient, _, _, tau = vehicle[1]
     share = 1.0 if tau <= 0.0 else 1.0 - exp(-period / tau)
     middle = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * period / tau)
     none = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    for k in range(table.shape[0]):
+    for k in range(len(table)):
         r = table[k]
         reference = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12], r[13], r[14], r[15],
                      r[16], r[17], r[18], r[19], r[20], r[21], r[22], r[23],
                      r[24], r[25], r[26], r[27], r[28], r[29], r[30], r[31], r[32])
-        part = 1.0 if window <= 0.0 else min(max((duration - k * period - lead) / window, 0.0), 1.0)
+        part = min(max((duration - k * period - lead) / window, 0.0), 1.0)
         cone = narrow + part * (limits[1] - narrow)
         command = control_step(state, reference, speed, command, none, gains,
                                (limits[0], cone, limits[2], limits[3], limits[4], limits[5]), lead, vehicle)[0]

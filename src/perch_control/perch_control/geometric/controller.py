@@ -116,4 +116,4 @@ class GeometricController(Law):
             State at the contact, shape (13,).
         """
         return flown(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
-                     CONTACT_WINDOW, self.gains.lead, self.period, len(table) * self.period, self._vehicle)
+                     CONTACT_WINDOW, self.gains.lead, self.period, self._vehicle)

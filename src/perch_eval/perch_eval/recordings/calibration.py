@@ -185,6 +185,5 @@ def _transform(source: str, key: str, value: Any) -> np.ndarray:
     if not np.isfinite(T).all() or np.abs(R @ R.T
                                           - np.eye(3)).max() > RIGID or np.linalg.det(R) < 0.0 or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ConfigError(source, key, f"{np.round(T, 4).tolist()} is no rigid transform")
-    u, _, vt = np.linalg.svd(R)
-    T[:3, :3] = u @ vt
+    T[:3, :3] = so3.nearest(R)
     return T
