@@ -64,7 +64,7 @@ def test_what_is_recorded_is_read_back_value_by_value(tmp_path):
     recording.fly(range(100))
     order = TrajectoryOrder.of(3, rest_to_rest([0, 0, 1.0], [1.0, 0, 1.0], 0.0, 0.0, 2.0, start_time=7.5))
     recording.give("trajectory", order)
-    recording.give("controller/status", ControllerStatus(100 * STEP, 3, "geometric", 3, 0.1, 2.0, 0.01, 0.0, 0.5, "tracking"))
+    recording.give("controller/status", ControllerStatus(100 * STEP, 3, "geometric", 3, 0.1, 2.0, 0.01, 0.0, 0.5, 1.0, "tracking"))
     recording.recorder.close()
     flight = RecordedFlight(recording.path)
     assert flight.topics == ["controller/status", "motor_command", "odometry", "trajectory"] and flight.damage == ""

@@ -63,7 +63,7 @@ def flown():
         "trajectory": [TrajectoryOrder(1, PATH, AtEnd.CONTACT, 0.25)],
         "contact": [Contact(1_100_000_000, 0, "ground", 0.0, 0.0, 0.0, 0.0, ""), Contact(3_400_000_000, 1, "pad", 0.7, 0.1, 0.02, 0.03, "")],
         "controller/command": [ControllerCommand(1_000_000_000, 1, "take-off")],
-        "controller/status": [ControllerStatus(k * STEP, 3, "geometric", 1, 0.0, 2.0, 0.0, 0.0, 0.5, "tracking") for k in STEPS[::10]],
+        "controller/status": [ControllerStatus(k * STEP, 3, "geometric", 1, 0.0, 2.0, 0.0, 0.0, 0.5, 1.0, "tracking") for k in STEPS[::10]],
         "estimator/status": [EstimatorHealth(k * STEP, 1, 0.02, k, 0, 3.0, (0.0,) * 3, (0.0,) * 3, 0.01, 0.01, "") for k in STEPS[::50]],
         "camera_front/image_raw/compressed": [CompressedPixels(k * STEP, "camera_front_optical_frame", "jpeg", packed) for k in STEPS[::100]],
     }

@@ -131,7 +131,7 @@ def test_a_client_sees_topics_with_their_definitions_scene_and_time(show):
     order = TrajectoryOrder.of(3, rest_to_rest([0, 0, 1.0], [1.0, 0, 1.0], 0.0, 0.0, 2.0), AtEnd.CONTACT)
     show.give("trajectory", order)
     show.give("target/pose", TargetPose(0, np.array([1.7, 0.0, 1.2]), np.array([0.0, -0.70710678, 0.0, 0.70710678]), ZERO))
-    show.give("controller/status", ControllerStatus(0, 3, "geometric", 3, 0.0, 2.0, 0.0, 0.0, 0.5, "tracking trajectory 3"))
+    show.give("controller/status", ControllerStatus(0, 3, "geometric", 3, 0.0, 2.0, 0.0, 0.0, 0.5, 1.0, "tracking trajectory 3"))
     wanted = {"room", "surface", "pad", "vehicle", "camera_axis", "status", "truth", "plan", "flown", "target"}
     show.until(lambda: wanted <= set(show.markers()) and show.markers()["flown"][0].points, "the scene", show.odometry)
     client.subscribe("/trajectory")  # after it was sent

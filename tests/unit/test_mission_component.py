@@ -49,7 +49,7 @@ class World:
         self.period, self.stamp, self.clock, self.planner = period, 5 * NANOSECONDS, 900 * NANOSECONDS, planner or self.plan
         self.p, self.q, self.state, self.id = np.zeros(3), LEVEL, ControllerState.DISARMED, 0
         self.flown = self.contact = None
-        self.covariance = NONE
+        self.covariance, self.thrust_ratio = NONE, 1.0
         self.requests, self.orders, self.commands, self.lines, self.sees, self.odometry = [], [], [], [], True, True
         self.mission.trajectory.receivers.append(self.fly)
         self.mission.recovery.receivers.append(self.orders.append)
@@ -86,7 +86,7 @@ class World:
             self.mission.on_imu(ImuSample(stamp, (0.0,) * 3, force))
             if self.odometry:
                 self.mission.on_odometry(OdometryState(stamp, tuple(map(float, self.p)), self.q, (0.0,) * 3, (0.0,) * 3, self.covariance, NONE))
-        self.mission.on_status(ControllerStatus(self.stamp, int(self.state), "geometric", self.id, 0.0, 0.0, 0.0, 0.0, 1.0, "says so"))
+        self.mission.on_status(ControllerStatus(self.stamp, int(self.state), "geometric", self.id, 0.0, 0.0, 0.0, 0.0, 1.0, self.thrust_ratio, "says so"))
         self.mission.on_estimator(EstimatorHealth(self.stamp, 1, 0.0, 1, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""))
         if self.sees:
             self.mission.on_target(TargetPose(self.stamp - 30_000_000, SURFACE.p_WS, Q_PERCH, 1e-4 * np.eye(6)))
@@ -148,6 +148,14 @@ def test_an_answer_counts_from_its_due_time_on():
     world.run(until=lambda w: len(w.orders) > orders)
     assert world.stamp - TICK == due, "the answer was there at once"
     assert seconds(request.start) == world.orders[-1].trajectory.start_time
+
+
+@pytest.mark.parametrize(("told", "asked"), [(0.83, 0.83), (0.0, None)])
+def test_a_plan_is_asked_for_with_the_thrust_that_the_controller_has_found(told, asked):
+    world = World()
+    world.thrust_ratio = told
+    world.send().run(until=lambda w: w.requests)
+    assert world.requests[0][0].thrust_ratio == asked
 
 
 def test_a_late_answer_is_used_when_it_comes():
@@ -305,8 +313,8 @@ def test_foreign_odometry_imu_and_states_are_ignored(odometry):
         if world.stamp > 6 * NANOSECONDS:
             world.mission.on_odometry(state._replace(**odometry))
             world.mission.on_imu(ImuSample(world.stamp, (0.0,) * 3, (NAN, 0.0, 0.0)))
-            world.mission.on_status(ControllerStatus(0, 6, "", 0, NAN, NAN, NAN, NAN, NAN, "failed long ago"))
-            world.mission.on_status(ControllerStatus(world.stamp, 200, "", 0, NAN, NAN, NAN, NAN, NAN, "no state"))
+            world.mission.on_status(ControllerStatus(0, 6, "", 0, NAN, NAN, NAN, NAN, NAN, NAN, "failed long ago"))
+            world.mission.on_status(ControllerStatus(world.stamp, 200, "", 0, NAN, NAN, NAN, NAN, NAN, NAN, "no state"))
             world.mission.on_estimator(EstimatorHealth(0, 3, NAN, 0, 0, NAN, (NAN,) * 3, (NAN,) * 3, NAN, NAN, ""))
         world.tick()
     assert world.goal.ending == "succeeded" and ("ignored" in world.said or "odometry: " in world.said)
@@ -318,7 +326,7 @@ def test_states_that_were_overtaken_do_not_undo_the_newer_ones_and_one_of_the_fu
         def tick(self):
             super().tick()
             if self.phase in ("verifying", "perched"):
-                self.mission.on_status(ControllerStatus(self.stamp - TICK - older, int(ControllerState.TRACKING), "", 1, 0.0, 0.0, 0.0, 0.0, 1.0, "old"))
+                self.mission.on_status(ControllerStatus(self.stamp - TICK - older, int(ControllerState.TRACKING), "", 1, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, "old"))
                 self.mission.on_estimator(EstimatorHealth(self.stamp - TICK - older, 2, 9.0, 1, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""))
 
     world = Reordered().send().run()

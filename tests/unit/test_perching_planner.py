@@ -85,6 +85,13 @@ def test_options_of_a_request_replace_the_parameters(ask: Asked) -> None:
     assert ask(request(minimum_time=True)).trajectory.duration < free.trajectory.duration
 
 
+def test_rotors_that_give_less_are_planned_for(ask: Asked) -> None:
+    whole, weaker = ({c.quantity: c for c in ask(request(thrust_ratio=ratio)).certificates} for ratio in (None, 0.83))
+    for quantity in ("thrust", "rotor_thrust"):
+        assert weaker[quantity].upper_limit == pytest.approx(0.83 * whole[quantity].upper_limit) and weaker[quantity].holds
+    assert weaker["rotor_thrust"].maximum <= weaker["rotor_thrust"].upper_limit < whole["rotor_thrust"].maximum
+
+
 @pytest.mark.parametrize("inclination", [0.0, 15.0, 30.0, 45.0, 60.0, 90.0])
 def test_a_surface_that_faces_up_is_met_from_above(ask: Asked, inclination: float) -> None:
     """The plate does not pass through the surface on its way to it."""
@@ -147,6 +154,7 @@ NONSENSE = [
     ({"segment_times": (300.0,)}, X, "duration_max 20 s"), ({"p": np.array([-1000.0, 0.0, 1.4])}, X, "duration_max 20 s"),
     ({"impact_acceleration": -1.0}, B, "impact_acceleration"), ({"impact_acceleration": math.inf}, B, "impact_acceleration"),
     ({"impact_speed_min": 2.0}, B, "impact_speed"), ({"thrust_max": 1e308}, B, "thrust_max"), ({"thrust_min": 900.0}, B, "empty"),
+    ({"thrust_ratio": 0.2}, B, "cannot lift"), ({"thrust_ratio": -1.0}, B, "thrust_ratio"), ({"thrust_ratio": NAN}, B, "thrust_ratio"),
     ({"objective": 2}, B, "objective"), ({"objective": 9}, B, "objective"), ({"start": -1}, B, "start"), ({"start": 10**30}, B, "start"),
     ({"current": FlatTrajectory(np.array([2.0]), np.full((1, 4, 100), 1.0), 12.0)}, B, "degree: 99"),
     ({"current": FlatTrajectory(np.full(200, 0.1), np.ones((200, 4, 6)), 12.0)}, B, "200 entries"),

@@ -129,7 +129,7 @@ class Graph:
 
     def order(self, order, state):
         self.orders.append(order)
-        status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, "said")
+        status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, "said")
         return Order(status, 0.1, state == command.State.ARMED and self.obeys)
 
     def await_end_of_commands(self, patience):

@@ -274,7 +274,7 @@ class Controller(Component[ControllerParameters]):
             stamp=stamp, state=int(flight.state), controller=flight.law_name, trajectory_id=x.trajectory_id,
             trajectory_time=float(flight.trajectory_time), trajectory_duration=float(x.order.source.duration) if x.order else 0.0,
             position_error=float(x.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
-            thrust_margin=float(x.margin), message=x.message))
+            thrust_margin=float(x.margin), thrust_ratio=float(flight.thrust_ratio), message=x.message))
 
     def _emit_reference(self, stamp: int, x: Setpoint, result: StepResult) -> None:
         self.reference(ControlReference(

@@ -93,6 +93,11 @@ class FlightController:
         return self._thrust.health
 
     @property
+    def thrust_ratio(self) -> float:
+        """Thrust / mass that a perch would be flown with, over the vehicle file's."""
+        return self.health.believed if self.compensator is None else self.health.adoptable
+
+    @property
     def blind(self) -> bool:
         """A descent without position is under way."""
         return self.flown.blind is not None

@@ -314,7 +314,8 @@ class Mission(Component[MissionParameters]):
         channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
         asked = _Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time)))
         self._asked[channel] = [other for other in self._asked[channel] if stamp - other.made < FORGOTTEN] + [asked]
-        getattr(self, channel)(perch_request(query) if surface else powerline_request(query), asked.due)
+        ratio = self._status.thrust_ratio or None if self._status is not None else None
+        getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), asked.due)
         return asked
 
     def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:

@@ -75,13 +75,19 @@ class RotorHealth:
         self.weak = self._low.update(self.ratio < _WEAK, now) or self.weak
         return self.weak and self._believe(self.ratio)
 
+    @property
+    def adoptable(self) -> float:
+        """What `adopt` would believe."""
+        return self.believed if self.weak else self._stepped(self.mean)
+
     def adopt(self) -> bool:
         """Believe the mean from now on; returns whether that changes anything. Weak rotors are believed already."""
-        return not self.weak and self._believe(self.mean)
+        return self._believe(self.adoptable)
 
     def _believe(self, ratio: float) -> bool:
+        before, self.believed = self.believed, self._stepped(ratio)
+        return self.believed != before
+
+    def _stepped(self, ratio: float) -> float:
         ratio = min(max(ratio, self._least), _GREATEST)
-        if abs(ratio - self.believed) < _STEP:
-            return False
-        self.believed = ratio
-        return True
+        return self.believed if abs(ratio - self.believed) < _STEP else ratio

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import hypot
 
 from perch_control.flight_state import FlightState
@@ -61,7 +60,7 @@ class ThrustBelief:
 
     def _believed(self, x: FlightState, law: Law, compensator: L1Augmentation | None,
                   explained: tuple[float, ...] | None = None) -> FlightState:
-        vehicle = replace(self._nominal, thrust_coefficient=self.health.believed * self._nominal.thrust_coefficient)
+        vehicle = self._nominal.giving(self.health.believed)
         law.believe(vehicle)
         if compensator is not None:
             compensator.believe(vehicle, explained)

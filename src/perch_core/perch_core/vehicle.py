@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -190,6 +190,14 @@ class Vehicle:
     def thrust_max(self) -> float:
         """Greatest thrust of one rotor [N]."""
         return self.thrust_coefficient * self.speed_max**2
+
+    def giving(self, ratio: float) -> Vehicle:
+        """The same vehicle, whose rotors give `ratio` times the thrust.
+
+        Raises:
+            ConfigError: it cannot fly.
+        """
+        return self if ratio == 1.0 else replace(self, thrust_coefficient=ratio * self.thrust_coefficient)
 
     @property
     def hover_thrust(self) -> float:

@@ -230,7 +230,8 @@ class ScriptedFlight:
         """
         pad = self.simulation.pad
         [answer] = self.loop.request("perching_planner", "plan_perch", PerchPlanRequest(
-            start=nanoseconds(start), p=p, p_WS=pad.p_WS + shift, q_WS=so3.quat_from_matrix(pad.R_WS)))
+            start=nanoseconds(start), p=p, p_WS=pad.p_WS + shift, q_WS=so3.quat_from_matrix(pad.R_WS),
+            thrust_ratio=self.controller.flight.thrust_ratio))
         if not answer.success:
             raise PerchError(answer.message)
         return answer.trajectory

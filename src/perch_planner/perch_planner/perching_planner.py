@@ -88,7 +88,8 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            arguments = (method, problem, perch_settings(request, self.config.settings, problem.surface), self._vehicle)
+            vehicle = self._vehicle if request.thrust_ratio is None else self._vehicle.giving(request.thrust_ratio)
+            arguments = (method, problem, perch_settings(request, self.config.settings, problem.surface), vehicle)
         except PerchError as error:
             answer(error)
             return

@@ -96,6 +96,7 @@ class ControllerStatus(NamedTuple):
     position_error: float
     odometry_age: float
     thrust_margin: float
+    thrust_ratio: float
     message: str
 
 

@@ -147,14 +147,14 @@ def status_message(status: ControllerStatus) -> StatusMessage:
         header=header(status.stamp, FRAME), state=int(status.state), controller=status.controller, trajectory_id=int(status.trajectory_id),
         trajectory_time=float(status.trajectory_time), trajectory_duration=float(status.trajectory_duration),
         position_error=float(status.position_error), odometry_age=float(status.odometry_age), thrust_margin=float(status.thrust_margin),
-        message=status.message)
+        thrust_ratio=float(status.thrust_ratio), message=status.message)
 
 
 def status_value(msg: StatusMessage) -> ControllerStatus:
     """`perch_msgs/ControllerStatus`."""
     return ControllerStatus(
         stamp_value(msg.header.stamp), msg.state, msg.controller, msg.trajectory_id, msg.trajectory_time, msg.trajectory_duration,
-        msg.position_error, msg.odometry_age, msg.thrust_margin, msg.message)
+        msg.position_error, msg.odometry_age, msg.thrust_margin, msg.thrust_ratio, msg.message)
 
 
 def reference_message(x: ControlReference) -> ReferenceMessage:

@@ -13,7 +13,7 @@ from perch_core.values import Certificate, PerchPlan, PerchPlanRequest, Powerlin
 from perch_msgs.msg import Certificate as CertificateMessage
 from perch_msgs.srv import PlanPerch, PlanPowerline
 
-OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
+OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min", "thrust_ratio")
 
 
 def _array(v: Vector3 | Point) -> np.ndarray:
