@@ -71,7 +71,7 @@ def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:
     need = Requirements(
         start=np.array([[0.0, 0.0, 1.4], rest, rest, rest]), start_yaw=(0.0, 0.0), waypoints=np.zeros((0, 3)), p_S=WALL.p_WS,
         s1=WALL.R_WS[:, 0], s2=WALL.R_WS[:, 1], s3=WALL.normal, v_S=rest, perch_offset=0.04, mass=0.25,
-        impact_acceleration=3.3, impact_speed=(0.65, 0.75), tangential_speed=0.3, contact_delay=0.03, tube=(0.12, 0.01, 0.1, 0.33),
+        impact_acceleration=3.3, impact_speed=(0.65, 0.8), tangential_speed=0.3, contact_delay=0.03, tube=(0.12, 0.01, 0.1, 0.33),
         thrust=limits["thrust"], body_rate=limits["body_rate"][1], speed=limits["speed"][1], height=limits["height"],
         extension=0.15)
     assert verify(plan.trajectory.durations, plan.trajectory.coefficients, need, step=1e-3) == []
@@ -83,6 +83,21 @@ def test_options_of_a_request_replace_the_parameters(ask: Asked) -> None:
     assert bounded.success and thrust.upper_limit == 3.8 and thrust.maximum <= 3.8
     assert {c.quantity: c for c in free.certificates}["thrust"].upper_limit > 3.8
     assert ask(request(minimum_time=True)).trajectory.duration < free.trajectory.duration
+
+
+@pytest.mark.parametrize("inclination, height", [(60.0, 1.2), (90.0, 1.4), (180.0, 3.6)])
+def test_speed_and_slip_are_bounded_for_contacts_on_time_and_late(ask: Asked, inclination: float, height: float) -> None:
+    """Where no speed is within the window at both times, its middle is met on the average."""
+    pad = PerchSurface.from_inclination(np.array([1.7, 0.0, height]), math.radians(inclination))
+    end = ask(request(pad)).trajectory
+    x = end.sample(end.duration)
+    v = np.array([x.v, x.v + 0.03 * x.a])
+    speeds = -v @ pad.normal
+    assert np.linalg.norm(v @ pad.R_WS[:, :2], axis=1).max() <= 0.3
+    if inclination < 100.0:
+        assert 0.65 <= speeds.min() and speeds.max() <= 0.8
+    else:
+        assert speeds.mean() == pytest.approx(0.725, abs=1e-6) and speeds[0] == pytest.approx(0.725 + 0.5 * 0.03 * (3.3 + 9.81), abs=2e-3)
 
 
 def test_rotors_that_give_less_are_planned_for(ask: Asked) -> None:

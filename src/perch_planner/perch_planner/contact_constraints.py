@@ -80,20 +80,24 @@ def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Ar
 def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
     """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]
 
-    They hold after a change of the velocity by `later` [m/s], shape (3,): for a contact that comes late.
+    They hold for a contact on time and for one that comes late, after a change of the velocity by `later` [m/s], shape (3,).
+    Where no speed meets its bounds at both times, the middle of what the two ask for counts.
     """
     count = 1 + len(_OCTAGON)
     directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
     for k in range(count):
-        shift = 0.0
+        shift = change = 0.0
         for d in range(3):
             if k == 0:
                 directions[k, d] = -R_WS[d, 2]
             else:
                 directions[k, d] = _OCTAGON[k - 1, 0] * R_WS[d, 0] + _OCTAGON[k - 1, 1] * R_WS[d, 1]
-            shift += directions[k, d] * (velocity[d] - later[d])
-        lower[k] = shift + (least if k == 0 else -tangential)
-        upper[k] = shift + (most if k == 0 else tangential)
+            shift += directions[k, d] * velocity[d]
+            change += directions[k, d] * later[d]
+        lower[k] = shift + (least if k == 0 else -tangential) - min(change, 0.0)
+        upper[k] = shift + (most if k == 0 else tangential) - max(change, 0.0)
+        if lower[k] > upper[k]:
+            lower[k] = upper[k] = 0.5 * (lower[k] + upper[k])
     return directions, lower, upper
 
 
@@ -196,9 +200,6 @@ class Contact:
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float) -> None:
         start, R_WS = problem.start, problem.surface.R_WS
-        least, most = settings.impact_speed_min + INSET, settings.impact_speed_max - INSET
-        if least > most:
-            least = most = 0.5 * (settings.impact_speed_min + settings.impact_speed_max)
         self.velocity = problem.target_velocity
         self.points = problem.points.copy()
         self.points[-1] += perch_offset * R_WS[:, 2]
@@ -206,5 +207,6 @@ class Contact:
                  for order, value in ((1, waypoint.v), (2, waypoint.a), (3, waypoint.j)) if value is not None]
         derivatives = tuple(map(np.array, zip(*fixed))) if fixed else _NO_DERIVATIVES
         self.problem = (self.points, start.v, start.a, start.j, *derivatives, R_WS, self.velocity, settings.impact_acceleration,
-                        TUBE_SHARE, TUBE_FLOOR, settings.tube_time, TUBE_STEP, settings.contact_delay, least, most,
+                        TUBE_SHARE, TUBE_FLOOR, settings.tube_time, TUBE_STEP, settings.contact_delay,
+                        settings.impact_speed_min + INSET, settings.impact_speed_max - INSET,
                         settings.tangential_speed_max * _INSCRIBED - INSET)
