@@ -23,7 +23,7 @@ EXAMPLES = """examples:
   python3 scripts/start_stack.py --without mission recorder            start those yourself (run_node.py)
   python3 scripts/start_stack.py --only vehicle --realtime
   python3 scripts/start_stack.py --composed --view                     watch it in Foxglove, ws://localhost:8765
-  python3 scripts/start_stack.py -p vehicle.cameras:=none -p estimator.gate_probability:=0.99
+  python3 scripts/start_stack.py -p vehicle.cameras:=none -p estimator.coasting_after:=0.3
   python3 scripts/start_stack.py --namespace /quad1 --domain 7
 
 Other shells reach the nodes with the same ROS_DOMAIN_ID (42 by default, as in setup.bash).

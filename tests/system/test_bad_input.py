@@ -87,10 +87,10 @@ def test_arguments_of_the_demo(arguments, words, capsys):
 
 def test_a_parameter_that_a_node_refuses_is_the_caller_s_mistake(tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text(BLIND.replace("{vehicle", "{estimator: {gate_probability: 7.0}, vehicle"))
+    file.write_text(BLIND.replace("{vehicle", "{estimator: {coasting_after: 7000.0}, vehicle"))
     result = run_script("demo.py", "--scenario", str(file), "--out", str(tmp_path), "--composed", *sorted(set(ALL_NODES) - {"estimator"}))
     assert result.returncode == 2, result.stderr
-    assert "estimator: gate_probability: 7 is outside (0, 0.999999]" in result.stderr and "Traceback" not in result.stderr
+    assert "estimator: coasting_after: 7000 is outside (0, 3600] s" in result.stderr and "Traceback" not in result.stderr
 
 
 # -- nodes -----------------------------------------------------------------------------------------------------------
@@ -110,14 +110,14 @@ def test_every_node_refuses_a_parameter_that_it_does_not_have(node, context):
         create(cli_args=["--ros-args", "-p", "no_such_gain:=1.0"], use_global_arguments=False)
 
 
-AS_A_USER = "estimator: gate_probability: 7 is outside (0, 0.999999]"
+AS_A_USER = "estimator: coasting_after: 7000 is outside (0, 3600] s"
 """This executable is started as a user does; the others are forked from a process that has its code."""
 
 
 @pytest.mark.parametrize("arguments, words", [
-    (["-p", "gate_probability:=7.0"], AS_A_USER),
-    (["-p", "gate_probability:=often"], "estimator: gate_probability: 'often' is not of type float"),
-    (["-p", "gate_probabilty:=0.9"], "estimator: gate_probabilty: unknown parameter; allowed: sensors, vio.position, vio.attitude, gate_probability"),
+    (["-p", "coasting_after:=7000.0"], AS_A_USER),
+    (["-p", "coasting_after:=often"], "estimator: coasting_after: 'often' is not of type float"),
+    (["-p", "coastng_after:=0.9"], "estimator: coastng_after: unknown parameter; allowed: sensors, vio.position, vio.attitude, coasting_after"),
     (["--params-file", "/nowhere/gains.yaml"], "--params-file: /nowhere/gains.yaml: no such file"),
 ])
 def test_an_executable_ends_with_one_line_and_exit_code_2(arguments, words, ros_domain):

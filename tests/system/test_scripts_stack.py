@@ -131,9 +131,9 @@ def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, tmp_path):
 
 def test_a_parameter_that_a_node_refuses_is_the_callers_mistake(domain, tmp_path):
     """What each node refuses is shown in test_bad_input.py."""
-    result = run_script("start_stack.py", "--only", "estimator", "-p", "estimator.gate_probability:=7.0", "--domain", domain, "--log-dir", str(tmp_path))
+    result = run_script("start_stack.py", "--only", "estimator", "-p", "estimator.coasting_after:=7000.0", "--domain", domain, "--log-dir", str(tmp_path))
     assert result.returncode == 2
-    assert "gate_probability: 7 is outside" in result.stderr and "Traceback" not in result.stderr + result.stdout
+    assert "coasting_after: 7000 is outside" in result.stderr and "Traceback" not in result.stderr + result.stdout
 
 
 def test_a_port_in_use_is_the_callers_mistake(domain, tmp_path):
@@ -147,9 +147,9 @@ def test_a_port_in_use_is_the_callers_mistake(domain, tmp_path):
 
 
 def test_a_single_node(domain):
-    process = start_script("run_node.py", "estimator", "--ros-args", "-p", "gate_probability:=0.5", ROS_DOMAIN_ID=domain)
+    process = start_script("run_node.py", "estimator", "--ros-args", "-p", "coasting_after:=0.5", ROS_DOMAIN_ID=domain)
     try:
-        answer = fork_script("param.py", "get", "/estimator", "gate_probability", "--spin-time", str(PATIENCE), ROS_DOMAIN_ID=domain)
+        answer = fork_script("param.py", "get", "/estimator", "coasting_after", "--spin-time", str(PATIENCE), ROS_DOMAIN_ID=domain)
         assert (answer.returncode, answer.stdout) == (0, "0.5\n")
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=PATIENCE)

@@ -11,7 +11,7 @@ from perch_control.parameters import ControllerChoice, ControllerParameters
 from perch_core.errors import ConfigError, PerchError
 from perch_core.vehicle import load_vehicle
 
-PARAMETERS = ControllerParameters(controller=ControllerChoice(standby=False))
+PARAMETERS = ControllerParameters()
 CHANGED = replace(PARAMETERS, nmpc=replace(PARAMETERS.nmpc, horizon=0.5))
 
 
@@ -38,7 +38,7 @@ def test_a_build_that_failed_says_so_at_each_door_and_is_tried_again_with_other_
     with pytest.raises(LawNotReady, match="no compiler"):
         assembly.choose("nmpc", False)
     with pytest.raises(ConfigError, match="no compiler"):
-        assembly.change(replace(PARAMETERS, controller=ControllerChoice(type="nmpc", standby=False)))
+        assembly.change(replace(PARAMETERS, controller=ControllerChoice(type="nmpc")))
     assembly.change(CHANGED)
     assert jobs.pop().arguments[2] is CHANGED
     with pytest.raises(LawNotReady, match="being built"):

@@ -28,7 +28,7 @@ START = 3 * NANOSECONDS
 
 
 def parameters(**choice) -> ControllerParameters:
-    return ControllerParameters(controller=ControllerChoice(**{"standby": False} | choice))
+    return ControllerParameters(controller=ControllerChoice(**choice))
 
 
 class Flight:
@@ -437,7 +437,7 @@ def ask(component, port, request):
 
 def test_laws_are_chosen_in_flight_when_they_are_built():
     jobs = []
-    flight = Flight(params=parameters(standby=True))
+    flight = Flight()
     flight.component.work = jobs.append
     flight.component.warm_up()
     flight.take_off()
@@ -464,7 +464,7 @@ def test_laws_are_chosen_in_flight_when_they_are_built():
 
 def test_a_law_whose_settings_are_compiled_in_is_built_again_where_these_have_changed():
     jobs = []
-    component = Controller(parameters(standby=True))
+    component = Controller(parameters())
     component.work = jobs.append
     component.warm_up()
     component.reconfigure(replace(component.config, nmpc=replace(component.config.nmpc, horizon=0.5)))
@@ -477,7 +477,7 @@ def test_a_law_whose_settings_are_compiled_in_is_built_again_where_these_have_ch
 
 def test_a_law_that_could_not_be_built_says_why():
     jobs = []
-    component = Controller(parameters(standby=True))
+    component = Controller(parameters())
     component.work, lines = jobs.append, []
     component.log.receivers.append(lines.append)
     component.warm_up()
@@ -495,9 +495,9 @@ def test_gains_change_in_flight_and_what_is_fixed_is_refused():
     with pytest.raises(ConfigError, match="fixed"):
         component.reconfigure(replace(component.config, vehicle="rpg"))
     with pytest.raises(ConfigError, match="not ready"):
-        component.reconfigure(replace(component.config, controller=ControllerChoice(type="nmpc", standby=False)))
+        component.reconfigure(replace(component.config, controller=ControllerChoice(type="nmpc")))
     assert component.config.vehicle == "snapdragon" and component.config.controller.type == "geometric"
-    component.reconfigure(replace(component.config, controller=ControllerChoice(adaptive=True, standby=False)))
+    component.reconfigure(replace(component.config, controller=ControllerChoice(adaptive=True)))
     flight.step(0.5)
     assert flight.status[-1].controller == "geometric+l1" and np.linalg.norm(flight.plant.v) < 0.05
     with pytest.raises(ConfigError, match="'pid' is not one of geometric, nmpc"):

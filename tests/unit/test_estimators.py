@@ -31,7 +31,7 @@ def scenario(tmp_path, parameters):
 
 
 def test_the_filter_of_the_paper_is_the_default(tmp_path):
-    parameters = NodeParameters(scenario(tmp_path, "{gate_probability: 0.9}"), 1)
+    parameters = NodeParameters(scenario(tmp_path, "{coasting_after: 0.3}"), 1)
     assert type(parameters.component("estimator")) is StateEstimator is estimator_class("ukf")
 
 

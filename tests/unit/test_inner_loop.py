@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_control.controller import Controller
 from perch_control.inner_loop import InnerLoopEstimate, stopped
-from perch_control.parameters import ControllerChoice, ControllerParameters
+from perch_control.parameters import ControllerParameters
 from perch_control.rotor_lag import RotorEstimate
 from perch_core.errors import ConfigError
 from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
@@ -95,7 +95,7 @@ def test_rotors_without_a_loop_are_what_they_were():
 @pytest.mark.parametrize("attitude", [False, True])
 def test_the_controller_speaks_the_vehicles_language_alone(attitude, tmp_path):
     name = str(attitude_file(tmp_path)) if attitude else "snapdragon_rates"
-    component = Controller(ControllerParameters(vehicle=name, controller=ControllerChoice(standby=False)))
+    component = Controller(ControllerParameters(vehicle=name))
     out = {port: [] for port in ("motor_command", "rates_thrust", "attitude_thrust")}
     for port, values in out.items():
         getattr(component, port).receivers.append(values.append)

@@ -10,7 +10,7 @@ from perch_core.camera import RadialTangentialCamera
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
-from perch_perception.tags import BoardLocalizer, CalibrationSigma, LocalizerConfig
+from perch_perception.tags import BoardLocalizer, CalibrationSigma
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import load_scenario
 
@@ -94,7 +94,7 @@ def test_a_radial_tangential_lens_is_as_good(coefficients):
 def test_tracks_through_fast_motion_with_the_vehicles_own_state(places):
     """Between frames the pad moves by 120 px: the prediction from the body's state finds it, without a search."""
     place = places("surface_90")
-    localizer = BoardLocalizer(BOARD, MOUNT, LocalizerConfig(search_rate=0.5))
+    localizer = BoardLocalizer(BOARD, MOUNT)
     for k in range(6):
         p, R = np.array([0.15 * k, 0.05 * k, 1.1]), so3.exp(np.array([0.0, 0.4 * (k % 2), 0.3 * ((k + 1) % 2)]))
         result = localizer.process(place.image(p, R), k / 30, body(k / 30, p, R))
@@ -198,7 +198,7 @@ def test_a_board_of_another_size_is_refused_with_its_range(places):
     """Our tags a fifth of their size look like ours at five times the range."""
     place = places("surface_90_far")
     p, R = place.hover()
-    localizer = BoardLocalizer(BOARD, MOUNT, LocalizerConfig(max_range=2.0))
+    localizer = BoardLocalizer(BOARD, MOUNT, max_range=2.0)
     result = localizer.process(place.image(p, R), 0.0)
     assert result.board is None
     assert "outside [0.15, 2] m" in result.message

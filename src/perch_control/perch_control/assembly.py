@@ -150,8 +150,7 @@ class Assembly:
 
     def _absent(self, name: str) -> str:
         """Why a law that takes long to build is not there."""
-        return (f"{name} could not be built: {self._failed[name][0]}" if name in self._failed else
-                f"{name} is not ready: it is being built, or controller.standby is false")
+        return f"{name} could not be built: {self._failed[name][0]}" if name in self._failed else f"{name} is not ready: it is being built"
 
     # -- what is flown -----------------------------------------------------------------------------------------------
 

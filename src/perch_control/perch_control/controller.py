@@ -87,8 +87,7 @@ class Controller(Component[ControllerParameters]):
     def warm_up(self) -> None:
         """Load the compiled code, and build the laws that take long."""
         _dry_run_once(self.config)
-        if self.config.controller.standby:
-            self._assembly.prepare_slow_laws(self.work, self.warn)
+        self._assembly.prepare_slow_laws(self.work, self.warn)
 
     def reconfigure(self, config: ControllerParameters) -> None:
         """New gains and limits count from the next step."""

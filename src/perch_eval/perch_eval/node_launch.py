@@ -173,7 +173,7 @@ def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
         target, assigned, value = text.partition(":=")
         node, dot, parameter = target.partition(".")
         if not (assigned and dot and node and parameter):
-            raise PerchError(f"-p {text}: expected NODE.PARAMETER:=VALUE, as in controller.position_gain:=6.0")
+            raise PerchError(f"-p {text}: expected NODE.PARAMETER:=VALUE, as in controller.gains.lead:=0.02")
         overrides.setdefault(node, {})[parameter] = config.parse_yaml(value, f"-p {text}")
     return overrides
 

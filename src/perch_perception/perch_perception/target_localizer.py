@@ -19,7 +19,7 @@ from perch_perception.images import ImageError, check_image, mono_image
 from perch_perception.pose_buffer import BodyState, StampError
 from perch_perception.sensor_file import sensors_parameter, tag_sigmas
 from perch_perception.tags import (
-    BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, LocalizerConfig, MapPose, fuse, start_fusion, to_map)
+    BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, MapPose, fuse, start_fusion, to_map)
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
@@ -40,7 +40,8 @@ class TargetLocalizerConfig:
     max_position_sigma: float = config.quantity(0.10, unit="m", above=0.0, high=10.0,
                                                 doc="worst axis, relative to the vehicle, with which target/pose is still published")
     max_attitude_sigma: float = config.quantity(5.0, unit="deg", above=0.0, high=180.0, doc="the same for the attitude")
-    localizer: LocalizerConfig = config.part(LocalizerConfig)
+    max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
+                                       doc="a board further away than this is taken for one of another size")
     calibration: CalibrationSigma = config.derived(CalibrationSigma())
 
 
@@ -85,7 +86,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
     def use_camera(self, mount: CameraMount) -> None:
         """Look through another lens, from another place."""
         if self._given is None:
-            self._localizer = BoardLocalizer(self._board, mount, self.config.localizer, averaging=self.config.mode == "average",
+            self._localizer = BoardLocalizer(self._board, mount, self.config.max_range, averaging=self.config.mode == "average",
                                              calibration=self.config.calibration)
 
     def restart(self) -> None:

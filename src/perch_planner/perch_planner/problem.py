@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from math import atan2, hypot
 from typing import Any, NamedTuple
 
@@ -148,7 +149,6 @@ class PerchParameters:
     height_max: float = quantity(1e3, unit="m", low=-1e4, high=1e4, doc="ceiling for the centre of mass")
     clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of the body's rim from the surface")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
-    solver: str = choice("daqp", options=("daqp", "osqp"), doc="quadratic programming solver; osqp where DAQP has no wheel")
 
     def __post_init__(self) -> None:
         if self.impact_speed_max < self.impact_speed_min:
@@ -170,6 +170,7 @@ class PerchSettings(PerchParameters):
     body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
+    solver: str = choice("daqp" if find_spec("daqp") else "osqp", options=("daqp", "osqp"), doc="of the quadratic programs")
 
 
 class Limits(NamedTuple):

@@ -20,7 +20,7 @@ from perch_core.values import NANOSECONDS
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import Localization, LocalizationRefusal, average_board, solve_board
-from perch_perception.tags.localizer import LOST_AFTER, MIN_RANGE
+from perch_perception.tags.localizer import LOST_AFTER, MIN_RANGE, SEARCH_PERIOD
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
@@ -72,11 +72,10 @@ class ModelledSight:
 
     def process(self, image: Any, exposed: float, body: BodyState | None) -> Localization:
         """What the localiser would say of an image, which is not looked at; arguments as those of `Localizer.process`."""
-        settings = self._config.localizer
         tracking = exposed - self._last <= LOST_AFTER
         if not tracking:
             self._R_CS = None
-            if exposed - self._searched < 1.0 / settings.search_rate - 1e-3:
+            if exposed - self._searched < SEARCH_PERIOD - 1e-3:
                 return Localization(None, message="waiting for the next search")
             self._searched = exposed
         try:
@@ -94,7 +93,7 @@ class ModelledSight:
             pose = solve_board(self._mount.camera, corners_S, rays, sigma, ids, self._R_CS, lens_sigma=self._config.calibration.lens)
         except LocalizationRefusal as refusal:
             return Localization(None, message=str(refusal))
-        if not MIN_RANGE <= np.linalg.norm(pose.p_CS) <= settings.max_range:
+        if not MIN_RANGE <= np.linalg.norm(pose.p_CS) <= self._config.max_range:
             return Localization(None, message="not a board of this size")
         self._last, self._R_CS = exposed, pose.R_CS
         complete = len(ids) == len(self._board.ids)

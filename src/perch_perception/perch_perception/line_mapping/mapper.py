@@ -23,6 +23,7 @@ TURN = 3.0  # or rotation between them [deg]
 MOST_OBSERVATIONS = 40  # sightings kept per wire
 FORGET_AFTER = 2.0  # a wire that was never triangulated and is not seen is dropped [s]
 STALE_AFTER, SUPERSEDED = 0.4, 0.3  # a wire not seen for so long gives way to one that is seen so close to it [s, m]
+MAX_RANGE = 8.0  # ends of wires further away are not believed [m]
 STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [m]
 PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
 CERTAIN = 3           # so many more images that show a line to be attached to what is beside it than apart: no wire
@@ -33,7 +34,6 @@ MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 class MapperConfig:
     """What is kept and published."""
 
-    max_range: float = config.quantity(8.0, unit="m", above=0.0, high=100.0, doc="ends are not believed beyond this distance")
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
 
@@ -187,7 +187,7 @@ class LineMapper:
         against = curve.offsets(centres, rays)
         tangent = curve.tangent(against.s)
         glancing = np.abs(np.sum(rays * tangent, axis=1)) / np.linalg.norm(tangent, axis=1)
-        good = (glancing < np.cos(np.radians(8.0))) & (np.abs(against.ahead) < self.settings.max_range)
+        good = (glancing < np.cos(np.radians(8.0))) & (np.abs(against.ahead) < MAX_RANGE)
         both = good.reshape(-1, 2).all(axis=1)
         if both.sum() < 2:
             return None

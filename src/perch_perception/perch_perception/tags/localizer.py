@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core import config
 from perch_core.camera import CameraMount, Region
 from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState
@@ -24,16 +23,7 @@ from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_boa
 from perch_perception.tags.refinement import refine_corners
 from perch_perception.tags.view import VirtualView
 
-
-@dataclass(frozen=True)
-class LocalizerConfig:
-    """How the board is looked for and which sightings count."""
-
-    search_rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=30.0, doc="searches of the whole frame")
-    max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
-                                       doc="a board further away than this is taken for one of another size")
-
-
+SEARCH_PERIOD = 0.1  # between searches of the whole frame, 10 ms each [s]
 LOST_AFTER = 0.4   # tracking without a tag before searching [s]
 MIN_RANGE = 0.15   # a nearer board is taken for one of another size [m]
 FOLLOW_IMAGES = 4  # in a row in which the expected corners are measured without reading the tags' numbers
@@ -84,16 +74,15 @@ class BoardLocalizer:
     Args:
         board: geometry of the tags.
         mount: the camera.
-        settings: see `LocalizerConfig`.
+        max_range: a board further away is taken for one of another size [m].
         averaging: compute the paper's average too.
         calibration: how well the lens is known.
     """
 
-    def __init__(self, board: TagBoard, mount: CameraMount, settings: LocalizerConfig | None = None,
+    def __init__(self, board: TagBoard, mount: CameraMount, max_range: float = 6.0,
                  averaging: bool = False, calibration: CalibrationSigma = CalibrationSigma()) -> None:
         self.board, self.mount = board, mount
-        self.settings = settings or LocalizerConfig()
-        self._averaging = averaging
+        self._max_range, self._averaging = max_range, averaging
         self._lens_sigma = calibration.lens
         self._detector = TagDetector(board, mount.camera)
         self._tag_size = float(np.median(np.linalg.norm(board.corners_S[:, 0] - board.corners_S[:, 1], axis=-1)))
@@ -126,7 +115,7 @@ class BoardLocalizer:
             if followed is None:
                 self._followed = 0
             result = followed or self._attempt(part, self._look(part, view), (p_CS, R_CS), False)
-        elif time - self._search_time < 1.0 / self.settings.search_rate - 1e-3:
+        elif time - self._search_time < SEARCH_PERIOD - 1e-3:
             return Localization(None, message="waiting for the next search")
         else:
             self._search_time, self._followed = time, 0
@@ -237,10 +226,10 @@ class BoardLocalizer:
         pose = solve_board(camera, corners_S, rays, sigma, ids, None if expected is None else expected[1], start, self._lens_sigma,
                            PRINT_SIGMA)
         distance = float(np.linalg.norm(pose.p_CS))
-        if not MIN_RANGE <= distance <= self.settings.max_range:
+        if not MIN_RANGE <= distance <= self._max_range:
             raise LocalizationRefusal(
                 f"the tags' size puts the board at {distance:.2f} m, outside "
-                f"[{MIN_RANGE:g}, {self.settings.max_range:g}] m: not a board of this size")
+                f"[{MIN_RANGE:g}, {self._max_range:g}] m: not a board of this size")
         complete = len(pose.ids) == len(self.board.ids)
         average = average_board(camera, corners_S, rays, ids) if self._averaging and complete else None
         if pose.dropped:

@@ -46,6 +46,4 @@ class UkfConfig:
     sensors: str = text("", doc="sensor file, config/sensors/<name>.yaml or a path: noise and axes of the IMU; empty: noise of an MPU-9250")
     imu: ImuNoise = derived(ImuNoise())
     vio: VioNoise = part(VioNoise)
-    gate_probability: float = quantity(0.999, above=0.0, high=0.999999, doc="chi2 gate of the innovation")
-    history: float = quantity(0.5, unit="s", above=0.0, high=5.0, doc="IMU kept for replay: oldest usable VIO stamp")
     coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose")

@@ -12,20 +12,19 @@ from __future__ import annotations
 import numpy as np
 
 from perch_core import so3
-from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.stillness import REST_VELOCITY
-from perch_perception.ukf.unscented import ACCEL, DT, GYRO, Belief, Innovation, UnscentedTransform
+from perch_perception.ukf.unscented import ACCEL, DT, GATES, GYRO, Belief, Innovation, UnscentedTransform
 
 
-def stopped(belief: Belief, config: UkfConfig) -> Belief | None:
+def stopped(belief: Belief) -> Belief | None:
     """The belief of a vehicle that has come to rest; None: it knows that the vehicle moves, steadily."""
     H = np.zeros((3, at.ERROR_SIZE))
     H[:, at.D_VELOCITY] = np.eye(3)
     innovation = _innovation(belief, H, -belief.x[at.VELOCITY], np.full(3, REST_VELOCITY**2))
-    return UnscentedTransform.correct(belief, innovation) if innovation.nis < chi2_quantile(config.gate_probability, 3) else None
+    return UnscentedTransform.correct(belief, innovation) if innovation.nis < GATES[3] else None
 
 
 def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:

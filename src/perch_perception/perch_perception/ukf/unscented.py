@@ -15,6 +15,7 @@ from scipy.linalg import cholesky
 from perch_core import so3
 from perch_core.errors import PerchError
 from perch_core.jit import COMPILED
+from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import kernels, update_kernels
 from perch_perception.ukf import layout as at
@@ -23,6 +24,8 @@ from perch_perception.ukf.measurement import VioPose
 
 # van der Merwe's spread of the sigma points: with alpha = 1 no weight is negative; beta = 2 is that of a Gaussian
 ALPHA, BETA, KAPPA = 1.0, 2.0, 0.0
+# NIS that 99.9 % of the right measurements stay below, by their size
+GATES = {m: float(chi2_quantile(0.999, m)) for m in (3, 6, 9)}
 # columns of a run of IMU steps
 DT, GYRO, ACCEL, GYRO_VARIANCE, ACCEL_VARIANCE = 0, slice(1, 4), slice(4, 7), 7, 8
 
