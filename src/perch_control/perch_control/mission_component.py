@@ -10,11 +10,10 @@ from itertools import count
 import numpy as np
 
 from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Wake
-from perch_core.covariance import drift, largest_sigma
-from perch_core.errors import PerchError
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, ControllerCommand, ControllerStatus, Done, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
     PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, nanoseconds, seconds)
+from perch_control.mission.asked import Asked, Requests
 from perch_control.mission.departure import Departure
 from perch_control.mission.goals import goal_of, problem_with
 from perch_control.mission.machine import MissionMachine
@@ -22,29 +21,17 @@ from perch_control.mission.missions import mission_class
 from perch_control.mission.moves import Moves
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission.requests import flown_order, perch_request, plan_answer, powerline_request
-from perch_control.mission.values import (
-    TICK, ControllerState, Inputs, Mode, Outcome, Outputs, PlanQuery, Result, State, Target)
+from perch_control.mission.sightings import Sightings
+from perch_control.mission.values import TICK, ControllerState, Inputs, Mode, Outcome, Outputs, PlanQuery, Result, State
 from perch_control.period import MeasuredPeriod
 from perch_control.stamp_guard import Stamp, StampGuard
 
 FEEDBACK_PERIOD = NANOSECONDS // 10  # where nothing changes [ns]
 SILENCE = NANOSECONDS // 2           # without odometry for so long, the host's time goes on in its place [ns]
-FORGOTTEN = 15 * NANOSECONDS         # a planner that has not answered for so long does not answer any more [ns]
-AHEAD = NANOSECONDS // 10            # a target's stamp is no more than this ahead of the newest sample [ns]
 STALE = NANOSECONDS                  # of another time [ns]
 RUNNING = 1                          # perch_msgs/EstimatorStatus
 IMU_MOST = 4000                      # samples between two ticks that are kept
 _ENDINGS = {Result.PERCHED: "succeeded", Result.CANCELLED: "cancelled"}
-
-
-@dataclass
-class _Asked:
-    """A request under way: when it was made and when its answer counts [ns], the plan's start [s], the answer."""
-
-    made: int
-    due: int
-    start: float
-    answer: PerchPlan | PowerlinePlan | Unavailable | None = None
 
 
 @dataclass
@@ -64,8 +51,8 @@ class _Running:
     machine: MissionMachine
     started: bool = False
     waiting_since: int | None = None
-    pending: _Asked | None = None
-    way_out: _Asked | None = None
+    pending: Asked | None = None
+    way_out: Asked | None = None
 
 
 class _Departing:
@@ -118,11 +105,10 @@ class Mission(Component[MissionParameters]):
         self._moves = Moves(self.config.mission)  # home stays from goal to goal
         self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_MOST)
         self._odometry: OdometryState | None = None
-        self._pad: tuple[TargetPose, np.ndarray] | None = None  # and the covariance of the odometry when it came, shape (6, 6)
-        self._map: PowerlineMap | None = None
+        self._seen = Sightings()
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
-        self._asked: dict[str, list[_Asked]] = {"plan_perch": [], "plan_way_out": [], "plan_powerline": []}
+        self._asked = {channel: Requests() for channel in ("plan_perch", "plan_way_out", "plan_powerline")}
         self._used = self._heard = -1          # odometry of the last tick, and the host's time then [ns]
         self._told = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
         self._diagnosed: int | None = None
@@ -166,41 +152,13 @@ class Mission(Component[MissionParameters]):
 
     def on_target(self, pose: TargetPose) -> None:
         """Keep the newest pose of the pad."""
-        x, problem = self._odometry, ""
-        if x is None:
-            problem = "there is no odometry yet"
-        elif pose.stamp > self._stamps.newest + AHEAD:
-            problem = "its stamp is in the future"
-        elif self._pad is not None and pose.stamp < self._pad[0].stamp:
-            problem = "it is older than the newest"
-        if x is None or problem:
+        if problem := self._seen.take_pad(pose, self._odometry, self._stamps.newest):
             self.warn(f"target/pose refused: {problem}", every=1.0)
-            return
-        self._pad = pose, x.pose_covariance
-
-    def _pad_now(self, x: OdometryState) -> Target | None:
-        """The pad as it stands to the vehicle: what the odometry has drifted since it was seen makes it less certain."""
-        if self._pad is None:
-            return None
-        pose, before = self._pad
-        covariance = pose.covariance + drift(x.pose_covariance, before, pose.p_WS - x.p_WB)
-        return Target(seconds(pose.stamp), pose.p_WS, pose.q_WS / np.linalg.norm(pose.q_WS), largest_sigma(covariance[:3, :3]),
-                      largest_sigma(covariance[3:, 3:]))
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
         """Keep the newest map."""
-        newest = self._stamps.newest
-        try:
-            if not self._stamps.begun or lines.stamp > newest + AHEAD:
-                raise PerchError("its stamp is in the future")
-            if self._map is not None and lines.stamp < self._map.stamp:
-                raise PerchError("it is older than the newest")
-            for line in lines.lines:
-                _ = line.segment  # raises where it is none
-        except PerchError as error:
-            self.warn(f"powerlines refused: {error}", every=1.0)
-            return
-        self._map = lines
+        if problem := self._seen.take_lines(lines, self._stamps.newest if self._stamps.begun else None):
+            self.warn(f"powerlines refused: {problem}", every=1.0)
 
     def on_status(self, status: ControllerStatus) -> None:
         """Keep the controller's state."""
@@ -277,7 +235,7 @@ class Mission(Component[MissionParameters]):
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0, trajectory_time=status.trajectory_time if status else 0.0,
-            target=running.machine.target(self._pad_now(x), self._map, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3),
+            target=running.machine.target(self._seen.pad(x), self._seen.lines, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3),
             cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
 
     def _act(self, running: _Running, stamp: int, outputs: Outputs) -> None:
@@ -309,36 +267,25 @@ class Mission(Component[MissionParameters]):
 
     # -- planners ----------------------------------------------------------------------------------------------------
 
-    def _ask(self, running: _Running, stamp: int, query: PlanQuery) -> _Asked:
+    def _ask(self, running: _Running, stamp: int, query: PlanQuery) -> Asked:
         surface = running.goal.value.mode == Mode.SURFACE
         channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
-        asked = _Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time)))
-        self._asked[channel] = [other for other in self._asked[channel] if stamp - other.made < FORGOTTEN] + [asked]
+        asked = self._asked[channel].add(Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time))))
         ratio = self._status.thrust_ratio or None if self._status is not None else None
         getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), asked.due)
         return asked
 
     def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:
         """Keep it until it counts."""
-        self._take_answer(self._asked["plan_perch"], plan)
+        self._asked["plan_perch"].answered(plan)
 
     def on_plan_way_out(self, plan: PerchPlan | Unavailable) -> None:
         """Keep it until it counts."""
-        self._take_answer(self._asked["plan_way_out"], plan)
+        self._asked["plan_way_out"].answered(plan)
 
     def on_plan_powerline(self, plan: PowerlinePlan | Unavailable) -> None:
         """Keep it until it counts."""
-        self._take_answer(self._asked["plan_powerline"], plan)
-
-    @staticmethod
-    def _take_answer(under_way: list[_Asked], plan: PerchPlan | PowerlinePlan | Unavailable) -> None:
-        """An answer belongs to the request for its start; one without a trajectory to the oldest under way."""
-        if not under_way:
-            return
-        start = None if isinstance(plan, Unavailable) or plan.trajectory is None else plan.trajectory.start_time
-        asked = next((other for other in under_way if other.start == start), under_way[0])
-        under_way.remove(asked)
-        asked.answer = plan
+        self._asked["plan_powerline"].answered(plan)
 
     # -- goals -------------------------------------------------------------------------------------------------------
 

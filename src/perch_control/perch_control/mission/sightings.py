@@ -1,0 +1,64 @@
+"""Where to perch, as the perception nodes tell: the pad and the map of powerlines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perch_core.covariance import drift, largest_sigma
+from perch_core.errors import PerchError
+from perch_core.values import NANOSECONDS, OdometryState, PowerlineMap, TargetPose, seconds
+from perch_control.mission.values import Target
+
+AHEAD = NANOSECONDS // 10  # a stamp is no more than this ahead of the newest sample [ns]
+
+
+class Sightings:
+    """The newest of each.
+
+    Attributes:
+        lines: the map of powerlines.
+    """
+
+    def __init__(self) -> None:
+        self._pad: tuple[TargetPose, np.ndarray] | None = None  # and the covariance of the odometry when it came, shape (6, 6)
+        self.lines: PowerlineMap | None = None
+
+    def take_pad(self, pose: TargetPose, x: OdometryState | None, newest: int) -> str:
+        """Keep a pose of the pad, or tell why not.
+
+        Args:
+            pose: of the pad.
+            x: the newest odometry.
+            newest: the newest stamp of a sensor [ns].
+        """
+        if x is None:
+            return "there is no odometry yet"
+        if pose.stamp > newest + AHEAD:
+            return "its stamp is in the future"
+        if self._pad is not None and pose.stamp < self._pad[0].stamp:
+            return "it is older than the newest"
+        self._pad = pose, x.pose_covariance
+        return ""
+
+    def pad(self, x: OdometryState) -> Target | None:
+        """The pad as it stands to the vehicle: what the odometry has drifted since it was seen makes it less certain."""
+        if self._pad is None:
+            return None
+        pose, before = self._pad
+        covariance = pose.covariance + drift(x.pose_covariance, before, pose.p_WS - x.p_WB)
+        return Target(seconds(pose.stamp), pose.p_WS, pose.q_WS / np.linalg.norm(pose.q_WS), largest_sigma(covariance[:3, :3]),
+                      largest_sigma(covariance[3:, 3:]))
+
+    def take_lines(self, lines: PowerlineMap, newest: int | None) -> str:
+        """Keep a map, or tell why not; `newest` as in `take_pad`, None before any."""
+        if newest is None or lines.stamp > newest + AHEAD:
+            return "its stamp is in the future"
+        if self.lines is not None and lines.stamp < self.lines.stamp:
+            return "it is older than the newest"
+        try:
+            for line in lines.lines:
+                _ = line.segment  # raises where it is none
+        except PerchError as error:
+            return str(error)
+        self.lines = lines
+        return ""
