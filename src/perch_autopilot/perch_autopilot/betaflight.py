@@ -56,7 +56,7 @@ class Betaflight(Component[BetaflightParameters]):
         super().__init__(config)
         vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        self._link, self._parser = SupervisedLink(config.link, *self._throttles(), config.disarm_after), msp.Parser()
+        self._link, self._parser = SupervisedLink(config.link, *self._throttles(), config.disarm_after, self._sticks.curves[:2]), msp.Parser()
         try:
             self.version = self._identify()
         except BaseException:
