@@ -91,6 +91,16 @@ def test_every_reason_not_to_arm_is_named():
             assert refusal == (msp.TOO_EARLY if bit == count - 1 else msp.ARMING_REASONS[bit])
 
 
+def test_reasons_not_to_arm_that_last_are_those_of_repairs_settings_and_restarts():
+    def lasting(flags: int) -> tuple[str, ...]:
+        return msp.status(msp.Frame(msp.STATUS, struct.pack("<HHHIBHBBBBIB", *(0,) * 8, 0, 29, flags, 0), False)).lasting
+
+    words = lasting(0xFFFFFFFF)
+    assert [word.split(":")[0] for word in words] == [
+        "no gyro", "CLI is open", "paralyzed", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated", "motor protocol is not set"]
+    assert lasting(1 << 7 | 1 << 12 | 1 << 28) == ()
+
+
 def test_short_and_refused_answers_are_typed_errors():
     for read in (msp.status, msp.battery, msp.attitude, lambda frame: msp.inertial(frame, 512.0)):
         for frame in (msp.Frame(1, b"\x01", False), msp.Frame(1, bytes(40), True)):
@@ -368,16 +378,6 @@ def test_a_clock_that_jumps_back_turns_the_motors_off():
     assert dog.channels(50.0)[4] == OFF
 
 
-# -- link ------------------------------------------------------------------------------------------------------------
-
-@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
-def test_a_wire_that_is_none_is_one_line(address):
-    with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
-        Link(address)
-    assert "\n" not in str(error.value)
-
-
-def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
 # -- levelling by rates --------------------------------------------------------------------------------------------------
 
 CURVES = (RateCurve(400, 900, 0.0), RateCurve(400, 900, 0.3))
@@ -424,6 +424,16 @@ def test_far_from_level_rates_are_commanded_while_the_attitude_is_fresh_and_self
     assert not dog.levels(16.0)
 
 
+# -- link ------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
+def test_a_wire_that_is_none_is_one_line(address):
+    with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
+        Link(address)
+    assert "\n" not in str(error.value)
+
+
+def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
     ours, theirs = pty.openpty()
     link = Link(os.ttyname(theirs) + "@921600")
     try:
