@@ -35,6 +35,8 @@ PHASES = {"take-off": ("take_off", 0.6), "hover": ("searching", 0.3), "way to th
 GAPS = (0.05, 0.2, 0.5, 1.0, 5.0)         # commands stop for so long [s]; then they go on
 TILTED = ((30.0, 2.0), (60.0, 4.0), (90.0, 0.0), (85.0, 6.5))
 """Tilt [deg] and rate [rad/s] of a body in free air at the last commands, which say that it shall turn on."""
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.8, 0.0))
+"""About which it turns: roll, pitch, and between them."""
 WATCHED = 6.0                             # after they have stopped [s]
 
 
@@ -117,12 +119,12 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
                 max(followed, default=0.0))
 
 
-def levelled(vehicle: str, axis: int, tilt: float, rate: float) -> float:
-    """When a body in free air is level after the last command [s]."""
+def levelled(vehicle: str, axis: tuple[float, float, float], tilt: float, rate: float) -> float:
+    """When a body in free air that is tilted and turns about an axis in B is level after the last command [s]."""
     body = Body(load_vehicle(vehicle))
     with closing(body.loop):
         body.hover()
-        body.found(np.eye(3)[axis], tilt, rate)
+        body.found(np.array(axis), tilt, rate)
         last, body.loop.cut, above = body.loop.heard, True, 0.0
         while body.time < last + 1.5:
             body.step(True)
@@ -172,7 +174,8 @@ def figures(quick: bool) -> list[Figure]:
     out.append(figure(f"level within {LEVEL:g} deg", "s", [one.levelled for one in long if np.isfinite(one.levelled)], 0.3, "max <="))
     for tilt, rate in TILTED:
         times = [levelled(vehicle, axis, tilt, rate)
-                 for vehicle in (SCENARIO.vehicle, "rpg_betaflight") for axis in ((1,) if quick else (0, 1))]
+                 for vehicle in (SCENARIO.vehicle, "rpg_betaflight") for axis in (AXES[1:2] if quick else AXES)]
+        print(f"{tilt:g} deg, {rate:g} rad/s: level after", *(f"{time:.3f}" for time in times), "s", flush=True)
         out.append(figure(f"level within {LEVEL:g} deg, from {tilt:g} deg and {rate:g} rad/s", "s", times, 0.3, "max <="))
     out.append(figure("descent or motors off", "s", [one.down for one in long if np.isfinite(one.down)], 1.0, "max <="))
     out.append(figure("last command held by the firmware, link cut", "s", [held_without_link()], 0.05, "max <="))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import socket
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,24 @@ from perch_core.vehicle import Vehicle
 _PATIENCE = 20.0  # for the firmware's answer to a frame [s]
 
 
+class LateWatchdog(Watchdog):
+    """Its attitude comes late, as over a serial line from tasks of 100 Hz and 1 kHz."""
+
+    delay = 0.01  # [s]
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        self._coming: list[tuple[float, float, float]] = []
+
+    def attitude(self, now, roll, pitch):
+        self._coming.append((now, roll, pitch))
+
+    def channels(self, now):
+        while self._coming and self._coming[0][0] <= now - self.delay + 1e-6:
+            super().attitude(now, *self._coming.pop(0)[1:])
+        return super().channels(now)
+
+
 class SupervisedLoop(FirmwareLoop):
     """Of a node that can be cut off, and be killed, and of a pilot.
 
@@ -37,11 +56,14 @@ class SupervisedLoop(FirmwareLoop):
         super().__init__(vehicle)
         self.severed = False
         self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
-        self.watchdog = Watchdog(self.sticks.throttle_for(1.0), self.sticks.throttle_for(DESCENT))
+        self.watchdog = LateWatchdog(self.sticks.throttle_for(1.0), self.sticks.throttle_for(DESCENT), curves=self.sticks.curves[:2])
         self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._node.setblocking(False)
         self._time, self._parser = 0.0, msp.Parser()
         self._supervisor = LinkSupervisor(f"fd:{self.sitl.file}", theirs, self.watchdog, lambda: self._time)
+        link = self._supervisor._link
+        self._link_read, link.read = link.read, self._read
+        self._answers: set[int] = set()
         self._killed = False
         self.aimed = np.zeros(4)
 
@@ -63,28 +85,27 @@ class SupervisedLoop(FirmwareLoop):
         self._time = now
         if self.severed:
             return tuple(self.radio)
-        spoken = now >= self._supervisor._due
-        self._supervisor.work(0.0)
-        if spoken:  # a frame counts from the cycle on that follows its answer
-            self._answered()
+        if now >= self._supervisor._due:  # a frame counts from the cycle on that follows its answer
+            self._answers.clear()
+            self._supervisor.work(0.0)
+            self._answered({msp.SET_RAW_RC, msp.ATTITUDE} if self.watchdog.levels(now) else {msp.SET_RAW_RC})
+        else:
+            self._supervisor.work(0.0)
         return tuple(self.radio)
 
-    def _answered(self) -> None:
+    def _read(self, timeout: float = 0.0) -> bytes:
+        data = self._link_read(timeout)
+        self._answers |= {frame.command for frame in self._parser.feed(data)}
+        return data
+
+    def _answered(self, wanted: set[int]) -> None:
         last = time.monotonic() + _PATIENCE
-        while time.monotonic() < last:
-            if self._killed:  # nobody hears the answer
-                if self._supervisor._link.read(1.0):
-                    return
-                continue
+        while not wanted <= self._answers:
+            assert time.monotonic() < last, "the firmware does not answer the supervisor"
             self._supervisor.work(1.0)
-            while True:
-                try:
-                    word = self._node.recv(8192)
-                except BlockingIOError:
-                    break
-                if word[:1] == b"D" and any(frame.command == msp.SET_RAW_RC for frame in self._parser.feed(word[1:])):
-                    return
-        raise AssertionError("the firmware does not answer the supervisor")
+            with suppress(OSError):  # killed, or nothing more has come
+                while self._node.recv(8192):
+                    pass
 
     def close(self) -> None:
         self._node.close()

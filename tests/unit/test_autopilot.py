@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from perch_autopilot import firmware, frames, msp
+from perch_autopilot import firmware, frames, levelling, msp
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
-from perch_autopilot.rates import RateCurve, Sticks, rate_curves
+from perch_autopilot.rate_curve import RateCurve
+from perch_autopilot.rates import Sticks, rate_curves
 from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog
 from perch_autopilot.link import Link, LinkError
 from perch_core.config import config_dir
@@ -90,6 +91,16 @@ def test_every_reason_not_to_arm_is_named():
             assert refusal == (msp.TOO_EARLY if bit == count - 1 else msp.ARMING_REASONS[bit])
 
 
+def test_reasons_not_to_arm_that_last_are_those_of_repairs_settings_and_restarts():
+    def lasting(flags: int) -> tuple[str, ...]:
+        return msp.status(msp.Frame(msp.STATUS, struct.pack("<HHHIBHBBBBIB", *(0,) * 8, 0, 29, flags, 0), False)).lasting
+
+    words = lasting(0xFFFFFFFF)
+    assert [word.split(":")[0] for word in words] == [
+        "no gyro", "CLI is open", "paralyzed", "reboot required", "DSHOT bitbang", "accelerometer is not calibrated", "motor protocol is not set"]
+    assert lasting(1 << 7 | 1 << 12 | 1 << 28) == ()
+
+
 def test_short_and_refused_answers_are_typed_errors():
     for read in (msp.status, msp.battery, msp.attitude, lambda frame: msp.inertial(frame, 512.0)):
         for frame in (msp.Frame(1, b"\x01", False), msp.Frame(1, bytes(40), True)):
@@ -144,7 +155,7 @@ class StubAutopilot:
 
     voltage, silent = 16.0, False
 
-    def __init__(self, address, hover, descent, disarm_after) -> None:
+    def __init__(self, address, hover, descent, disarm_after, curves) -> None:
         self.throttles, self._said, self._parser, self.closed = (hover, descent), b"", msp.Parser(), False
         self.mode: list[str] = []
 
@@ -367,6 +378,52 @@ def test_a_clock_that_jumps_back_turns_the_motors_off():
     assert dog.channels(50.0)[4] == OFF
 
 
+# -- levelling by rates --------------------------------------------------------------------------------------------------
+
+CURVES = (RateCurve(400, 900, 0.0), RateCurve(400, 900, 0.3))
+
+
+@pytest.mark.filterwarnings("ignore:Gimbal lock")
+@given(ROTATIONS)
+def test_levelling_turns_up_the_shortest_way(R):
+    """Against scipy: the rotation vector of the smallest rotation that takes z of B to up."""
+    _, pitch, roll = (NED * R * FRD.inv()).as_euler("ZYX")
+    up = levelling.up(roll, pitch)
+    assert up == pytest.approx(R.inv().apply((0.0, 0.0, 1.0)), abs=1e-9)
+    if abs(np.hypot(up[0], up[1])) < 1e-3:
+        return
+    rates = np.array((*levelling.rates(up, 100.0), 0.0))
+    assert np.hypot(*levelling.rates(up, 3.0)) == pytest.approx(min(np.hypot(*rates[:2]), 3.0))
+    turned = R * Rotation.from_rotvec(rates / levelling.GAIN)
+    assert turned.apply((0.0, 0.0, 1.0)) == pytest.approx((0.0, 0.0, 1.0), abs=1e-6)
+    assert np.linalg.norm(rates) / levelling.GAIN == pytest.approx(levelling.tilt(up)) and levelling.tilt(up) <= np.pi
+
+
+@given(ROTATIONS.map(lambda R: tuple(R.apply((0.0, 0.0, 1.0)))))
+def test_the_sticks_ask_for_the_levelling_rate(up):
+    widths = levelling.sticks(up, CURVES)
+    asked = [np.radians(curve.rate((width - 1500) / 500)) for curve, width in zip(CURVES, widths)]
+    assert asked == pytest.approx(levelling.rates(up, np.radians(900.0)), abs=0.06)
+
+
+def test_far_from_level_rates_are_commanded_while_the_attitude_is_fresh_and_self_level_otherwise():
+    dog = Watchdog(hover=1450, descent=1420, curves=CURVES)
+    dog.command(-1.0, True, STICKS)
+    dog.command(10.0, True, STICKS)
+    assert [dog.levels(10.0 + age) for age in (0.01, 0.03, 1.0)] == [False, True, True]
+    for age, throttle in ((0.05, 1450), (0.6, 1420)):
+        dog.attitude(10.0 + age, 0.0, np.radians(-80.0))                          # nose down: up again
+        roll, pitch, *rest = dog.channels(10.0 + age)
+        assert (roll, rest) == (1500, [throttle, 1500, ON, OFF]) and pitch < 1500
+        assert dog.channels(10.0 + age + 0.06) == (1500, 1500, throttle, 1500, ON, ON)   # its attitude is old
+        dog.attitude(10.0 + age, 0.0, np.radians(-40.0))
+        assert dog.channels(10.0 + age) == (1500, 1500, throttle, 1500, ON, ON)
+    dog.attitude(14.1, 0.0, 1.5)
+    assert dog.channels(14.1)[4] == OFF
+    dog.command(15.0, False, STICKS)
+    assert not dog.levels(16.0)
+
+
 # -- link ------------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
@@ -398,7 +455,7 @@ def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
 def test_the_supervisor_sends_without_a_node_reopens_the_link_and_ends_with_the_motors_off():
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(120.0)
-        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", 1450, 1420, 4.0)
+        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", 1450, 1420, 4.0, CURVES)
         frame = msp.channels((1500, 1500, 1000, 1500, OFF, OFF))
         for _ in range(2):  # the first link ends; the supervisor opens another
             with server.accept()[0] as peer:

@@ -19,7 +19,7 @@ from perch_autopilot.configuration import Cli, CliError, Configuration, load_con
 from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.namespace import IsolatedProgram, NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
-from perch_autopilot.watchdog import OFF, ON, Mode
+from perch_autopilot.watchdog import CENTRED, OFF, ON, Mode
 from closed_loop.supervised_loop import Body
 from perch_core import config
 from perch_core.component import Output, ports
@@ -383,7 +383,8 @@ def body():
 
 
 @pytest.mark.parametrize("axis, tilt, rate", [
-    ((1, 0, 0), 30.0, 2.0), ((-1, 0, 0), 60.0, 4.0), ((0, 1, 0), 60.0, 4.0), ((0, -1, 0), 90.0, 0.0), ((0.6, 0.8, 0), 45.0, 2.0)])
+    ((1, 0, 0), 30.0, 2.0), ((-1, 0, 0), 60.0, 4.0), ((0, 1, 0), 60.0, 4.0), ((0, -1, 0), 90.0, 0.0), ((0.6, 0.8, 0), 45.0, 2.0),
+    ((0, 1, 0), 85.0, 6.5), ((0.6, 0.8, 0), 60.0, 4.0)])
 def test_a_body_is_level_a_third_of_a_second_after_the_last_command(body, axis, tilt, rate):
     body.found(axis, tilt, rate)
     last, told, above = body.loop.heard, None, 0.0
@@ -447,6 +448,38 @@ def test_a_firmware_whose_wire_is_cut_holds_the_last_command(body):
     while body.time < last + 1.0:
         body.step(True)
         assert body.plant.w[0] == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_receiver_by_msp_alone_levels_and_descends_when_the_wire_is_cut(monkeypatch):
+    """The alternative of docs/howto/real_vehicle.md, without a pilot's radio: its failsafe counts the frames by MSP."""
+    loaded = load_configuration("betaflight")
+    lines = (*loaded.lines, "set failsafe_delay = 1", "set failsafe_procedure = AUTO-LAND", "set failsafe_throttle = 1560")
+
+    def bench(loop, switch, _):
+        for _ in range(500):
+            loop.sitl.send(msp.channels((*CENTRED, switch, OFF)))
+            motors = loop.sitl.step(STILL, GRAVITY, LEVEL, CENTRED)
+            loop.sitl.receive(1.0)
+            if min(motors) > 0.02 if switch == ON else max(motors) == 0.0:
+                return
+        raise AssertionError(loop.sitl.status())
+
+    monkeypatch.setattr("perch_autopilot.loop.load_configuration", lambda _: replace(loaded, lines=lines))
+    monkeypatch.setattr(FirmwareLoop, "_bench", bench)
+    monkeypatch.setattr(sitl, "STICKS", 9)  # nobody is there: frames by UDP would make that the receiver
+    body = started(lambda: Body(VEHICLE))
+    try:
+        body.hover()
+        body.found((1, 0, 0), 0.0, 2.0)
+        last, body.loop.severed, held, above = body.time, True, 0.0, 0.0
+        while body.time < last + 1.0:
+            body.step(True)
+            held = body.time - last if body.plant.w[0] > 1.5 else held
+            above = body.time - last if body.tilt > 10.0 else above
+        assert 0.1 < held < 0.2 and above < 0.35, (held, above)
+        assert body.tilt < 3.0 and body.plant.v[2] < -0.5 and body.loop.aimed.min() > 0.0
+    finally:
+        body.loop.close()
 
 
 @pytest.mark.parametrize("battery, share", [(Battery(), 0.85**2), (Battery(reference=16.0, range=(12.0, 17.0)), 1.0)])

@@ -51,12 +51,13 @@ class Betaflight(Component[BetaflightParameters]):
         Raises:
             ConfigError: there is no such vehicle or configuration.
             LinkError: the link cannot be opened.
-            MspError: nobody answers, another firmware than this was written for, or a battery for which the vehicle has no thrust curve.
+            MspError: nobody answers, another firmware than this was written for, or one that is not armed and will not fly: it refuses to
+                arm for a lasting reason, or the vehicle has no thrust curve for the battery.
         """
         super().__init__(config)
         vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        self._link, self._parser = SupervisedLink(config.link, *self._throttles(), config.disarm_after), msp.Parser()
+        self._link, self._parser = SupervisedLink(config.link, *self._throttles(), config.disarm_after, self._sticks.curves[:2]), msp.Parser()
         try:
             self.version = self._identify()
         except BaseException:
@@ -76,8 +77,8 @@ class Betaflight(Component[BetaflightParameters]):
         return self._sticks.throttle_for(1.0), self._sticks.throttle_for(DESCENT)
 
     def _identify(self) -> msp.Version:
-        """Ask for the firmware's version and the battery's voltage."""
-        wanted = [msp.FC_VARIANT, msp.FC_VERSION, *([msp.ANALOG] if self._sticks.battery.reference else [])]
+        """Ask for the firmware's version, and whether it can fly."""
+        wanted = (msp.FC_VARIANT, msp.FC_VERSION, msp.STATUS, msp.ANALOG)
         answers: dict[int, msp.Frame] = {}
         last, said = time.monotonic() + _HANDSHAKE, [""]
         while time.monotonic() < last:
@@ -87,9 +88,12 @@ class Betaflight(Component[BetaflightParameters]):
             for frame in self._parser.feed(data):
                 answers[frame.command] = frame
             if answers.keys() >= set(wanted):
-                if msp.ANALOG in wanted:
+                version = msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
+                if not (status := msp.status(answers[msp.STATUS])).armed:  # what flies goes on when the node is started again
                     self._take_battery(msp.battery(answers[msp.ANALOG]).voltage)
-                return msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
+                    if status.lasting:
+                        raise msp.MspError(f"{self.config.link}: the autopilot refuses to arm: {'; '.join(status.lasting)}")
+                return version
         noise = (f"{self._parser.skipped} bytes came that are no MSP: is the baud rate right, and the autopilot's command line closed?"
                  if self._parser.skipped else "")
         raise msp.MspError("; ".join(filter(None, (f"{self.config.link}: no autopilot answers within {_HANDSHAKE:g} s", said[-1], noise))))

@@ -10,6 +10,7 @@ optional extra (`python3 scripts/setup.py --extra mavlink`).
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ from perch_autopilot.clock import JUMP, jumped
 from perch_autopilot.offboard import ARDUPILOT, PX4, SILENT, Ask, Offboard
 from perch_autopilot.link import Link, LinkError
 
+_HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _COMMANDS = {176: "the mode", 400: "arming"}
@@ -80,7 +82,7 @@ class Mavlink(Component[MavlinkParameters]):
         Raises:
             ConfigError: there is no such vehicle.
             LinkError: the link cannot be opened.
-            PerchError: pymavlink is not installed.
+            PerchError: pymavlink is not installed, no heartbeat comes, or that of another autopilot.
         """
         super().__init__(config)
         try:
@@ -97,6 +99,21 @@ class Mavlink(Component[MavlinkParameters]):
         self._now: int | None = None         # of the last poll [ns]
         self._begun = self._came = self._second = self._torn = self._named = 0
         self._sampled: int | None = None     # stamp of its last sample, by its own clock [ns]
+        try:
+            self._identify()
+        except BaseException:
+            self._link.close()
+            raise
+
+    def _identify(self) -> None:
+        """Wait for the autopilot's first heartbeat."""
+        last = time.monotonic() + _HANDSHAKE
+        while not self.offboard.autopilot and (left := last - time.monotonic()) > 0.0:
+            for message in self._mavlink.parse_buffer(self._link.read(left)) or ():
+                if message.get_type() in ("HEARTBEAT", "BAD_DATA"):
+                    self._take(message, 0)
+        if trouble := self._trouble(0):
+            raise PerchError(f"{self.config.link}: {trouble}")
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 

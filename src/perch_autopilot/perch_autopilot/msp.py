@@ -35,6 +35,8 @@ ARMING_REASONS = (
     "altitude hold is switched on: switch it off", "position hold is switched on: switch it off")
 """Why the firmware refuses to arm, and what to do: by bit of its flags. Their number differs from 4.3 to 4.6, and the last one is always
 the same."""
+LASTING = (0, 13, 17, 21, 22, 23, 24)
+"""Bits of the reasons that need a repair, a setting or a restart: they do not pass while the node waits."""
 TOO_EARLY = "arming switch was on too early: switch it off first"
 
 
@@ -157,10 +159,12 @@ class Status(NamedTuple):
     Attributes:
         modes: flight modes that are on, a bit each, in the order of its boxes; bit 0 is ARM.
         refusals: why it does not arm, empty: it does.
+        lasting: those of them that do not pass by themselves, nor by the pilot's switches.
     """
 
     modes: int
     refusals: tuple[str, ...]
+    lasting: tuple[str, ...]
 
     @property
     def armed(self) -> bool:
@@ -180,7 +184,8 @@ def status(frame: Frame) -> Status:
         raise MspError(f"MSP {frame.command}: {len(frame.payload)} bytes, needs {at + 5}")
     count, flags = struct.unpack_from("<BI", frame.payload, at)
     words = (*ARMING_REASONS[:count - 1], TOO_EARLY)
-    return Status(modes, tuple(words[bit] if bit < len(words) else f"flag {bit}" for bit in range(32) if flags >> bit & 1))
+    found = {bit: words[bit] if bit < len(words) else f"flag {bit}" for bit in range(32) if flags >> bit & 1}
+    return Status(modes, tuple(found.values()), tuple(found[bit] for bit in LASTING if bit in found))
 
 
 class Battery(NamedTuple):

@@ -2,46 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import degrees, sqrt
 
 from perch_core.arrays import Numbers
 from perch_core.errors import ConfigError
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_autopilot.rate_curve import CENTRE, HALF, RateCurve
 
-CENTRE, HALF, LOW, HIGH = 1500, 500, 1000, 2000  # pulse widths [us]
+LOW, HIGH = 1000, 2000  # pulse widths [us]
 AXES = ("roll", "pitch", "yaw")
-
-
-@dataclass(frozen=True)
-class RateCurve:
-    """Betaflight's rate curve of type ACTUAL.
-
-        rate(s) = c s + (m - c) |s| (e s^5 + (1 - e) s),   s in [-1, 1]
-
-    Attributes:
-        centre: c, slope at the centre of the stick [deg/s].
-        most: m, at its end [deg/s].
-        expo: e, 0..1.
-    """
-
-    centre: float
-    most: float
-    expo: float
-
-    def rate(self, stick: float) -> float:
-        """Angular velocity [deg/s] at a stick's deflection in [-1, 1]."""
-        return self.centre * stick + max(self.most - self.centre, 0.0) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
-
-    def stick(self, rate: float) -> float:
-        """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. By bisection, as the curve rises."""
-        if abs(rate) >= self.rate(1.0):
-            return 1.0 if rate > 0 else -1.0
-        low, high = 0.0, 1.0
-        for _ in range(14):  # finer than a microsecond of the pulse
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.rate(middle) < abs(rate) else (low, middle)
-        return 0.5 * (low + high) if rate > 0 else -0.5 * (low + high) if rate < 0 else 0.0
 
 
 def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
@@ -63,6 +32,7 @@ class Sticks:
     """Channels of body rates and thrust, in Betaflight's order AETR: roll, pitch, throttle, yaw, then switches.
 
     Attributes:
+        curves: of roll, pitch, yaw.
         battery: how the thrust changes with the voltage.
     """
 
@@ -72,7 +42,7 @@ class Sticks:
             vehicle: its mass and thrust curve.
             curves: of roll, pitch, yaw.
         """
-        self._curves, self._mass, self._coefficient = curves, vehicle.mass, vehicle.thrust_coefficient
+        self.curves, self._mass, self._coefficient = curves, vehicle.mass, vehicle.thrust_coefficient
         self._idle, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self.battery, self._share = vehicle.actuation.battery, 1.0
 
@@ -104,5 +74,5 @@ class Sticks:
             thrust: of all rotors per mass [m/s^2].
         """
         p, q, r = (degrees(rate) for rate in rates)
-        roll, pitch, yaw = (round(CENTRE + HALF * curve.stick(rate)) for curve, rate in zip(self._curves, (p, q, -r)))
+        roll, pitch, yaw = (round(CENTRE + HALF * curve.stick(rate)) for curve, rate in zip(self.curves, (p, q, -r)))
         return roll, pitch, round(LOW + (HIGH - LOW) * self.throttle(thrust)), yaw

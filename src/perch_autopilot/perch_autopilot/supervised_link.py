@@ -18,10 +18,12 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from pathlib import Path
 
 from perch_autopilot import msp
+from perch_autopilot.rate_curve import RateCurve
 from perch_autopilot.watchdog import Mode, Watchdog
 from perch_autopilot.link import Link, LinkError
 
@@ -50,6 +52,7 @@ class LinkSupervisor:
         self._link: Link | None = Link(address)
         self._due = self._opened = clock()
         self._reported, self._node_gone, self._final_frames = Mode.DISARMED, False, 0
+        self._parser = msp.Parser()
 
     def run(self) -> None:
         """Run until the node has gone and the motors are off."""
@@ -82,7 +85,7 @@ class LinkSupervisor:
                 self._link = Link(self._address)
             except LinkError:
                 return
-        self._send(msp.channels(channels))
+        self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.levels(now) else b""))
 
     def _send(self, data: bytes) -> None:
         try:
@@ -114,9 +117,14 @@ class LinkSupervisor:
 
     def _forward(self, link: Link) -> None:
         try:
-            self._notify(b"D" + link.read())
+            data = link.read()
         except LinkError as error:
             self._close_link(error)
+            return
+        self._notify(b"D" + data)
+        for frame in self._parser.feed(data):
+            if frame.command == msp.ATTITUDE and not frame.refused and len(frame.payload) >= 6:
+                self._watchdog.attitude(self._clock(), *msp.attitude(frame)[:2])
 
     def _notify(self, packet: bytes) -> None:
         try:
@@ -128,11 +136,11 @@ class LinkSupervisor:
 class SupervisedLink:
     """The node's end."""
 
-    def __init__(self, address: str, hover: int, descent: int, disarm_after: float) -> None:
+    def __init__(self, address: str, hover: int, descent: int, disarm_after: float, curves: Sequence[RateCurve]) -> None:
         """
         Args:
             address: see `Link`.
-            hover, descent, disarm_after: see `Watchdog`.
+            hover, descent, disarm_after, curves: see `Watchdog`.
 
         Raises:
             LinkError: the link cannot be opened.
@@ -140,8 +148,8 @@ class SupervisedLink:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         passed = [theirs.fileno()] + ([int(address[3:])] if address.startswith("fd:") else [])
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, str(theirs.fileno()),
-                                         str(hover), str(descent), str(disarm_after)],
+        words = (theirs.fileno(), hover, descent, disarm_after, *(value for curve in curves for value in astuple(curve)))
+        self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, *map(str, words)],
                                         pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
                                         cwd=Path(__file__).parents[1], start_new_session=True)  # a Ctrl-C is not for it
         theirs.close()
@@ -202,13 +210,14 @@ class SupervisedLink:
 
 
 def main() -> None:
-    """The process: address, file number, hover, descent, disarm_after."""
-    address, number, hover, descent, disarm_after = sys.argv[1:]
+    """The process: address, file number, hover, descent, disarm_after; centre, most, expo of the curves of roll and pitch."""
+    address, number, hover, descent, disarm_after, *rest = sys.argv[1:]
+    roll, pitch = (RateCurve(*map(float, rest[k:k + 3])) for k in (0, 3))
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     control = socket.socket(fileno=int(number))
     try:
-        supervisor = LinkSupervisor(address, control, Watchdog(int(hover), int(descent), float(disarm_after)))
+        supervisor = LinkSupervisor(address, control, Watchdog(int(hover), int(descent), float(disarm_after), curves=(roll, pitch)))
     except LinkError as error:
         sys.exit(str(error))
     control.send(b"M")

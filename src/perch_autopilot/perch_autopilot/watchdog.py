@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 
-STICKS = 4
+from perch_autopilot.levelling import FAR, FRESH, sticks, tilt, up
+from perch_autopilot.rate_curve import RateCurve
+
 CENTRED = (1500, 1500, 1000, 1500)
 ON, OFF = 1900, 1000  # of a switch [us]
 ARMING = 0.2         # the throttle stays down for this time after arming, as the firmware requires [s]
@@ -31,13 +34,16 @@ class Watchdog:
         mode: present mode.
     """
 
-    def __init__(self, hover: int, descent: int, disarm_after: float = DISARM_AFTER, arming: float = ARMING) -> None:
+    def __init__(self, hover: int, descent: int, disarm_after: float = DISARM_AFTER, arming: float = ARMING,
+                 curves: Sequence[RateCurve] = ()) -> None:
         """
         Args:
             hover, descent: throttle that carries the weight, and that of the descent [us].
             disarm_after, arming: times [s], see `DISARM_AFTER`, `ARMING`.
+            curves: of roll and pitch, for levelling by rates; empty: the autopilot's self-level does all of it.
         """
-        self._disarm_after, self._arming = disarm_after, arming
+        self._curves, self._disarm_after, self._arming = curves, disarm_after, arming
+        self._up, self._seen = (0.0, 0.0, 1.0), -1e9  # in B, and when [s]
         self.set_throttles(hover, descent)
         self.mode = Mode.DISARMED
         self._sticks: Channels = CENTRED
@@ -47,6 +53,14 @@ class Watchdog:
     def set_throttles(self, hover: int, descent: int) -> None:
         """Set the throttles of hover and descent [us]; they rise as the battery empties."""
         self._hover, self._descent = hover, descent
+
+    def attitude(self, now: float, roll: float, pitch: float) -> None:
+        """Take the autopilot's attitude at a time [s]: roll and pitch of FRD against NED [rad]."""
+        self._up, self._seen = up(roll, pitch), now
+
+    def levels(self, now: float) -> bool:
+        """Whether its attitude is needed at a time [s]: commands are late."""
+        return bool(self._curves) and self._wanted and now - self._came > 0.5 * STALE_AFTER
 
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
         """Take a command.
@@ -71,7 +85,10 @@ class Watchdog:
             return (*(self._sticks if now - self._since >= self._arming else CENTRED), ON, OFF)
         elif age <= self._disarm_after:
             self.mode = Mode.LEVEL if age <= DESCEND_AFTER else Mode.DESCENDING
-            return (1500, 1500, self._hover if self.mode is Mode.LEVEL else self._descent, 1500, ON, ON)
+            throttle = self._hover if self.mode is Mode.LEVEL else self._descent
+            if self._curves and 0.0 <= now - self._seen <= FRESH and tilt(self._up) > FAR:
+                return (*sticks(self._up, self._curves), throttle, 1500, ON, OFF)
+            return (1500, 1500, throttle, 1500, ON, ON)
         else:
             self.mode, self._locked = Mode.DISARMED, True
         return (*CENTRED, OFF, OFF)

@@ -1,0 +1,38 @@
+"""The firmware's rate curve, forwards and backwards. Without numpy: the process that holds the link starts quickly and stays small."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+CENTRE, HALF = 1500, 500  # pulse widths [us]
+
+
+@dataclass(frozen=True)
+class RateCurve:
+    """Betaflight's rate curve of type ACTUAL.
+
+        rate(s) = c s + (m - c) |s| (e s^5 + (1 - e) s),   s in [-1, 1]
+
+    Attributes:
+        centre: c, slope at the centre of the stick [deg/s].
+        most: m, at its end [deg/s].
+        expo: e, 0..1.
+    """
+
+    centre: float
+    most: float
+    expo: float
+
+    def rate(self, stick: float) -> float:
+        """Angular velocity [deg/s] at a stick's deflection in [-1, 1]."""
+        return self.centre * stick + max(self.most - self.centre, 0.0) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
+
+    def stick(self, rate: float) -> float:
+        """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. By bisection, as the curve rises."""
+        if abs(rate) >= self.rate(1.0):
+            return 1.0 if rate > 0 else -1.0
+        low, high = 0.0, 1.0
+        for _ in range(14):  # finer than a microsecond of the pulse
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.rate(middle) < abs(rate) else (low, middle)
+        return 0.5 * (low + high) if rate > 0 else -0.5 * (low + high) if rate < 0 else 0.0
