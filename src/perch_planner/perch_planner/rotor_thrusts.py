@@ -102,7 +102,13 @@ def motion(coefficients: Array, duration: float, basis: Array) -> Array:
 
 @compiled
 def headings(yaw: Array, duration: float, basis: Array) -> Array:
-    """x and y of b2_des and of its first two derivatives on a segment, shape (6, places); yaw: shape (1, 15); basis: the second of `bases_at`."""
+    """x and y of b2_des and of its first two derivatives on a segment, shape (6, places). [M:eq12]
+
+    Args:
+        yaw: Bernstein coefficients of the heading, shape (1, 15) [rad].
+        duration: of the segment [s].
+        basis: the second of `bases_at`.
+    """
     count = basis.shape[1] // 3
     turn, out = np.empty((3, count)), np.empty((6, count))
     three_derivatives(yaw, 0, duration, basis, turn)
@@ -210,7 +216,16 @@ def _slopes(x: Array, heading: Array, mass: float, J: Vector3, mixing: Array, th
 
 @compiled
 def _functions(program: ProgramArrays, segment: int, at: Indices) -> Array:
-    """Acceleration, jerk and snap at places `at` of a segment from w of one dimension, and their constants in all three, shape (3 places, size + 3)."""
+    """Acceleration, jerk and snap at some places of a segment, as factors of w of one dimension and constants of all three.
+
+    Args:
+        program: fields of `ReducedProgram`.
+        segment: its number.
+        at: numbers of the places, shape (n,).
+
+    Returns:
+        Shape (3 n, size + 3), by derivative, then by place.
+    """
     duration, n = program[0][segment], len(at)
     rows = np.empty((3 * n, FUNCTIONS))
     for order in range(3):
@@ -218,7 +233,8 @@ def _functions(program: ProgramArrays, segment: int, at: Indices) -> Array:
         for k in range(n):
             for c in range(FUNCTIONS):
                 rows[order * n + k, c] = unit * _FUNCTIONS_AT[order * _COUNT + at[k], c]
-    return np.dot(rows, whitened(program, segment))
+    out: Array = np.dot(rows, whitened(program, segment))
+    return out
 
 
 @compiled
@@ -240,6 +256,7 @@ def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients:
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
     below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
     chosen = (thrusts < low + near) | (thrusts > high - near)
+    chosen[1:, :, 0] = False  # the end of the segment before
     count = chosen.sum()
     keys, rows = np.empty(count, np.int64), np.empty((count, 3 * m))
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
