@@ -12,7 +12,7 @@ from perch_planner import taylor_models
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState
 from perch_planner.rotor_proof import prove_rotors
-from perch_planner.rotor_thrusts import bases_at, motion, rotor_model, thrusts_along
+from perch_planner.rotor_thrusts import bases_at, headings, motion, rotor_model, thrusts_along
 
 VEHICLE = load_vehicle("snapdragon")
 ROTORS = rotor_model(VEHICLE)
@@ -63,10 +63,10 @@ def planned(request):
     found = plan(PerchProblem(StartState((0.0, 0.0, 1.2)), surface), PerchSettings(), VEHICLE)
     rows = found.trajectory.coefficients
     position, yaw, durations = np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3]), found.trajectory.durations
-    bases = bases_at(np.linspace(0.0, 1.0, 2000))
+    moved, turned = bases_at(np.linspace(0.0, 1.0, 2000))
     thrusts = np.empty((len(durations), 4, 2000))
     for i, duration in enumerate(durations):
-        thrusts_along(motion(position[i], yaw[i], duration, bases), *ROTORS, thrusts[i])
+        thrusts_along(motion(position[i], duration, moved), headings(yaw[i:i + 1], duration, turned), *ROTORS, thrusts[i])
     certificate = next(c for c in found.certificates if c.quantity == "rotor_thrust")
     return (position, yaw, durations), certificate, thrusts.min(), thrusts.max()
 

@@ -12,7 +12,7 @@ from perch_planner.cutting import limit_cuts, thrust_cuts
 from perch_planner.linear_bounds import BoundArrays
 from perch_planner.plan_checks import HOLDS, ROTOR_THRUST, check, thrust_extrema
 from perch_planner.rotor_proof import prove_rotors
-from perch_planner.rotor_thrusts import RotorModel, sampled
+from perch_planner.rotor_thrusts import Rotors, sampled
 
 _CUT_REACH = 1.7  # peaks beyond this multiple of the limit are stretched before they are cut
 _LOOK = 0.9       # of the least thrust: where the first plan's is greater, its rotors are bounded together with the thrust
@@ -32,8 +32,6 @@ class Question(NamedTuple):
         near: a thrust outside its range by less is cut together with the other limits [m/s^2].
         waypoints: peaks of the thrust in so many segments are stretched rather than cut; those after them only where they
             are high.
-        low_rotor, high_rotor: limits of a rotor's thrust [N].
-        rotors: of `rotor_thrusts.rotor_model`.
     """
 
     p_S: np.ndarray
@@ -50,9 +48,6 @@ class Question(NamedTuple):
     rate: float
     near: float
     waypoints: int
-    low_rotor: float
-    high_rotor: float
-    rotors: RotorModel
 
 
 class Judgement(NamedTuple):
@@ -93,15 +88,17 @@ def _better_stretched(extrema: Array, high: float, waypoints: int) -> bool:
 
 
 @compiled
-def judge(coefficients: Array, yaw: Array, durations: Array, question: tuple[Any, ...], patient: bool, later: bool
-          ) -> tuple[Array, Array, tuple[float, float, bool, bool, bool, bool], BoundArrays, BoundArrays, Array]:
+def judge(coefficients: Array, yaw: Array, heading: Array, durations: Array, question: tuple[Any, ...], rotors: Rotors, patient: bool,
+          later: bool) -> tuple[Array, Array, tuple[float, float, bool, bool, bool, bool], BoundArrays, BoundArrays, Array]:
     """Check a plan, and find cuts against what breaks a limit.
 
     Args:
         coefficients: of the position, shape (f, 3, 15) [m].
         yaw: of the heading, shape (f, 15) [rad].
+        heading: of `rotor_thrusts.plan_headings`.
         durations: shape (f,) [s].
         question: fields of `Question`.
+        rotors: their limits and model.
         patient: give up where longer durations promise more than cuts.
         later: this is not the first program: where the thrust is nearly in its range, the other limits count too.
 
@@ -109,8 +106,7 @@ def judge(coefficients: Array, yaw: Array, durations: Array, question: tuple[Any
         (extrema, results, (least, most, checked, kept, holds, stretch), thrust, other, thrusts): as in `Judgement`; cuts of the thrust
         and of the other limits, fields of `Bounds`; of `rotor_thrusts.sampled`, empty where the rotors were not looked at.
     """
-    (p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints, low_rotor, high_rotor,
-     rotors) = question
+    p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints = question
     extrema, least, most = thrust_extrema(coefficients, durations, low, high)
     broken = most > high or least < low
     stretch = broken and patient and _better_stretched(extrema, high, waypoints)
@@ -121,10 +117,10 @@ def judge(coefficients: Array, yaw: Array, durations: Array, question: tuple[Any
                                           high_height, extension, clearance, rate)
     thrusts = np.empty((0, 4, 0))
     if checked or not (later or stretch or least < _LOOK * low):
-        thrusts, row = sampled(coefficients, yaw, durations, low_rotor, high_rotor, *rotors)
-        kept = low_rotor <= row[0] and row[2] <= high_rotor
+        thrusts, row = sampled(coefficients, heading, durations, *rotors)
+        kept = rotors[0] <= row[0] and row[2] <= rotors[1]
         if kept and holds:
-            kept, row[0], row[2] = prove_rotors(coefficients, yaw, durations, row[0], row[2], low_rotor, high_rotor, *rotors)
+            kept, row[0], row[2] = prove_rotors(coefficients, yaw, durations, row[0], row[2], *rotors)
         results[ROTOR_THRUST, :4], results[ROTOR_THRUST, HOLDS] = row, kept
     cut = not stretch and not holds
     thrust = thrust_cuts(coefficients, durations, extrema, low if cut else -np.inf, high if cut else np.inf, side)

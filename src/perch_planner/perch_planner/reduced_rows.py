@@ -53,16 +53,11 @@ def whitened(program: ProgramArrays, segment: int) -> Array:
 def normalise(rows: Array, lower: Array, upper: Array) -> None:
     """Scale rows and their bounds to unit length."""
     for r in range(len(rows)):
-        squared = 0.0
+        scale = 1.0 / max(np.sqrt(np.dot(rows[r], rows[r])), 1e-300)
         for k in range(rows.shape[1]):
-            squared += rows[r, k] ** 2
-        norm = np.sqrt(squared)
-        if norm < 1e-300:
-            norm = 1.0
-        for k in range(rows.shape[1]):
-            rows[r, k] /= norm
-        lower[r] /= norm
-        upper[r] /= norm
+            rows[r, k] *= scale
+        lower[r] *= scale
+        upper[r] *= scale
 
 
 @compiled

@@ -17,7 +17,7 @@ from perch_core import bernstein
 from perch_core.arrays import Array, Vector3
 from perch_core.jit import compiled
 from perch_planner.bounds import largest, smallest, split
-from perch_planner.rotor_thrusts import motion
+from perch_planner.rotor_thrusts import motion, three_derivatives
 from perch_planner.taylor_models import (
     ROUNDING, ZERO, Taylor, Vector, add, axpy, cross, dot, greatest, inverse_root, least, mul, scale, sine, sub, times, vector_add)
 
@@ -57,11 +57,10 @@ def _numbers(rows: Array, powers: Array, work: Array) -> None:
         at = 4 * _LANES * n
         for lane in range(_LANES):
             work[at + lane], work[at + _LANES + lane] = powers[n, lane], powers[n, _LANES + lane]
-            work[at + 2 * _LANES + lane] = 2.0 * powers[n, 2 * _LANES + lane]
-            reach = 0.0
-            for k in range(3, _POWERS):
-                reach += k * (k - 1) * abs(powers[n, _LANES * k + lane])
-            work[at + 3 * _LANES + lane] = reach
+            work[at + 2 * _LANES + lane], work[at + 3 * _LANES + lane] = 2.0 * powers[n, 2 * _LANES + lane], 0.0
+        for k in range(3, _POWERS):
+            for lane in range(_LANES):
+                work[at + 3 * _LANES + lane] += k * (k - 1) * abs(powers[n, _LANES * k + lane])
 
 
 @compiled(inline=True)
@@ -168,7 +167,8 @@ def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: floa
     rows, length = np.empty((_DEPTH + 2, 12, _POWERS)), np.empty(_DEPTH + 2)
     nodes = 0
     for i in range(len(durations) - 1, -1, -1):  # backwards: the end asks most of the rotors
-        rows[0], length[0] = motion(coefficients[i], yaw[i], durations[i], _DERIVATIVES), durations[i]
+        rows[0, :9], length[0] = motion(coefficients[i], durations[i], _DERIVATIVES[0]), durations[i]
+        three_derivatives(yaw[i:i + 1], 0, durations[i], _DERIVATIVES[1], rows[0, 9:])
         top = 1
         while top > 0:
             top -= 1

@@ -13,7 +13,7 @@ It is smooth in acceleration, jerk and snap: its linearisation at the present pl
 from __future__ import annotations
 
 from functools import lru_cache
-from math import cos, perm, sin
+from math import cos, perm, pi, sin
 
 import numpy as np
 
@@ -25,12 +25,10 @@ from perch_core.vector3 import axpy, cross, norm, times
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.reduced_qp import ProgramArrays
 from perch_planner.reduced_rows import Rows, normalise, whitened
-from perch_planner.reference_element import DEGREE, TABLES
+from perch_planner.reference_element import DEGREE, FUNCTIONS, TABLES
 
 _COUNT = 49
-_FINER = 4  # samples from one place to the next, where a segment's thrusts come near a limit
-_SAMPLES = 0.5 - 0.5 * np.cos(np.pi * np.arange(_FINER * (_COUNT - 1) + 1) / (_FINER * (_COUNT - 1)))
-_PLACES = _SAMPLES[::_FINER].copy()  # where a rotor is bounded; dense at the ends, where polynomials turn fastest
+_PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(_COUNT) / (_COUNT - 1))  # dense at the ends, where polynomials turn fastest
 _FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
 _NO_THRUST = -1e3   # [N] in its place
 _ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
@@ -42,6 +40,9 @@ _BETWEEN = 1.5      # and by this multiple of what was seen between the places
 
 RotorModel = tuple[float, Vector3, Array]
 """Mass [kg], principal inertias [kg m^2], wrench to rotor thrusts, shape (4, 4)."""
+
+Rotors = tuple[float, float, float, Vector3, Array]
+"""Limits of a rotor's thrust [N], and the entries of `RotorModel`."""
 
 
 def rotor_model(vehicle: Vehicle) -> RotorModel:
@@ -61,43 +62,82 @@ def bases_at(places: Array) -> tuple[Array, Array]:
     return np.hstack(rows[2:]), np.hstack(rows[:3])
 
 
-_BASES, _FINE_BASES = bases_at(_PLACES), bases_at(_SAMPLES)
+_MOVED, _TURNED = bases_at(_PLACES)
 _FUNCTIONS_AT = np.vstack([bernstein.basis(DEGREE - n, _PLACES) @ TABLES[n, :DEGREE + 1 - n] for n in range(2, 5)])
 """Second to fourth derivative of the functions of the reference element at the places, shape (3 places, 15)."""
 
 
 @compiled
-def motion(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, Array]) -> Array:
-    """Specific force, jerk and snap, yaw and its first two derivatives at the places of `bases_at`, shape (12, places)."""
-    moved, turned = np.dot(coefficients, bases[0]), np.dot(yaw, bases[1])
-    count = len(turned) // 3
-    out = np.empty((12, count))
+def three_derivatives(coefficients: Array, order: int, duration: float, basis: Array, out: Array) -> None:
+    """Derivatives of three orders from `order` on, by order, then by polynomial.
+
+    Args:
+        coefficients: Bernstein coefficients, shape (r, 15).
+        order: of the first of them.
+        duration: of the segment [s].
+        basis: of `bases_at`, shape (15, 3 places).
+        out: receives the values, shape (3 r, places).
+    """
+    r, count = len(coefficients), out.shape[1]
     for n in range(3):
-        unit, slow = duration**-(n + 2), duration**-n
-        for d in range(3):
+        unit = duration ** -(order + n)
+        for d in range(r):
             for k in range(count):
-                out[3 * n + d, k] = unit * moved[d, n * count + k]
-        for k in range(count):
-            out[9 + n, k] = slow * turned[n * count + k]
-    for k in range(count):
+                out[n * r + d, k] = 0.0
+            for i in range(coefficients.shape[1]):
+                share = unit * coefficients[d, i]
+                for k in range(count):
+                    out[n * r + d, k] += share * basis[i, n * count + k]
+
+
+@compiled
+def motion(coefficients: Array, duration: float, basis: Array) -> Array:
+    """Specific force, jerk and snap of a segment, shape (9, places); basis: the first of `bases_at`."""
+    out = np.empty((9, basis.shape[1] // 3))
+    three_derivatives(coefficients, 2, duration, basis, out)
+    for k in range(out.shape[1]):
         out[2, k] += GRAVITY
     return out
 
 
 @compiled
-def thrusts_along(x: Array, mass: float, J: Vector3, mixing: Array, out: Array) -> None:
-    """Rotor thrusts [N] at each place of `motion`, into `out`, shape (4, places); -1000 N in all where no attitude is defined.
+def headings(yaw: Array, duration: float, basis: Array) -> Array:
+    """x and y of b2_des and of its first two derivatives on a segment, shape (6, places). [M:eq12]
 
-    The second loop has no branches: compiled, it takes several places at a time.
+    Args:
+        yaw: Bernstein coefficients of the heading, shape (1, 15) [rad].
+        duration: of the segment [s].
+        basis: the second of `bases_at`.
+    """
+    count = basis.shape[1] // 3
+    turn, out = np.empty((3, count)), np.empty((6, count))
+    three_derivatives(yaw, 0, duration, basis, turn)
+    for k in range(count):
+        h, dh, ddh = turned_heading(sin(turn[0, k]), cos(turn[0, k]), turn[1, k], turn[2, k])
+        out[0, k], out[1, k], out[2, k], out[3, k], out[4, k], out[5, k] = h[0], h[1], dh[0], dh[1], ddh[0], ddh[1]
+    return out
+
+
+@compiled
+def plan_headings(yaw: Array, durations: Array) -> Array:
+    """`headings` of each segment at the places where rotors may be bounded, shape (f, 6, 49); yaw: shape (f, 15) [rad]."""
+    out = np.empty((len(durations), 6, _COUNT))
+    for i in range(len(durations)):
+        out[i] = headings(yaw[i:i + 1], durations[i], _TURNED)
+    return out
+
+
+@compiled
+def thrusts_along(x: Array, heading: Array, mass: float, J: Vector3, mixing: Array, out: Array) -> None:
+    """Rotor thrusts [N] at each place of `motion` and `headings`, into `out`, shape (4, places); -1000 N in all where no attitude is defined.
+
+    The first loop has no branches: compiled, it takes several places at a time.
     """
     count = x.shape[1]
-    turn = np.empty((2, count))
-    for k in range(count):
-        turn[0, k], turn[1, k] = sin(x[9, k]), cos(x[9, k])
     for k in range(count):
         falls = norm((x[0, k], x[1, k], x[2, k])) < _FREE_FALL
         f = (x[0, k], x[1, k], 1.0 if falls else x[2, k])
-        h, dh, ddh = turned_heading(turn[0, k], turn[1, k], x[10, k], x[11, k])
+        h, dh, ddh = (heading[0, k], heading[1, k], 0.0), (heading[2, k], heading[3, k], 0.0), (heading[4, k], heading[5, k], 0.0)
         specific = norm(f)
         _, _, _, w, dw = commanded_frame(f, (x[3, k], x[4, k], x[5, k]), (x[6, k], x[7, k], x[8, k]), h, dh, ddh)
         M = axpy(1.0, times(J, dw), cross(w, times(J, w)))
@@ -123,63 +163,50 @@ def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
     bend = before - 2.0 * here + after
     shift = 0.5 * (before - after) / bend if sign * bend < 0.0 else 2.0
     if abs(shift) > 1.0:
-        return 0.5 - 0.5 * np.cos(np.pi * k / last), values[k]
-    return 0.5 - 0.5 * np.cos(np.pi * (middle + shift) / last), here - 0.25 * (before - after) * shift
+        return 0.5 - 0.5 * cos(pi * k / last), values[k]
+    return 0.5 - 0.5 * cos(pi * (middle + shift) / last), here - 0.25 * (before - after) * shift
 
 
 @compiled
-def _segment(coefficients: Array, yaw: Array, duration: float, bases: tuple[Array, Array], mass: float, J: Vector3, mixing: Array) -> Array:
-    """Rotor thrusts of a segment at the places of `bases_at`, shape (4, places) [N]."""
-    x = motion(coefficients, yaw, duration, bases)
-    out = np.empty((4, x.shape[1]))
-    thrusts_along(x, mass, J, mixing, out)
-    return out
-
-
-@compiled
-def sampled(coefficients: Array, yaw: Array, durations: Array, low: float, high: float, mass: float, J: Vector3, mixing: Array
+def sampled(coefficients: Array, heading: Array, durations: Array, low: float, high: float, mass: float, J: Vector3, mixing: Array
             ) -> tuple[Array, Array]:
     """Rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
-        yaw: of the heading, shape (f, 15) [rad].
+        heading: of `plan_headings`.
         durations: shape (f,) [s].
-        low, high: limits of a rotor's thrust [N]; segments that come near them are sampled more finely.
+        low, high: limits of a rotor's thrust [N].
         mass, J, mixing: of `rotor_model`.
 
     Returns:
         (thrusts, row): thrusts, shape (f, 4, 49) [N]; row: least and its time, greatest and its time, refined between
         the samples, shape (4,) [N, s].
     """
-    f, near = len(durations), _NEAR * (high - low)
-    out, row = np.empty((f, 4, _COUNT)), np.array([np.inf, 0.0, -np.inf, 0.0])
+    thrusts, row = np.empty((len(durations), 4, _COUNT)), np.array([np.inf, 0.0, -np.inf, 0.0])
     begin = 0.0
-    for i in range(f):
+    for i in range(len(durations)):
         T = durations[i]
-        found = _segment(coefficients[i], yaw[i], T, _BASES, mass, J, mixing)
-        out[i] = found
-        if found.min() < low + near or found.max() > high - near:
-            found = _segment(coefficients[i], yaw[i], T, _FINE_BASES, mass, J, mixing)
+        thrusts_along(motion(coefficients[i], T, _MOVED), heading[i], mass, J, mixing, thrusts[i])
         for q in range(4):
-            place, value = _vertex(found[q], found[q].argmin(), -1.0)
+            place, value = _vertex(thrusts[i, q], thrusts[i, q].argmin(), -1.0)
             if value < row[0]:
                 row[0], row[1] = value, begin + place * T
-            place, value = _vertex(found[q], found[q].argmax(), 1.0)
+            place, value = _vertex(thrusts[i, q], thrusts[i, q].argmax(), 1.0)
             if value > row[2]:
                 row[2], row[3] = value, begin + place * T
         begin += T
-    return out, row
+    return thrusts, row
 
 
 @compiled
-def _slopes(x: Array, mass: float, J: Vector3, mixing: Array, thrusts: Array) -> Array:
+def _slopes(x: Array, heading: Array, mass: float, J: Vector3, mixing: Array, thrusts: Array) -> Array:
     """Derivatives of the rotor thrusts with respect to specific force, jerk and snap, shape (9, 4, places)."""
     out = np.empty((9, 4, x.shape[1]))
     for e in range(9):
         step = _STEPS[e // 3]
         x[e] += step
-        thrusts_along(x, mass, J, mixing, out[e])
+        thrusts_along(x, heading, mass, J, mixing, out[e])
         x[e] -= step
         for q in range(4):
             for k in range(x.shape[1]):
@@ -188,53 +215,76 @@ def _slopes(x: Array, mass: float, J: Vector3, mixing: Array, thrusts: Array) ->
 
 
 @compiled
-def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients: Array, yaw: Array, low: float, high: float, mass: float,
+def _functions(program: ProgramArrays, segment: int, at: Indices) -> Array:
+    """Acceleration, jerk and snap at some places of a segment, as factors of w of one dimension and constants of all three.
+
+    Args:
+        program: fields of `ReducedProgram`.
+        segment: its number.
+        at: numbers of the places, shape (n,).
+
+    Returns:
+        Shape (3 n, size + 3), by derivative, then by place.
+    """
+    duration, n = program[0][segment], len(at)
+    rows = np.empty((3 * n, FUNCTIONS))
+    for order in range(3):
+        unit = duration ** -(order + 2)
+        for k in range(n):
+            for c in range(FUNCTIONS):
+                rows[order * n + k, c] = unit * _FUNCTIONS_AT[order * _COUNT + at[k], c]
+    out: Array = np.dot(rows, whitened(program, segment))
+    return out
+
+
+@compiled
+def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients: Array, heading: Array, low: float, high: float, mass: float,
                J: Vector3, mixing: Array) -> tuple[Indices, Rows]:
     """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:
         program: fields of `ReducedProgram`.
         thrusts, row: of `sampled`; what lies beyond the limits between the places is made up for at the places.
-        coefficients, yaw, mass, J, mixing: as for `sampled`.
+        coefficients, heading, mass, J, mixing: as for `sampled`.
         low, high: limits of a rotor's thrust [N].
 
     Returns:
         (keys, rows): for each rotor and place near a limit an ascending number that names segment, place and rotor, and a row of w.
     """
-    durations, first, unit, spread, centre = program
-    near, keep, m = _NEAR * (high - low), _KEEP * (high - low), len(spread)
+    durations, m = program[0], len(program[3])
+    near, keep = _NEAR * (high - low), _KEEP * (high - low)
     above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
     below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
     chosen = (thrusts < low + near) | (thrusts > high - near)
+    chosen[1:, :, 0] = False  # the end of the segment before
     count = chosen.sum()
-    keys, rows = np.empty(count, np.int64), np.zeros((count, 3 * m))
+    keys, rows = np.empty(count, np.int64), np.empty((count, 3 * m))
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
     r = 0
     for i in range(len(durations)):
-        if not chosen[i].any():
+        at = np.nonzero(chosen[i, 0] | chosen[i, 1] | chosen[i, 2] | chosen[i, 3])[0]
+        n = len(at)
+        if n == 0:
             continue
-        x = motion(coefficients[i], yaw[i], durations[i], _BASES)
-        slopes = _slopes(x, mass, J, mixing, thrusts[i])
-        values = np.dot(_FUNCTIONS_AT, whitened(program, i))
-        for k in range(_COUNT):
+        x = motion(coefficients[i], durations[i], _MOVED)[:, at]
+        slopes = _slopes(x, heading[i][:, at], mass, J, mixing, thrusts[i][:, at])
+        values = _functions(program, i, at)
+        for k in range(n):
             for q in range(4):
-                if not chosen[i, q, k]:
+                if not chosen[i, q, at[k]]:
                     continue
-                known = -thrusts[i, q, k]
-                for n in range(3):
-                    at, part = n * _COUNT + k, durations[i] ** -(n + 2)
-                    for d in range(3):
-                        slope = slopes[3 * n + d, q, k]
-                        known += slope * (x[3 * n + d, k] - part * values[at, m + d])
-                        for c in range(m):
-                            rows[r, d * m + c] += slope * part * values[at, c]
-                    if n == 0:
-                        known -= slopes[2, q, k] * GRAVITY  # the program knows the acceleration
-                if thrusts[i, q, k] < low + near:
+                known = -thrusts[i, q, at[k]] - slopes[2, q, k] * GRAVITY  # the program knows the acceleration
+                for d in range(3):
+                    a, j, s = slopes[d, q, k], slopes[3 + d, q, k], slopes[6 + d, q, k]
+                    known += (a * (x[d, k] - values[k, m + d]) + j * (x[3 + d, k] - values[n + k, m + d])
+                              + s * (x[6 + d, k] - values[2 * n + k, m + d]))
+                    for c in range(m):
+                        rows[r, d * m + c] = a * values[k, c] + j * values[n + k, c] + s * values[2 * n + k, c]
+                if thrusts[i, q, at[k]] < low + near:
                     lower[r] = above + known
                 else:
                     upper[r] = below + known
-                keys[r] = (i * _COUNT + k) * 4 + q
+                keys[r] = (i * _COUNT + at[k]) * 4 + q
                 r += 1
     normalise(rows, lower, upper)
     return keys, (rows, lower, upper)

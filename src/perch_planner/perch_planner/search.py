@@ -84,7 +84,8 @@ class Search:
         self.question = Question(
             problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turning_side(self.end_yaw), self.low,
             self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _NEAR * self.high,
-            len(problem.waypoints), *limits.rotor_thrust, rotor_model(vehicle))
+            len(problem.waypoints))
+        self.rotors = (*limits.rotor_thrust, *rotor_model(vehicle))
         self.attempts: list[Attempt] = []
         self.acted = {"tangential_speed_max", "clearance_min"}
         """Settings whose limits had an influence on the search: those of rows that every program has, and those that plans left."""
@@ -102,17 +103,17 @@ class Search:
         """
         settings, start = self.settings, self.problem.start
         nothing = Outcome(durations)
-        try:
-            program = SegmentProgram(self.contact, durations, settings, self.question)
-        except np.linalg.LinAlgError:
-            return nothing
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
+        try:
+            program = SegmentProgram(self.contact, durations, settings, yaw, self.question, self.rotors)
+        except np.linalg.LinAlgError:
+            return nothing
         best, count, duration = None, 0, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= self._iterations_max:
                 break
-            found = program.judged(yaw, patient, rounds > 0)
+            found = program.judged(patient, rounds > 0)
             if found is None:
                 self._note(duration, np.nan, np.nan, count)
                 break

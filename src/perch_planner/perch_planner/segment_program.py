@@ -16,18 +16,18 @@ from perch_planner.problem import PerchSettings
 from perch_planner.reduced_qp import ProgramArrays, assemble, coefficients
 from perch_planner.reduced_rows import Rows, rows_of, stacked
 from perch_planner.reference_element import GRAMS
-from perch_planner.rotor_thrusts import rotor_rows
+from perch_planner.rotor_thrusts import Rotors, plan_headings, rotor_rows
 
 COST_ORDER = {"snap": 4, "jerk": 3}
 
 
 @compiled
-def _prepare(durations: Array, velocity: Array, problem: tuple[Any, ...], everywhere: bool, gram: Array, cost_order: int
-             ) -> tuple[tuple[Indices, float, Array, Array], Rows]:
-    """Program and rows of tube and window in one call: several calls cost more than they compute."""
+def _prepare(durations: Array, yaw: Array, velocity: Array, problem: tuple[Any, ...], everywhere: bool, gram: Array, cost_order: int
+             ) -> tuple[tuple[Indices, float, Array, Array], Rows, Array]:
+    """Program, rows of tube and window, and headings in one call: several calls cost more than they compute."""
     given, values, bubbles, bounds = conditions(durations, everywhere, velocity, problem)
     program = assemble(durations, given, values, bubbles, gram, cost_order)
-    return program[1:], rows_of(program, bounds)
+    return program[1:], rows_of(program, bounds), plan_headings(yaw, durations)
 
 
 @compiled
@@ -43,22 +43,22 @@ def _carried(keys: Indices, dual: Array, to: Indices) -> Array:
 
 
 @compiled
-def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: Array, yaw: Array, question: tuple[Any, ...], patient: bool,
-            later: bool, turning: bool) -> tuple[tuple[Any, ...], Rows, Indices, Array]:
+def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: Array, yaw: Array, heading: Array,
+            question: tuple[Any, ...], rotors: Rotors, patient: bool, later: bool, turning: bool) -> tuple[tuple[Any, ...], Rows, Indices, Array]:
     """A solution's plan, what it is worth, and the next program.
 
     Args:
         program: fields of `ReducedProgram`.
         rows: of the program that was solved; the last ones, one for each of `keys`, hold near its plan alone.
         w, dual: its solution.
-        yaw, question, patient, later: as for `judgement.judge`.
+        yaw, heading, question, rotors, patient, later: as for `judgement.judge`.
         turning: a rotor has left its range before.
 
     Returns:
         (fields of `Judgement`, rows and keys of the next program, multipliers where it may start).
     """
     plan = coefficients(program, w)
-    extrema, results, found, thrust, other, thrusts = judge(plan, yaw, program[0], question, patient, later)
+    extrema, results, found, thrust, other, thrusts = judge(plan, yaw, heading, program[0], question, rotors, patient, later)
     fixed, cuts, kept = len(dual) - len(keys), 0, found[3]
     always, near = (rows[0][:fixed], rows[1][:fixed], rows[2][:fixed]), (rows[0][fixed:], rows[1][fixed:], rows[2][fixed:])
     for bounds in (thrust, other):
@@ -67,37 +67,44 @@ def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: A
             cuts += len(bounds[-1])
     to, count = keys, 0
     if len(thrusts) and (turning or not kept) and not (kept and found[4]):
-        to, near = rotor_rows(program, thrusts, results[ROTOR_THRUST], plan, yaw, question[-3], question[-2], *question[-1])
+        to, near = rotor_rows(program, thrusts, results[ROTOR_THRUST], plan, heading, *rotors)
         count = len(to)
     start = np.concatenate((dual[:fixed], np.zeros(cuts), _carried(keys, dual[fixed:], to)))
     return (plan, extrema, results, *found, cuts, count), stacked(always, near), to, start
 
 
 class SegmentProgram:
-    """The reduced program (`reduced_qp`) of a perch with the durations of its segments [s], shape (f,), and its rows."""
+    """The reduced program (`reduced_qp`) of a perch with the durations of its segments [s], shape (f,), and its rows.
 
-    def __init__(self, contact: Contact, durations: Array, settings: PerchSettings, question: Question) -> None:
-        self._solver, self._question, cost_order = settings.solver, tuple(question), COST_ORDER[settings.objective]
-        program, self._rows = _prepare(durations, contact.velocity, contact.problem, settings.objective == "jerk", GRAMS[cost_order],
-                                       cost_order)
+    Args:
+        contact, durations, settings: of the program.
+        yaw, question, rotors: as for `judgement.judge`.
+    """
+
+    def __init__(self, contact: Contact, durations: Array, settings: PerchSettings, yaw: Array, question: Question, rotors: Rotors) -> None:
+        self._solver, self._question, self._rotors, cost_order = settings.solver, tuple(question), rotors, COST_ORDER[settings.objective]
+        program, self._rows, heading = _prepare(durations, yaw, contact.velocity, contact.problem, settings.objective == "jerk",
+                                                GRAMS[cost_order], cost_order)
         self._program: ProgramArrays = (durations, *program)
+        self._yaw, self._heading = yaw, heading
         self._keys: Indices = np.empty(0, np.int64)  # of rows that hold near the present plan alone
         self._dual: Array | None = None
         self.turning = False
         """A rotor has left its range."""
 
-    def judged(self, yaw: Array, patient: bool, later: bool) -> Judgement | None:
+    def judged(self, patient: bool, later: bool) -> Judgement | None:
         """Solve, judge the plan and add the bounds that were found; None where the program has no solution.
 
         Args:
-            yaw, patient, later: as for `judgement.judge`.
+            patient, later: as for `judgement.judge`.
         """
         solution = solvers.least_norm(*self._rows, self._solver, self._dual)
         if not solution.solved:
             return None
         dual = np.zeros(len(self._rows[1])) if solution.dual is None else solution.dual
-        fields, self._rows, self._keys, self._dual = _judged(self._program, self._rows, self._keys, solution.w, dual, yaw, self._question,
-                                                             patient, later, self.turning)
+        fields, self._rows, self._keys, self._dual = _judged(
+            self._program, self._rows, self._keys, solution.w, dual, self._yaw, self._heading, self._question, self._rotors, patient, later,
+            self.turning)
         found = Judgement(*fields)
         self.turning = self.turning or not found.kept
         return found
