@@ -50,12 +50,14 @@ class Encoders:
         return encode
 
     def parse_buffer(self, data: bytes) -> list:
-        return []
+        """PX4's heartbeat."""
+        return [SimpleNamespace(get_type=lambda: "HEARTBEAT", get_srcSystem=lambda: 1, get_srcComponent=lambda: 1, type=2, autopilot=12,
+                                base_mode=0, custom_mode=0, system_status=4)]
 
 
 @pytest.fixture(scope="module")
 def node():
-    """The node `mavlink`, on a link at whose other end nobody is."""
+    """The node `mavlink`, on a link at whose other end somebody is."""
     names = ["pymavlink", "pymavlink.dialects", "pymavlink.dialects.v20"]
     before = {name: sys.modules.get(name) for name in names}
     modules = {name: ModuleType(name) for name in names}

@@ -345,7 +345,7 @@ def test_samples_and_attitude_come_in_the_axes_that_are_read():
             R = Rotation.from_euler("ZYX", rng.uniform((-170, -70, -170), (170, 70, 170)), degrees=True)
             gyro, force, q = rng.uniform(-2.0, 2.0, 3), R.inv().apply(GRAVITY), R.as_quat()[[3, 0, 1, 2]]
             got: dict = {}
-            for _ in range(100):
+            for _ in range(500):
                 running.step(gyro, force, q, (1500, 1500, 1000, 1500))
             running.send(msp.request(msp.RAW_IMU) + msp.request(msp.ATTITUDE))
             for _ in range(1000):
