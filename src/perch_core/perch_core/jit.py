@@ -2,12 +2,16 @@
 
 Compiled code is cached beside its source, so that only the first process of a checkout pays for it. PERCH_NUMBA=0 turns
 compilation off: the same results to rounding, many times slower.
+
+Two habits of numba cost each process more than its kernels, and are kept from it: it imports `coverage` where that is installed (a
+tenth of a second), and it registers all that it can compile before it loads the first compiled kernel (half a second).
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
@@ -16,12 +20,17 @@ from typing import Any, TypeVar, cast, overload
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 njit: Any = None
+_absent = [name for name in ("coverage",) if name not in sys.modules]  # where nobody measures it, `import coverage` fails meanwhile
 try:
     if os.environ.get("PERCH_NUMBA") == "0":
         raise ImportError
+    sys.modules.update(dict.fromkeys(_absent))  # type: ignore[arg-type]
     from numba import njit
 except ImportError:
     pass
+finally:
+    for name in _absent:
+        sys.modules.pop(name, None)
 
 COMPILED = njit is not None
 
@@ -46,6 +55,17 @@ def _package(file: Path) -> Path:
     return folder
 
 
+def _load(cache: Any, signature: Any, target: Any) -> Any:
+    """A kernel's compiled code for a signature from its cache; None where there is none, and the compiler registers what it needs.
+
+    In place of `numba.core.caching.Cache.load_overload`. What compiled code calls in numba's runtime has to be there.
+    """
+    from numba.core.runtime import rtsys
+
+    rtsys.initialize(target)
+    return cache._load_overload(signature, target)
+
+
 @overload
 def compiled(kernel: Kernel) -> Kernel: ...
 @overload
@@ -67,9 +87,11 @@ def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -
     out = njit(cache=True, error_model="numpy", nogil=nogil, forceinline=inline)(kernel)
     # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
     # unseen. The hash of all sources with kernels takes the place of that file's date.
-    index: Any = getattr(getattr(out, "_cache", None), "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
-        index._source_stamp = _stamp(_package(Path(kernel.__code__.co_filename)))
+    cache: Any = getattr(out, "_cache", None)
+    if hasattr(getattr(cache, "_cache_file", None), "_source_stamp"):
+        cache._cache_file._source_stamp = _stamp(_package(Path(kernel.__code__.co_filename)))
+    if hasattr(cache, "_load_overload"):
+        cache.load_overload = partial(_load, cache)
     return out
 
 
