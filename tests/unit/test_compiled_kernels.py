@@ -37,8 +37,12 @@ import sys
 import numpy as np
 import kernels
 
-assert "numba" not in sys.modules and pickle.loads(pickle.dumps(kernels.norm)) is kernels.norm
+from perch_core.jit import uncompiled
+
 x = np.array([3.0, 0.0, -4.0])
+with uncompiled():
+    assert kernels.unit(x).tolist() == [0.6, 0.0, -0.8]
+assert "numba" not in sys.modules and pickle.loads(pickle.dumps(kernels.norm)) is kernels.norm
 norm, compiler = kernels.norm(x), "numba.typed.typeddict" in sys.modules
 print(norm, compiler, "coverage" in sys.modules, *[float(value) for value in kernels.unit(x)], sum(kernels.norm.dispatcher.stats.cache_hits.values()))
 """

@@ -13,7 +13,8 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property, lru_cache, partial, update_wrapper
 from importlib.util import find_spec
 from pathlib import Path
@@ -79,6 +80,8 @@ class _Compiled:
         py_func: the plain function.
     """
 
+    plain = False  # what `uncompiled` switches, for all kernels
+
     def __init__(self, kernel: Callable[..., Any], options: dict[str, Any]) -> None:
         self.py_func, self._options = kernel, options
         update_wrapper(self, kernel)
@@ -97,7 +100,7 @@ class _Compiled:
         return out
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.dispatcher(*arguments)
+        return self.py_func(*arguments) if self.plain else self.dispatcher(*arguments)
 
     def __reduce__(self) -> str:
         return self.py_func.__qualname__  # pickled as a function is
@@ -128,3 +131,13 @@ def interpreted(kernel: Kernel) -> Kernel:
     """The plain function of a kernel."""
     plain: Kernel = cast(Any, kernel).py_func
     return plain
+
+
+@contextmanager
+def uncompiled() -> Iterator[None]:
+    """Kernels that are called meanwhile, by any thread, are interpreted: a few calls in a process that needs no others are not worth numba's import."""
+    _Compiled.plain = True
+    try:
+        yield
+    finally:
+        _Compiled.plain = False
