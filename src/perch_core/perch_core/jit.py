@@ -2,28 +2,44 @@
 
 Compiled code is cached beside its source, so that only the first process of a checkout pays for it. PERCH_NUMBA=0 turns
 compilation off: the same results to rounding, many times slower.
+
+Much of numba's own cost is spared: it is imported by the first call of a kernel, as most processes import kernels and call none
+(0.3 s); without `coverage`, where nobody measures that (0.1 s); and compiled code is loaded without registering everything that could
+be compiled (0.5 s).
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
-from functools import lru_cache, partial
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property, lru_cache, partial, update_wrapper
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, cast, overload
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-njit: Any = None
-try:
-    if os.environ.get("PERCH_NUMBA") == "0":
-        raise ImportError
-    from numba import njit
-except ImportError:
-    pass
+COMPILED = os.environ.get("PERCH_NUMBA") != "0" and find_spec("numba") is not None
 
-COMPILED = njit is not None
+
+@lru_cache(maxsize=None)
+def _njit() -> Any:
+    """numba's decorator; numba takes our kernels for its own."""
+    measured = "coverage" in sys.modules
+    if not measured:
+        sys.modules["coverage"] = cast(Any, None)  # numba goes on where this import fails
+    try:
+        from numba import njit
+        from numba.core import types
+        from numba.core.typing.typeof import typeof_impl
+    finally:
+        if not measured:
+            del sys.modules["coverage"]
+    typeof_impl.register(_Compiled)(lambda kernel, _: types.Dispatcher(kernel.dispatcher))
+    return njit
 
 
 @lru_cache(maxsize=None)
@@ -46,6 +62,50 @@ def _package(file: Path) -> Path:
     return folder
 
 
+def _load(cache: Any, signature: Any, target: Any) -> Any:
+    """A kernel's compiled code for a signature from its cache; None where there is none, and the compiler registers what it needs.
+
+    In place of `numba.core.caching.Cache.load_overload`. What compiled code calls in numba's runtime has to be there.
+    """
+    from numba.core.runtime import rtsys
+
+    rtsys.initialize(target)
+    return cache._load_overload(signature, target)
+
+
+class _Compiled:
+    """A kernel that numba compiles, or loads, when it is called. A call costs about 0.2 us more than one of numba's own.
+
+    Attributes:
+        py_func: the plain function.
+    """
+
+    plain = False  # what `uncompiled` switches, for all kernels
+
+    def __init__(self, kernel: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.py_func, self._options = kernel, options
+        update_wrapper(self, kernel)
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """numba's own object for this kernel."""
+        out = _njit()(cache=True, error_model="numpy", **self._options)(self.py_func)
+        # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
+        # unseen. The hash of all sources with kernels takes the place of that file's date.
+        cache: Any = getattr(out, "_cache", None)
+        if hasattr(getattr(cache, "_cache_file", None), "_source_stamp"):
+            cache._cache_file._source_stamp = _stamp(_package(Path(self.py_func.__code__.co_filename)))
+        if hasattr(cache, "_load_overload"):
+            cache.load_overload = partial(_load, cache)
+        return out
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.py_func(*arguments) if self.plain else self.dispatcher(*arguments)
+
+    def __reduce__(self) -> str:
+        return self.py_func.__qualname__  # pickled as a function is
+
+
 @overload
 def compiled(kernel: Kernel) -> Kernel: ...
 @overload
@@ -61,19 +121,23 @@ def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -
     """
     if kernel is None:
         return partial(compiled, nogil=nogil, inline=inline)
-    if njit is None:
+    if not COMPILED:
         kernel.py_func = kernel
         return kernel
-    out = njit(cache=True, error_model="numpy", nogil=nogil, forceinline=inline)(kernel)
-    # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
-    # unseen. The hash of all sources with kernels takes the place of that file's date.
-    index: Any = getattr(getattr(out, "_cache", None), "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
-        index._source_stamp = _stamp(_package(Path(kernel.__code__.co_filename)))
-    return out
+    return _Compiled(kernel, {"nogil": nogil, "forceinline": inline})
 
 
 def interpreted(kernel: Kernel) -> Kernel:
     """The plain function of a kernel."""
     plain: Kernel = cast(Any, kernel).py_func
     return plain
+
+
+@contextmanager
+def uncompiled() -> Iterator[None]:
+    """Kernels that are called meanwhile, by any thread, are interpreted: a few calls in a process that needs no others are not worth numba's import."""
+    _Compiled.plain = True
+    try:
+        yield
+    finally:
+        _Compiled.plain = False

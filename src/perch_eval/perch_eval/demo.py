@@ -13,6 +13,7 @@ from pathlib import Path
 from perch_autopilot import firmware
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
+from perch_core.jit import uncompiled
 from perch_core.vehicle import load_vehicle
 from perch_eval.arguments import command_parser, exit_code, open_network, output_folder
 from perch_eval.domain import own_domain
@@ -73,7 +74,8 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
     if vehicle:
         is_file = vehicle.endswith((".yaml", ".yml"))
         scenario = replace(scenario, vehicle=str(config.find("vehicles", vehicle).resolve()) if is_file else vehicle)
-    check_flight(scenario, source)
+    with uncompiled():
+        check_flight(scenario, source)
     if load_vehicle(scenario.vehicle).actuation.firmware:
         firmware.ensured()
     if not 0 <= seed < 2**31:

@@ -67,11 +67,14 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), classes: Sequ
 
 
 def image(figure: Figure | None, title: str = "") -> str:
-    """A figure; empty where there is none."""
+    """A figure; empty where there is none. `savefig` would draw it twice: the first time for its layout alone."""
     if figure is None:
         return ""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=95)
+    figure.set_dpi(95)
+    FigureCanvasAgg(figure).print_png(png)
     return f'<img alt="{text(title)}" src="data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}">'
 
 
