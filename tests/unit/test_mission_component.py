@@ -150,12 +150,12 @@ def test_an_answer_counts_from_its_due_time_on():
     assert seconds(request.start) == world.orders[-1].trajectory.start_time
 
 
-@pytest.mark.parametrize(("told", "asked"), [(0.83, 0.83), (0.0, None)])
-def test_a_plan_is_asked_for_with_the_thrust_that_the_controller_has_found(told, asked):
+@pytest.mark.parametrize("ratio", [0.83, 0.0])
+def test_a_plan_is_asked_for_with_the_thrust_that_the_controller_has_found(ratio):
     world = World()
-    world.thrust_ratio = told
+    world.thrust_ratio = ratio
     world.send().run(until=lambda w: w.requests)
-    assert world.requests[0][0].thrust_ratio == asked
+    assert world.requests[0][0].thrust_ratio == ratio
 
 
 def test_a_late_answer_is_used_when_it_comes():

@@ -101,7 +101,7 @@ def test_speed_and_slip_are_bounded_for_contacts_on_time_and_late(ask: Asked, in
 
 
 def test_rotors_that_give_less_are_planned_for(ask: Asked) -> None:
-    whole, weaker = ({c.quantity: c for c in ask(request(thrust_ratio=ratio)).certificates} for ratio in (None, 0.83))
+    whole, weaker = ({c.quantity: c for c in ask(request(thrust_ratio=ratio)).certificates} for ratio in (0.0, 0.83))
     for quantity in ("thrust", "rotor_thrust"):
         assert weaker[quantity].upper_limit == pytest.approx(0.83 * whole[quantity].upper_limit) and weaker[quantity].holds
     assert weaker["rotor_thrust"].maximum <= weaker["rotor_thrust"].upper_limit < whole["rotor_thrust"].maximum

@@ -271,7 +271,7 @@ class Mission(Component[MissionParameters]):
         surface = running.goal.value.mode == Mode.SURFACE
         channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
         asked = self._asked[channel].add(Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time))))
-        ratio = self._status.thrust_ratio or None if self._status is not None else None
+        ratio = self._status.thrust_ratio if self._status is not None else 0.0
         getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), asked.due)
         return asked
 

@@ -88,7 +88,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            vehicle = self._vehicle if request.thrust_ratio is None else self._vehicle.giving(request.thrust_ratio)
+            vehicle = self._vehicle.giving(request.thrust_ratio or 1.0)
             arguments = (method, problem, perch_settings(request, self.config.settings, problem.surface), vehicle)
         except PerchError as error:
             answer(error)

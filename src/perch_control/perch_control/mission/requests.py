@@ -12,8 +12,8 @@ from perch_core.values import AtEnd, PerchPlan, PerchPlanRequest, PowerlinePlan,
 from perch_control.mission.values import Plan, PlanQuery, Refusal
 
 
-def perch_request(query: PlanQuery, thrust_ratio: float | None = None) -> PerchPlanRequest:
-    """The request for a perch on a surface; `thrust_ratio`: of the vehicle that flies, over its file's."""
+def perch_request(query: PlanQuery, thrust_ratio: float) -> PerchPlanRequest:
+    """The request for a perch on a surface; `thrust_ratio`: as the controller tells it."""
     return PerchPlanRequest(
         start=nanoseconds(query.start_time), p=query.p, v=query.v, a=query.a, j=query.j, yaw=float(query.yaw), current=query.current,
         p_WS=query.target.p_WS, q_WS=query.target.q_WS, segment_times=() if query.duration is None else (float(query.duration),),

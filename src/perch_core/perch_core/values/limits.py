@@ -238,7 +238,7 @@ LIMITS: dict[type, dict[str, Any]] = {
         "waypoints": Limit(-1e4, 1e4, "m", (-1, 3), 50), "segment_times": Limit(0.01, PLAN_LONGEST, "s", (-1,), 51),
         "impact_acceleration": Limit(0.0, 100.0, "m/s^2"), "impact_speed_min": Limit(0.0, 20.0, "m/s"),
         "impact_speed_max": Limit(0.0, 20.0, "m/s"), "thrust_max": Limit(0.01, 1e3, "N"), "thrust_min": Limit(0.0, 1e3, "N"),
-        "thrust_ratio": Limit(0.1, 2.0, ""), "objective": Limit(0, 4)},
+        "thrust_ratio": Limit(0.0, 2.0, ""), "objective": Limit(0, 4)},
     PowerlinePlanRequest: {
         "start": STAMP, "p": POSITION, "q": Unit(1e-2), "v": VELOCITY, "w": TURN_RATE, "rotor_thrust": Limit(0.0, 1e3, "N", (-1,), 4),
         "lines": Each(MappedPowerline, PLAN_LINES_MAX), "target_line": ID, "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-9, "rad"),

@@ -64,7 +64,7 @@ class PerchPlanRequest:
         waypoints: positions to pass [m], shape (k, 3).
         segment_times: first guess [s]; empty: the planner's.
         impact_acceleration, impact_speed_min, impact_speed_max, thrust_max, thrust_min: [m/s^2], [m/s], [N]; None: the planner's.
-        thrust_ratio: thrust that the rotors give, over the vehicle file's; None: 1.
+        thrust_ratio: thrust that the rotors give, over the vehicle file's; 0: as in the file.
         objective: 0 the planner's, 4 snap, 3 jerk.
         minimum_time: shorten the plan until a bound is active.
     """
@@ -87,7 +87,7 @@ class PerchPlanRequest:
     impact_speed_max: float | None = None
     thrust_max: float | None = None
     thrust_min: float | None = None
-    thrust_ratio: float | None = None
+    thrust_ratio: float = 0.0
     objective: int = 0
     minimum_time: bool = False
 

@@ -13,7 +13,7 @@ from perch_core.values import Certificate, PerchPlan, PerchPlanRequest, Powerlin
 from perch_msgs.msg import Certificate as CertificateMessage
 from perch_msgs.srv import PlanPerch, PlanPowerline
 
-OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min", "thrust_ratio")
+OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
 
 
 def _array(v: Vector3 | Point) -> np.ndarray:
@@ -48,7 +48,8 @@ def perch_request_message(r: PerchPlanRequest) -> PlanPerch.Request:
         start_time=to_stamp(r.start), start_position=to_point(r.p), start_velocity=to_vector(r.v), start_acceleration=to_vector(r.a),
         start_jerk=to_vector(r.j), start_yaw=float(r.yaw), start_yaw_rate=float(r.yaw_rate), target=to_pose(r.p_WS, r.q_WS),
         target_velocity=to_vector(r.target_velocity), waypoints=[to_point(p) for p in r.waypoints],
-        segment_times=[float(t) for t in r.segment_times], objective=int(r.objective), minimum_time=bool(r.minimum_time))
+        segment_times=[float(t) for t in r.segment_times], thrust_ratio=float(r.thrust_ratio), objective=int(r.objective),
+        minimum_time=bool(r.minimum_time))
     for name in OPTIONS:
         value = getattr(r, name)
         setattr(msg, name, math.nan if value is None else float(value))
@@ -70,7 +71,8 @@ def perch_request_value(msg: PlanPerch.Request) -> PerchPlanRequest:
         j=_array(msg.start_jerk), yaw=msg.start_yaw, yaw_rate=msg.start_yaw_rate,
         current=trajectory_value(msg.current) if msg.from_trajectory else None, p_WS=p_WS, q_WS=q_WS,
         target_velocity=_array(msg.target_velocity), waypoints=np.array([floats(p) for p in msg.waypoints]).reshape(-1, 3),
-        segment_times=tuple(msg.segment_times), objective=msg.objective, minimum_time=msg.minimum_time, **options)
+        segment_times=tuple(msg.segment_times), thrust_ratio=msg.thrust_ratio, objective=msg.objective, minimum_time=msg.minimum_time,
+        **options)
 
 
 def perch_plan_message(plan: PerchPlan) -> PlanPerch.Response:
