@@ -8,11 +8,11 @@ import pytest
 
 from perch_core import bernstein
 from perch_core.vehicle import GRAVITY, load_vehicle
-from perch_eval.evaluation import command
+from perch_eval.evaluation import command, control
 from perch_eval.evaluation.cable import cable_of_length
 from perch_eval.evaluation.nonlinear import solve
 from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
-from perch_eval.evaluation.sections import Section
+from perch_eval.evaluation.sections import Effort, Section
 from perch_planner.paper import paper_m
 
 
@@ -92,3 +92,15 @@ def test_the_nonlinear_program_keeps_the_thrust_bound_and_costs_no_more_than_the
         second = bernstein.derivative(segment, 2) / T**2
         a = (second @ bernstein.basis(second.shape[-1] - 1, np.linspace(0.0, 1.0, 4001)).T).T
         assert vehicle.mass * np.linalg.norm(a + [0.0, 0.0, GRAVITY], axis=1).max() < 4.6
+
+
+def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monkeypatch):
+    """Its errors are kept as nulls."""
+    def known(effort, name, jobs, fly, good):
+        flown = [dict(zip(("controller", "condition", "maneuver", "seed"), job), rmse=[0.01, 0.02, 0.03], outcome="perched") for job in jobs]
+        flown[-1] |= {"rmse": [None] * 3, "outcome": "not begun: refused"}
+        return flown
+
+    monkeypatch.setattr(control, "computed", known)
+    sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", False, 1, 1, 1))
+    assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()

@@ -82,8 +82,7 @@ def comparison_sections(effort: Effort) -> list[Section]:
             text.append(f"| {condition} | " + " | ".join(cells) + " |")
 
     def mean(c: str, condition: str, maneuver: str) -> np.ndarray:
-        return np.sqrt(np.mean([np.square(r["rmse"]) for r in flown
-                                if (r["controller"], r["condition"], r["maneuver"]) == (c, condition, maneuver)], axis=0))
+        return _rms([r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == (c, condition, maneuver)])
 
     for c in CONTROLLERS:
         worst = float(mean(c, "nominal", "perch").max())
@@ -112,8 +111,13 @@ def _searched(r: dict[str, Any]) -> str:
             f"fault; within that time rotors of this lag turn the vehicle by no more than {x['turn_deg']:.0f} deg. ")
 
 
+def _rms(own: Sequence[dict[str, Any]]) -> np.ndarray:
+    """Of the flights that were begun, per axis [m], shape (3,)."""
+    return np.sqrt(np.nanmean(np.square(np.array([r["rmse"] for r in own], float)), axis=0))
+
+
 def _cell(own: Sequence[dict[str, Any]]) -> str:
-    rmse = 100 * np.sqrt(np.mean([np.square(r["rmse"]) for r in own], axis=0))
+    rmse = 100 * _rms(own)
     outcomes = [r["outcome"] for r in own]
     return ", ".join(f"{x:.1f}" for x in rmse) + "; " + (outcomes[0] if len(set(outcomes)) == 1 else " / ".join(outcomes))
 
