@@ -117,8 +117,9 @@ def judge(coefficients: Array, yaw: Array, heading: Array, durations: Array, que
                                           high_height, extension, clearance, rate)
     thrusts = np.empty((0, 4, 0))
     if checked or not (later or stretch or least < _LOOK * low):
-        thrusts, row = sampled(coefficients, heading, durations, *rotors)
-        kept = rotors[0] <= row[0] and row[2] <= rotors[1]
+        low_rotor, high_rotor, mass, J, mixing = rotors
+        thrusts, row = sampled(coefficients, heading, durations, mass, J, mixing)
+        kept = low_rotor <= row[0] and row[2] <= high_rotor
         if kept and holds:
             kept, row[0], row[2] = prove_rotors(coefficients, yaw, durations, row[0], row[2], *rotors)
         results[ROTOR_THRUST, :4], results[ROTOR_THRUST, HOLDS] = row, kept

@@ -168,15 +168,13 @@ def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
 
 
 @compiled
-def sampled(coefficients: Array, heading: Array, durations: Array, low: float, high: float, mass: float, J: Vector3, mixing: Array
-            ) -> tuple[Array, Array]:
+def sampled(coefficients: Array, heading: Array, durations: Array, mass: float, J: Vector3, mixing: Array) -> tuple[Array, Array]:
     """Rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
         heading: of `plan_headings`.
         durations: shape (f,) [s].
-        low, high: limits of a rotor's thrust [N].
         mass, J, mixing: of `rotor_model`.
 
     Returns:
