@@ -21,7 +21,7 @@ class VioOutcome(enum.Enum):
     GATED = "refused by the innovation gate"
     BROKEN = "refused: the filter's covariance is not positive definite; it starts again with the next one"
     DUPLICATE = "refused: a pose of this stamp was used before"
-    OUT_OF_ORDER = "refused: older than a pose that was used before"
+    OUT_OF_ORDER = "refused: older than a pose, or a rest, that was used before"
     TOO_OLD = "refused: older than the IMU history"
     FUTURE = "refused: stamp lies too far in the future"
     NOT_FINITE = "refused: not finite"
