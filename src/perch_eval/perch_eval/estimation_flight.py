@@ -30,7 +30,7 @@ from perch_perception.vio.start import TOLD_SIGMA
 from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_mount
 from perch_sim.lockstep import Task
-from perch_sim.lockstep.schedule import Arrival
+from perch_sim.lockstep.batches import Arrival
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import Scenario
 

@@ -20,7 +20,7 @@ from perch_core.values import (
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing, DrawnInProcesses
-from perch_sim.lockstep.schedule import Arrival
+from perch_sim.lockstep.batches import Arrival
 from perch_sim.motors import MotorCommandError
 from perch_sim.pacing import Pacing
 from perch_sim.parameters import CAMERAS, VehicleParameters

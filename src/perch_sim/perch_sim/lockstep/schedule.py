@@ -23,6 +23,7 @@ from perch_core.component import Component
 from perch_core.errors import PerchError
 from perch_core.timing import CONTROL_PERIOD_NS
 from perch_core.values import CameraImage
+from perch_sim.lockstep.batches import Arrival, Batch, Place, first_undrawn, is_drawn, is_lost
 from perch_sim.lockstep.packet import Codec, Packet
 from perch_sim.lockstep.participant import Emissions, Participant, handlers
 from perch_sim.lockstep.tasks import Task
@@ -31,22 +32,6 @@ MOST_UNDRAWN = 2            # frames of a camera that have arrived before their 
 LONGEST_SILENCE = 500       # steps without a frame after which a participant gets what has come to it all the same
 LATCHED = ("/tf_static", "target/pose", "powerlines", "ground_truth/target")
 _CHANNEL = attrgetter("channel")
-
-
-class Arrival(NamedTuple):
-    """A camera frame that has arrived.
-
-    Attributes:
-        camera: its name.
-        stamp: as in its header [ns].
-        middle: of the exposure, on the IMU's clock [ns].
-        image: as emitted; None: the camera takes no images, or this one is lost.
-    """
-
-    camera: str
-    stamp: int
-    middle: int
-    image: CameraImage | None
 
 
 class Owed(NamedTuple):
@@ -64,53 +49,6 @@ class Vehicle(Protocol):
 
     def advance(self) -> Sequence[Arrival]:
         """One control period and what is emitted in it; the frames that have arrived."""
-
-
-class _Batch:
-    """Work of a slow participant."""
-
-    __slots__ = ("stamp", "due", "packets", "begun", "results")
-
-    def __init__(self, stamp: int, due: int, packets: list[Packet]) -> None:
-        self.stamp, self.due, self.packets = stamp, due, packets
-        self.begun = False
-        self.results: Sequence[Packet] = ()
-
-
-class _Place:
-    """A participant's place in the order, taken or empty.
-
-    Attributes:
-        inbox: what has come since the last batch.
-        coming: slow: batches without results yet, oldest first; one at a time is worked on.
-        done: slow: batches whose results do not count yet.
-        last: step of the last batch.
-    """
-
-    def __init__(self, name: str, task: Task) -> None:
-        self.name, self.task = name, task
-        self.latency = 0 if task.latency is None else round(task.latency * 1e9)
-        self.participant: Participant | None = None
-        self.inbox: list[Packet] = []
-        self.coming: deque[_Batch] = deque()
-        self.done: deque[_Batch] = deque()
-        self.last = 0
-
-    @property
-    def inputs(self) -> frozenset[str]:
-        """Channels that its participant takes."""
-        return frozenset() if self.participant is None else self.participant.inputs
-
-    @property
-    def takes_images(self) -> bool:
-        """Whether images are among what its participant takes."""
-        return any(channel.endswith("/image_raw") for channel in self.inputs)
-
-    def awaits(self, arrival: Arrival) -> bool:
-        """Whether a frame starts work: with its image for those who take images."""
-        if f"camera_{arrival.camera}/image_raw" in self.inputs:
-            return arrival.image is not None
-        return f"camera_{arrival.camera}/camera_info" in self.inputs
 
 
 class _Routes(dict):
@@ -149,12 +87,12 @@ class Schedule:
         self._vehicle = cast(Vehicle, vehicle)
         self._vehicle_handlers = handlers(vehicle)
         self._emissions = Emissions(vehicle, codec)
-        self._places = {name: _Place(name, task) for name, task in tasks.items()}
+        self._places = {name: Place(name, task) for name, task in tasks.items()}
         self._fast = [place for place in self._places.values() if place.task.latency is None]
         self._slow = [place for place in self._places.values() if place.task.latency is not None]
         self._latest: dict[str, list[Packet]] = {}
         self._undrawn: dict[str, deque[CameraImage]] = {}
-        self._awaited: _Place | None = None  # fast participant whose answer is missing
+        self._awaited: Place | None = None  # fast participant whose answer is missing
         self._routes = _Routes(self._takers)
         for participant in participants:
             self.join(participant)
@@ -244,7 +182,7 @@ class Schedule:
         for place in self._slow:
             if place.coming and place.coming[0].due <= self.now:
                 batch = place.coming[0]
-                image = None if batch.begun else _first_undrawn(batch)
+                image = None if batch.begun else first_undrawn(batch)
                 missing.append(Owed(place.name, "its results", batch.stamp) if image is None
                                else Owed(image.channel.split("/")[0], f"an image for {place.name}", image.value.stamp))
         return missing
@@ -257,13 +195,13 @@ class Schedule:
         """
         for images in self._undrawn.values():
             if len(images) > MOST_UNDRAWN:
-                _is_drawn(images[0], timeout)
+                is_drawn(images[0], timeout)
                 return True
         for place in self._slow:
             if place.coming and place.coming[0].due <= self.now and not place.coming[0].begun:
-                image = _first_undrawn(place.coming[0])
+                image = first_undrawn(place.coming[0])
                 if image is not None:
-                    _is_drawn(image.value, timeout)
+                    is_drawn(image.value, timeout)
                     return True
         return False
 
@@ -337,11 +275,11 @@ class Schedule:
                     continue
                 due = now + place.latency
             place.last = self.index
-            place.coming.append(_Batch(now, max(due, now + CONTROL_PERIOD_NS), place.inbox.copy()))
+            place.coming.append(Batch(now, max(due, now + CONTROL_PERIOD_NS), place.inbox.copy()))
             place.inbox.clear()
             self._work(place)
 
-    def _work(self, place: _Place) -> None:
+    def _work(self, place: Place) -> None:
         """Take results and begin batches in their order, as far as that goes."""
         coming, participant = place.coming, place.participant
         assert participant is not None  # an empty place has no batches
@@ -349,9 +287,9 @@ class Schedule:
             batch = coming[0]
             if not batch.begun:
                 if place.takes_images:
-                    if _first_undrawn(batch) is not None:
+                    if first_undrawn(batch) is not None:
                         return
-                    lost = [packet for packet in batch.packets if _is_lost(packet)]
+                    lost = [packet for packet in batch.packets if is_lost(packet)]
                     if lost:  # nothing comes of it; the rest of the batch goes with the next
                         coming.popleft()
                         after = coming[0].packets if coming else place.inbox
@@ -376,7 +314,7 @@ class Schedule:
         """Whether a camera's frames arrive faster than they are drawn: the flight waits even where nobody else does."""
         crowded = False
         for images in self._undrawn.values():
-            while images and _is_drawn(images[0]):
+            while images and is_drawn(images[0]):
                 images.popleft()
             crowded = crowded or len(images) > MOST_UNDRAWN
         return crowded
@@ -384,23 +322,3 @@ class Schedule:
 
 def _is_latched(channel: str) -> bool:
     return channel in LATCHED or channel.endswith("/camera_info")
-
-
-def _is_image(packet: Packet) -> bool:
-    return packet.channel.endswith("/image_raw")
-
-
-def _is_drawn(image: CameraImage, timeout: float = 0.0) -> bool:
-    """Whether an image is there, or is within a time [s]."""
-    return image.ready is None or image.ready(timeout)
-
-
-def _first_undrawn(batch: _Batch) -> Packet | None:
-    """The first packet of a batch whose image is still being drawn."""
-    return next((packet for packet in batch.packets
-                 if _is_image(packet) and not _is_drawn(packet.value)), None)
-
-
-def _is_lost(packet: Packet) -> bool:
-    """Whether it is an image that will never come. One that is drawn when it is looked at always comes."""
-    return _is_image(packet) and packet.value.ready is not None and packet.value.pixels() is None
