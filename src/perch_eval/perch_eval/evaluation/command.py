@@ -9,7 +9,7 @@ from pathlib import Path
 
 from perch_core.errors import PerchError
 from perch_core.registry import resolved
-from perch_eval.arguments import command_parser, count, exit_code, output_folder
+from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 
@@ -57,12 +57,6 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _regenerate(args), interrupted="interrupted; finished flights are kept, the same command goes on")
-
-
 def _regenerate(args: argparse.Namespace) -> int:
     mode = "full" if args.full else "quick"
     counts = {name: getattr(args, name.replace("-", "_")) or default for name, default in (FULL if args.full else QUICK).items()}
@@ -97,3 +91,6 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
         print(f"  {time.monotonic() - began:.0f} s", flush=True)
         sections += part
     return sections
+
+
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command goes on")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from perch_core import config
 from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
-from perch_eval.arguments import command_parser, exit_code
+from perch_eval.arguments import command, command_parser
 from perch_eval.flight import Flight
 from perch_eval.identification import flight, page
 from perch_eval.identification.fit import battery, identify
@@ -33,18 +33,18 @@ exit code: 0 everything is told, 1 something is not (the reasons beside it), 2 w
 nothing, or a battery that no curve fits"""
 
 
-def command_line() -> argparse.ArgumentParser:
-    """The options."""
-    parser = command_parser("identify.py", "Identify lags, gains, thrust and drag of a vehicle from a flight.", EXAMPLES)
-    parser.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
-    parser.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
-    parser.add_argument("--voltage", type=float, nargs="+", default=[], metavar="V",
-                        help="the battery's in each flight, two or more: thrust against voltage; the first is that of the thrust curve")
-    parser.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated flight (default: %(default)s)")
-    parser.add_argument("--name", default="", help="name of the identified vehicle (default: that of the vehicle with _identified)")
-    parser.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (default: %(default)s)")
-    return parser
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = command_parser("identify.py", "Identify lags, gains, thrust and drag of a vehicle from a flight.", EXAMPLES)
+    out.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
+    out.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
+    out.add_argument("--voltage", type=float, nargs="+", default=[], metavar="V",
+                     help="the battery's in each flight, two or more: thrust against voltage; the first is that of the thrust curve")
+    out.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
+    out.add_argument("--seed", type=int, default=1, help="seed of the simulated flight (default: %(default)s)")
+    out.add_argument("--name", default="", help="name of the identified vehicle (default: that of the vehicle with _identified)")
+    out.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (default: %(default)s)")
+    return out
 
 
 def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | RecordedFlight]:
@@ -80,13 +80,8 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | Re
     return flown
 
 
-def main() -> int:
-    """Fly or read, fit, write, tell."""
-    arguments = command_line().parse_args()
-    return exit_code(lambda: _identify(arguments))
-
-
 def _identify(arguments: argparse.Namespace) -> int:
+    """Fly or read, fit, write, tell."""
     vehicle = load_vehicle(arguments.vehicle)
     flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
     flown = flights(arguments, vehicle)
@@ -108,3 +103,6 @@ def _identify(arguments: argparse.Namespace) -> int:
         print(f"{'actuation.battery':32s} not identified: flights at two voltages and more tell it (--voltage)")
     print(f"written: {arguments.out / 'vehicle.yaml'}, {arguments.out / 'identify.png'}")
     return 1 if any(one.refused for one in found) else 0
+
+
+main = command(parser, _identify)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage
-from perch_eval.arguments import command_parser, exit_code, output_folder
+from perch_eval.arguments import command, command_parser, output_folder
 from perch_eval.node_launch import parse_overrides
 from perch_eval.page import finite
 from perch_eval.recordings import report
@@ -66,12 +65,6 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--without", choices=OPTIONAL, nargs="+", default=[], metavar="NODE", help=f"leave out: {', '.join(OPTIONAL)}")
     out.add_argument("-p", "--parameter", action="append", default=[], metavar="NODE.NAME:=VALUE", help="change a parameter of a node")
     return out
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _perceive(args))
 
 
 def _perceive(args: argparse.Namespace) -> int:
@@ -298,5 +291,4 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
     return 0 if seen else 1
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = command(parser, _perceive)

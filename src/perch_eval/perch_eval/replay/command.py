@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import command_parser, count, exit_code
+from perch_eval.arguments import command, command_parser, count
 from perch_eval.flight_view import FlightView
 from perch_eval.replay.animation import write_animation
 from perch_eval.replay.scene import Scene
@@ -45,12 +45,6 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--vehicle", default="snapdragon", help="vehicle that is drawn (default: %(default)s)")
     out.add_argument("--namespace", default="", help="namespace of the vehicle, where several were recorded")
     return out
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _show(args), LookupError)
 
 
 def _show(args: argparse.Namespace) -> int:
@@ -111,3 +105,6 @@ def write_plots(view: FlightView, folder: Path) -> None:
     for name, draw in figures.items():
         if figure := draw(view):
             figure.savefig(folder / f"{name}.png", dpi=95)
+
+
+main = command(parser, _show, LookupError)
