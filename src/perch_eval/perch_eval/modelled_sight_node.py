@@ -17,8 +17,7 @@ from perch_core.component import Input
 from perch_core.config import quantity, text
 from perch_core.ros.node import node
 from perch_core.values import CameraImage, CameraModel, OdometryState
-from perch_eval.in_process.modelled_sight import ModelledSight
-from perch_eval.in_process.stand_ins import MappedWorld
+from perch_eval.in_process.modelled_sight import MappedWorld, ModelledSight
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig

@@ -15,9 +15,8 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, seconds
 from perch_eval.goal import goal_of, outcome_of
 from perch_eval.in_process.loop import Loop
-from perch_eval.in_process.modelled_sight import modelled_localizer
+from perch_eval.in_process.modelled_sight import MappedWorld, modelled_localizer
 from perch_eval.in_process.parameters import NodeParameters
-from perch_eval.in_process.stand_ins import MappedWorld
 from perch_eval.in_process.trace import FlightTrace
 from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.drawing import DrawnOnDemand

@@ -1,6 +1,6 @@
-"""Sightings of the pad without images: corners with the measured error of the tag pipeline.
+"""Error models in the place of images: sightings of the pad with the measured error of the tag pipeline, and a map of the cables.
 
-The error model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
+The pad's model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
 calibration errors included), shaken by the error that `perch_perception.tags` makes on rendered images (0.06 px
 at 1.7 m, 0.18 px at 3 m), and solved with the nominal camera by the code that flies. What it does not model:
 blur, contrast and light.
@@ -8,15 +8,19 @@ blur, contrast and light.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from perch_core import so3
+from perch_core.component import Component, Input, Output
+from perch_core.errors import PerchError
+from perch_core.lines import Segment
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
-from perch_core.values import NANOSECONDS
+from perch_core.values import NANOSECONDS, CameraModel, MappedPowerline, PowerlineMap
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import Localization, LocalizationRefusal, average_board, solve_board
@@ -33,6 +37,8 @@ READABLE_SIDE = 12.5    # a tag whose shortest side is smaller is not found [px]
 _SIDE, _SIGMA = 25.9, 0.06                              # shortest side of a tag [px] and its corners' error there [px]
 _GROWTH = np.log(0.18 / 0.06) / np.log(3.0 / 1.7)       # exponent with which that grows as the side shrinks
 _LARGEST = 0.6                                          # [px]
+MAP_ERROR = 0.02  # 1 sigma of each axis of both ends of a mapped line [m]; the mapper's bar is 3 cm
+MAP_PERIOD = 100_000_000  # [ns]
 
 
 def corner_sigma(side: np.ndarray) -> np.ndarray:
@@ -117,3 +123,60 @@ class ModelledSight:
         side = np.linalg.norm(np.roll(pixels, -1, axis=1) - pixels, axis=2).min(axis=1)
         keep = inside & (side >= READABLE_SIDE)
         return pixels[keep], tuple(np.array(self._board.ids)[keep].tolist()), side[keep]
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """Of a component that has none."""
+
+
+@dataclass(frozen=True)
+class MappedWorldParameters:
+    """What there is to be mapped, and when."""
+
+    camera: str
+    lines: tuple[Segment, ...]
+
+
+def mapped(lines: Sequence[Segment], rng: np.random.Generator) -> tuple[Segment, ...]:
+    """Lines as a mapper finds them: each end is off by `MAP_ERROR`."""
+    out = []
+    for line in lines:
+        start, end = (end + MAP_ERROR * rng.normal(size=3) for end in line.ends)
+        out.append(Segment.between(start, end, line.radius, line.id))
+    return tuple(out)
+
+
+class MappedWorld(Component[MappedWorldParameters]):
+    """A map with the mapper's error, ten times a second of the camera's frames, in the place of `powerline_mapper`."""
+
+    config_type = MappedWorldParameters
+
+    frame = Input(CameraModel, "camera_{camera}/camera_info")
+    powerlines = Output(PowerlineMap, "powerlines")
+
+    def __init__(self, config: MappedWorldParameters) -> None:
+        super().__init__(config)
+        length = [2.0 * line.half_length for line in config.lines]
+        self._lines = tuple(
+            MappedPowerline(line.id, tuple(line.ends[0].tolist()), tuple(line.ends[1].tolist()), line.radius, MAP_ERROR**2 * np.eye(3),
+                            MAP_ERROR * np.sqrt(2.0) / along, 100) for line, along in zip(config.lines, length))
+        self._next = 0
+
+    def on_frame(self, frame: CameraModel) -> None:
+        """The map of a frame."""
+        if frame.stamp >= self._next:
+            self._next = frame.stamp + MAP_PERIOD
+            self.powerlines(PowerlineMap(frame.stamp, self._lines, False, ""))
+
+    @classmethod
+    def of(cls, scenario: Scenario, seed: int) -> MappedWorld:
+        """The map of a scenario's cables, which must not sag.
+
+        Raises:
+            PerchError: one does: there is no error model for a map of curves.
+        """
+        if any(cable.sag > 0.0 for cable in scenario.world.cables):
+            raise PerchError(f"scenario {scenario.name}: cables that sag have no error model; sensing.target must be rendered")
+        lines = [Segment.between(np.array(c.start), np.array(c.end), c.radius, k) for k, c in enumerate(scenario.world.cables)]
+        return cls(MappedWorldParameters("front", mapped(lines, seeding.stream(seed, "line_map"))))

@@ -22,7 +22,7 @@ from perch_eval.recordings import report
 from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import Evaluation, evaluate
-from perch_eval.recordings.gallery import Gallery
+from perch_eval.recordings.drawing import Gallery
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Choice, Perception
 from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look

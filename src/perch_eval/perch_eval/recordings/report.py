@@ -11,7 +11,7 @@ from perch_eval.page import image, images, section, table
 from perch_eval.page import page as document
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
-from perch_eval.recordings.gallery import Shown
+from perch_eval.recordings.drawing import Shown
 from perch_eval.recordings.perception import Frame, Perception
 from perch_eval.recordings.trajectory import Trajectory
 

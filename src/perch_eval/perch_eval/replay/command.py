@@ -15,8 +15,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.arguments import command, command_parser, count
 from perch_eval.flight_view import FlightView
-from perch_eval.replay.animation import write_animation
-from perch_eval.replay.scene import Scene
+from perch_eval.replay.animation import Scene, write_animation
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
 
