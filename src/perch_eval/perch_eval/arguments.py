@@ -39,11 +39,13 @@ def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argpa
         mistakes: what else the caller is to blame for, beside `PerchError` and `OSError`.
         interrupted: said after Ctrl-C.
     """
+    callers: tuple[type[Exception], ...] = (OSError, PerchError, *mistakes)
+
     def main(arguments: list[str] | None = None) -> int:
         args = parser().parse_args(arguments)
         try:
             return work(args)
-        except (OSError, PerchError, *mistakes) as error:
+        except callers as error:
             words = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
             print(f"error: {words}", file=sys.stderr)
             return 2

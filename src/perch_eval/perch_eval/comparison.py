@@ -83,10 +83,7 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
         raise PerchError(f"{file}: no such recording")
     flight, report = RecordedFlight(file, namespace), _report(file.with_name("report.json"))
     model = load_vehicle(vehicle or report.get("vehicle") or "snapdragon")
-    try:
-        view = FlightView.of(flight, model, name, colour)
-    except LookupError as error:
-        raise PerchError(f"{file}: {error}") from None
+    view = FlightView.of(flight, model, name, colour)
     until = report.get("simulated_time_s") or float(view.truth.t[-1])
     report = {**report, **flight_metrics(flight, model, until), "flight_hash": flight.digest(until)}
     report.setdefault("margins", [one.mapping() for one in margins(flight, model)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections.abc import Sequence
 
@@ -38,8 +39,6 @@ def counts(sections: Sequence[Section]) -> dict[str, int]:
 
 def machine() -> str:
     """What this runs on."""
-    import os
-
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 

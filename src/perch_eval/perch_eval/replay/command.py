@@ -55,10 +55,7 @@ def _show(args: argparse.Namespace) -> int:
     flight, vehicle = RecordedFlight(args.flight, args.namespace), load_vehicle(args.vehicle)
     if flight.damage:
         print(f"warning: {args.flight} is cut off or damaged, and shown as far as it goes ({flight.damage})", file=sys.stderr)
-    try:
-        view = FlightView.of(flight, vehicle)
-    except LookupError as error:
-        raise PerchError(f"{args.flight}: {error}") from None
+    view = FlightView.of(flight, vehicle)
     path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
@@ -106,4 +103,4 @@ def write_plots(view: FlightView, folder: Path) -> None:
             figure.savefig(folder / f"{name}.png", dpi=95)
 
 
-main = command(parser, _show, LookupError)
+main = command(parser, _show)

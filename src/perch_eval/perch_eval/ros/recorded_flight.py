@@ -64,7 +64,7 @@ class RecordedFlight(Flight):
             if channel is not None:
                 names[key] = channel
                 messages.setdefault(key, []).append((time, data))
-        super().__init__(_Channels(names, messages), damage[0] if damage else "")
+        super().__init__(_Channels(names, messages), str(path), damage[0] if damage else "")
 
 
 @lru_cache(maxsize=None)
