@@ -30,10 +30,10 @@ def main() -> int:
     enter(*["view"] * (arguments.node == "viewer"))
     from perch_core.errors import PerchError
     from perch_eval.arguments import open_network
-    from perch_eval.node_launch import NODES
     from perch_eval.nodes import executable
+    from perch_sim.scenario import NODES
 
-    packages = {name: node.package for name, node in NODES.items()} | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
+    packages = NODES | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
     if arguments.node not in packages:
         print(f"error: node {arguments.node!r} is not one of {', '.join(packages)}", file=sys.stderr)
         return 2

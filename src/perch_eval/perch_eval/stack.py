@@ -145,7 +145,7 @@ class Stack:
         Returns:
             How each program ended.
         """
-        with _undisturbed():
+        with _handled_by(signal.SIG_IGN):
             self._memory.observe(self.pids.values())
             for number, patience in _ESCALATION if self._ready else _AT_START:
                 running = [program for program in self._started.values() if program.running]
@@ -159,13 +159,6 @@ class Stack:
             endings = {name: program.ending() for name, program in self._started.items()}
             self._memory.clean()
             return endings
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ignore what would interrupt."""
-    with _handled_by(signal.SIG_IGN):
-        yield
 
 
 @contextmanager
