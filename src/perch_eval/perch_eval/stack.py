@@ -121,13 +121,9 @@ class Stack:
         self._ready = True
         self._memory.observe((*self.pids.values(), os.getpid()))
 
-    def wait(self, done: Callable[[], bool] = lambda: False) -> tuple[Ending, ...]:
-        """Wait until `done`, or until a program ends.
-
-        Returns:
-            The programs that have ended; none where `done` came first.
-        """
-        while not (endings := self.endings()) and not done():
+    def wait(self) -> tuple[Ending, ...]:
+        """Wait until a program ends; those that have ended."""
+        while not (endings := self.endings()):
             time.sleep(_POLL_S)
         return endings
 

@@ -15,7 +15,7 @@ from perch_core.errors import PlanningRefusal
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.aborted import fly_aborted
-from perch_eval.evaluation.control import write_page
+from perch_eval.evaluation.document import write_page
 from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters

@@ -91,8 +91,6 @@ def write(path: Path, values: Iterable[tuple[str, int, Any]], namespace: str = "
     try:
         for channel, time, value in values:
             topic = channel if channel.startswith("/") else f"{namespace}/{channel}"
-            if topic not in log:
-                log.add_topic(topic, schema_of(topics.message_type(channel)))
-            log.write(topic, topics.encode(channel, value), time)
+            log.write(topic, schema_of(topics.message_type(channel)), topics.encode(channel, value), time)
     finally:
         log.close()
