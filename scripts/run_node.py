@@ -34,10 +34,9 @@ def main() -> int:
     from perch_sim.scenario import NODES
 
     packages = NODES | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
-    if arguments.node not in packages:
-        print(f"error: node {arguments.node!r} is not one of {', '.join(packages)}", file=sys.stderr)
-        return 2
     try:
+        if arguments.node not in packages:
+            raise PerchError(f"node {arguments.node!r} is not one of {', '.join(packages)}")
         open_network(arguments.network)
         path = executable(packages[arguments.node], arguments.node)
     except PerchError as error:
