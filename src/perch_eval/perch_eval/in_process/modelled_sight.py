@@ -8,7 +8,7 @@ blur, contrast and light.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.component import Component, Input, Output
+from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.lines import Segment
 from perch_core.surface import PerchSurface
@@ -28,7 +29,7 @@ from perch_perception.tags.localizer import LOST_AFTER, MIN_RANGE, SEARCH_PERIOD
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
-from perch_sim.scenario import Scenario
+from perch_sim.scenario import Cable, Scenario, load_scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
 from perch_sim.state_history import StateHistory, TrueState
 
@@ -131,36 +132,37 @@ class NoParameters:
 
 
 @dataclass(frozen=True)
-class MappedWorldParameters:
-    """What there is to be mapped, and when."""
+class MapParameters:
+    """Whose cables are mapped, and when."""
 
-    camera: str
-    lines: tuple[Segment, ...]
-
-
-def mapped(lines: Sequence[Segment], rng: np.random.Generator) -> tuple[Segment, ...]:
-    """Lines as a mapper finds them: each end is off by `MAP_ERROR`."""
-    out = []
-    for line in lines:
-        start, end = (end + MAP_ERROR * rng.normal(size=3) for end in line.ends)
-        out.append(Segment.between(start, end, line.radius, line.id))
-    return tuple(out)
+    scenario: str = text("line_80", doc="config/scenarios/<name>.yaml, or a file")
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
+    camera: str = text("front", doc="camera whose frames start the map")
 
 
-class MappedWorld(Component[MappedWorldParameters]):
+class MappedWorld(Component[MapParameters]):
     """A map with the mapper's error, ten times a second of the camera's frames, in the place of `powerline_mapper`."""
 
-    config_type = MappedWorldParameters
+    config_type = MapParameters
 
     frame = Input(CameraModel, "camera_{camera}/camera_info")
     powerlines = Output(PowerlineMap, "powerlines")
 
-    def __init__(self, config: MappedWorldParameters) -> None:
+    def __init__(self, config: MapParameters, scenario: Scenario | None = None) -> None:
+        """
+        Args:
+            config: when there is a map.
+            scenario: whose cables are mapped; None: that of `config`.
+
+        Raises:
+            ConfigError: no such scenario.
+            PerchError: a cable sags: there is no error model for a map of curves.
+        """
         super().__init__(config)
-        length = [2.0 * line.half_length for line in config.lines]
-        self._lines = tuple(
-            MappedPowerline(line.id, tuple(line.ends[0].tolist()), tuple(line.ends[1].tolist()), line.radius, MAP_ERROR**2 * np.eye(3),
-                            MAP_ERROR * np.sqrt(2.0) / along, 100) for line, along in zip(config.lines, length))
+        scenario, rng = scenario or load_scenario(config.scenario), seeding.stream(config.seed, "line_map")
+        if any(cable.sag > 0.0 for cable in scenario.world.cables):
+            raise PerchError(f"scenario {scenario.name}: cables that sag have no error model; sensing.target must be rendered")
+        self._lines = tuple(_mapped(k, cable, rng) for k, cable in enumerate(scenario.world.cables))
         self._next = 0
 
     def on_frame(self, frame: CameraModel) -> None:
@@ -169,14 +171,12 @@ class MappedWorld(Component[MappedWorldParameters]):
             self._next = frame.stamp + MAP_PERIOD
             self.powerlines(PowerlineMap(frame.stamp, self._lines, False, ""))
 
-    @classmethod
-    def of(cls, scenario: Scenario, seed: int) -> MappedWorld:
-        """The map of a scenario's cables, which must not sag.
 
-        Raises:
-            PerchError: one does: there is no error model for a map of curves.
-        """
-        if any(cable.sag > 0.0 for cable in scenario.world.cables):
-            raise PerchError(f"scenario {scenario.name}: cables that sag have no error model; sensing.target must be rendered")
-        lines = [Segment.between(np.array(c.start), np.array(c.end), c.radius, k) for k, c in enumerate(scenario.world.cables)]
-        return cls(MappedWorldParameters("front", mapped(lines, seeding.stream(seed, "line_map"))))
+def _mapped(number: int, cable: Cable, rng: np.random.Generator) -> MappedPowerline:
+    """A cable as a mapper finds it: each end is off by `MAP_ERROR`."""
+    line = Segment.between(np.array(cable.start), np.array(cable.end), cable.radius, number)
+    start, end = (end + MAP_ERROR * rng.normal(size=3) for end in line.ends)
+    line = Segment.between(start, end, cable.radius, number)
+    start, end = (tuple(end.tolist()) for end in line.ends)
+    sigma = MAP_ERROR * np.sqrt(2.0) / (2.0 * line.half_length)
+    return MappedPowerline(number, start, end, cable.radius, MAP_ERROR**2 * np.eye(3), sigma, 100)
