@@ -174,9 +174,9 @@ class MappedWorld(Component[MapParameters]):
 
 def _mapped(number: int, cable: Cable, rng: np.random.Generator) -> MappedPowerline:
     """A cable as a mapper finds it: each end is off by `MAP_ERROR`."""
-    line = Segment.between(np.array(cable.start), np.array(cable.end), cable.radius, number)
-    start, end = (end + MAP_ERROR * rng.normal(size=3) for end in line.ends)
-    line = Segment.between(start, end, cable.radius, number)
-    start, end = (tuple(end.tolist()) for end in line.ends)
+    true = Segment.between(np.array(cable.start), np.array(cable.end), cable.radius, number)
+    first, last = (end + MAP_ERROR * rng.normal(size=3) for end in true.ends)
+    line = Segment.between(first, last, cable.radius, number)
+    start, end = (tuple(place.tolist()) for place in line.ends)
     sigma = MAP_ERROR * np.sqrt(2.0) / (2.0 * line.half_length)
     return MappedPowerline(number, start, end, cable.radius, MAP_ERROR**2 * np.eye(3), sigma, 100)
