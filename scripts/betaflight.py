@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Betaflight as a program on this machine: build it, say where it is, or set a vehicle's autopilot up. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_autopilot.command"))
+    run("perch_autopilot.command")

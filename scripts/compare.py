@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Compare two recorded flights on one page. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.comparison"))
+    run("perch_eval.comparison")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Fly a scenario on the real nodes and report it. Sets everything up on first use; `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.demo"))
+    run("perch_eval.demo")

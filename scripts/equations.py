@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Write docs/equations.md: where each equation of both papers stands in the code."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.equations"))
+    run("perch_eval.equations")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Regenerate the papers' tables and figures beside the papers' values. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.evaluation.command"))
+    run("perch_eval.evaluation.command")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Kill, stop and restart nodes in flight, disturb their messages, and see how every flight ends. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.graph_faults.campaign"))
+    run("perch_eval.graph_faults.campaign")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Identify lags, gains, thrust and drag of a vehicle from a flight. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.identification.command"))
+    run("perch_eval.identification.command")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Write docs/limits.md: sizes, counts, magnitudes and rates of everything that enters."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.limits_page"))
+    run("perch_eval.limits_page")

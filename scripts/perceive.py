@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Run perception on a recording of real sensors. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.recordings.command", "recordings"))
+    run("perch_eval.recordings.command", "recordings")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Show a recorded flight as an animation and plots. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.replay.command"))
+    run("perch_eval.replay.command")

@@ -30,14 +30,13 @@ def main() -> int:
     enter(*["view"] * (arguments.node == "viewer"))
     from perch_core.errors import PerchError
     from perch_eval.arguments import open_network
-    from perch_eval.node_launch import NODES
     from perch_eval.nodes import executable
+    from perch_sim.scenario import NODES
 
-    packages = {name: node.package for name, node in NODES.items()} | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
-    if arguments.node not in packages:
-        print(f"error: node {arguments.node!r} is not one of {', '.join(packages)}", file=sys.stderr)
-        return 2
+    packages = NODES | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
     try:
+        if arguments.node not in packages:
+            raise PerchError(f"node {arguments.node!r} is not one of {', '.join(packages)}")
         open_network(arguments.network)
         path = executable(packages[arguments.node], arguments.node)
     except PerchError as error:

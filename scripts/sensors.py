@@ -6,4 +6,4 @@ import sys
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.recordings.sensors_command", *["recordings"] * ("check" in sys.argv[1:])))
+    run("perch_eval.recordings.sensors_command", *["recordings"] * ("check" in sys.argv[1:]))

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Perch, depart and perch again in one run of the stack, and see whether anything grows. `--help` shows the options."""
 
-import sys
-
 from perch_setup import run
 
 if __name__ == "__main__":
-    sys.exit(run("perch_eval.soak"))
+    run("perch_eval.soak")

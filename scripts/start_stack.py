@@ -77,12 +77,9 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # stops like Ctrl-C
     try:
         run(arguments)
-    except StackError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2 if error.callers_mistake else 1
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return 1 if isinstance(error, StackError) and not error.callers_mistake else 2
     except KeyboardInterrupt:
         print("stopped", flush=True)
         return 0

@@ -6,7 +6,6 @@ Everything that is not an option of this script goes to pytest.
 
 from __future__ import annotations
 
-import argparse
 import atexit
 import gc
 import os
@@ -15,7 +14,7 @@ import sys
 import tempfile
 from typing import IO, NoReturn
 
-from perch_setup import EXTRAS, ROOT, enter
+from perch_setup import EXTRAS, ROOT, command_parser, enter
 
 PARTS = (
     ("tests/system/test_restart.py", "tests/system/test_stopping.py", "tests/nodes/"),
@@ -39,12 +38,7 @@ EXAMPLES = """examples:
 
 def main() -> int:
     """Run pytest; 0 all passed, 1 some failed, 2 the caller's mistake."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
     parser.add_argument("--quick", action="store_true", help="only the unit tests that fly, draw and start nothing")
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
     arguments, for_pytest = parser.parse_known_args()

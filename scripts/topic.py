@@ -25,19 +25,19 @@ def command_line() -> argparse.ArgumentParser:
     info.add_argument("topic")
     info.add_argument("-v", "--verbose", action="store_true", help="nodes and QoS")
 
-    echo = commands.add("echo", "echo:echo", "print messages as they come")
+    echo = commands.add("echo", "topics:echo", "print messages as they come")
     _add_topic(echo)
     echo.add_argument("--once", action="store_true", help="end after one message")
     echo.add_argument("-n", type=count, metavar="N", help="end after N messages")
     echo.add_argument("--field", metavar="PATH", help="only a part, as in pose.pose.position.x or rotor_speed[0]")
     echo.add_argument("--no-arr", action="store_true", help="do not print arrays")
 
-    rate = commands.add("hz", "rate:measure_rate", "measure the rate")
+    rate = commands.add("hz", "topics:measure_rate", "measure the rate")
     _add_topic(rate)
     rate.add_argument("-w", "--window", type=count, default=10_000, metavar="N", help="messages to average over")
     rate.add_argument("-n", type=count, metavar="N", help="end after N messages")
 
-    publish = commands.add("pub", "publish:publish", "publish a message")
+    publish = commands.add("pub", "topics:publish", "publish a message")
     publish.add_argument("topic")
     publish.add_argument("type")
     publish.add_argument("values", nargs="?", default="", help="fields in YAML, as in '{data: 1.0}'")

@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 from .environment import variables
 from .errors import SetupError
@@ -50,12 +51,12 @@ def enter(*extras: str) -> None:
     os.execve(VENV_PYTHON, [str(VENV_PYTHON), *sys.argv], environment)
 
 
-def run(module: str, *extras: str) -> int:
-    """Set up if necessary, with extras, then do what a module's `main` does, with its options and its exit code."""
+def run(module: str, *extras: str) -> NoReturn:
+    """Set up if necessary, with extras, then be the program that a module's `main` is, with its options and its exit code."""
     enter(*extras)
     with quiet_on_interrupt():
         main = importlib.import_module(module).main
-    return main()
+    sys.exit(main())
 
 
 def leave_quietly_on_interrupt() -> None:

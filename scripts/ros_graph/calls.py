@@ -12,9 +12,7 @@ from rclpy.node import Node
 
 from ros_graph.commands import GraphError
 from ros_graph.connection import Visit, show_names, visit
-from ros_graph.interfaces import interface
-from ros_graph.message_text import to_yaml
-from ros_graph.message_values import fill, parse
+from ros_graph.messages import fill, interface, parse, to_yaml
 
 _STATUS = {
     GoalStatus.STATUS_SUCCEEDED: "SUCCEEDED",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import yaml
@@ -31,9 +33,8 @@ def list_parameters(arguments: argparse.Namespace) -> int:
 
 def get_parameter(arguments: argparse.Namespace) -> int:
     """`param.py get`"""
-    with visit() as graph:
-        node = graph.absolute(arguments.node)
-        value = _values(graph, _client(graph, node, arguments.spin_time), node, [arguments.parameter])[0]
+    with _node(arguments) as (graph, node, client):
+        value = _values(graph, client, node, [arguments.parameter])[0]
         if value.type == ParameterType.PARAMETER_NOT_SET:
             raise GraphError(f"{node} has no parameter {arguments.parameter!r}; 'param.py list {node}' shows all")
         shown = _plain(parameter_value_to_python(value))
@@ -43,9 +44,7 @@ def get_parameter(arguments: argparse.Namespace) -> int:
 
 def describe_parameters(arguments: argparse.Namespace) -> int:
     """`param.py describe`: what each parameter means, its type and unit, and what is allowed."""
-    with visit() as graph:
-        node = graph.absolute(arguments.node)
-        client = _client(graph, node, arguments.spin_time)
+    with _node(arguments) as (graph, node, client):
         names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
         values = _values(graph, client, node, names)
         found = graph.answer(client.describe_parameters(names), node).descriptors
@@ -75,9 +74,7 @@ def _allowed(descriptor: ParameterDescriptor) -> str:
 def set_parameter(arguments: argparse.Namespace) -> int:
     """`param.py set`: 1 where the node refuses the value."""
     value = parse_yaml(arguments.value, "value")
-    with visit() as graph:
-        node = graph.absolute(arguments.node)
-        client = _client(graph, node, arguments.spin_time)
+    with _node(arguments) as (graph, node, client):
         name = arguments.parameter
         present = _values(graph, client, node, [name])[0]
         if present.type == ParameterType.PARAMETER_DOUBLE and type(value) is int:
@@ -98,15 +95,21 @@ def set_parameter(arguments: argparse.Namespace) -> int:
 
 def dump_parameters(arguments: argparse.Namespace) -> int:
     """`param.py dump`: as a parameter file."""
-    with visit() as graph:
-        node = graph.absolute(arguments.node)
-        client = _client(graph, node, arguments.spin_time)
+    with _node(arguments) as (graph, node, client):
         names = _names(graph, client, node)
         values = _values(graph, client, node, names)
     known = {name: value for name, value in zip(names, values) if value.type != ParameterType.PARAMETER_NOT_SET}
     tree = nested({name: _plain(parameter_value_to_python(value)) for name, value in known.items()})
     print(yaml.safe_dump({node: {"ros__parameters": tree}}, sort_keys=False), end="")
     return 0
+
+
+@contextmanager
+def _node(arguments: argparse.Namespace) -> Iterator[tuple[Visit, str, AsyncParameterClient]]:
+    """A visit to the node of the command line: the graph, the node's full name, a client of its parameters."""
+    with visit() as graph:
+        name = graph.absolute(arguments.node)
+        yield graph, name, _client(graph, name, arguments.spin_time)
 
 
 def _nodes(graph: Visit, timeout: float) -> list[str]:

@@ -1,15 +1,24 @@
-"""Lists topics and describes their publishers and subscribers."""
+"""What `topic.py` does: lists topics and describes them, prints, counts and publishes messages."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import statistics
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ros_graph.commands import GraphError
 from ros_graph.connection import Visit, show_names, visit
-from ros_graph.interfaces import interface
+from ros_graph.messages import fill, interface, parse, pick, to_yaml
+
+REPORT_PERIOD = 1.0  # of `hz` [s]
 
 
 def list_topics(arguments: argparse.Namespace) -> int:
@@ -31,6 +40,86 @@ def show_info(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def echo(arguments: argparse.Namespace) -> int:
+    """`topic.py echo`"""
+    wanted = 1 if arguments.once else arguments.n or math.inf
+    shown = 0
+    problem: list[Exception] = []
+
+    def show(message: Any) -> None:
+        nonlocal shown
+        if problem or shown >= wanted:
+            return
+        try:
+            value = pick(message, arguments.field) if arguments.field else message
+            sys.stdout.write(to_yaml(value, not arguments.no_arr) + "---\n")
+            sys.stdout.flush()
+        except Exception as error:  # raised again below: here it would end in the executor
+            problem.append(error)
+        shown += 1
+
+    with visit() as graph:
+        _subscribe(graph, arguments, show)
+        graph.spin_until(lambda: problem or shown >= wanted)
+    if problem:
+        raise problem[0]
+    return 0
+
+
+def measure_rate(arguments: argparse.Namespace) -> int:
+    """`topic.py hz`: prints the rate every second; with `-n`, ends after so many messages."""
+    arrivals: deque[float] = deque(maxlen=arguments.window)
+    wanted, count, reported = arguments.n or math.inf, 0, 0
+
+    def arrived(_: bytes) -> None:
+        nonlocal count
+        count += 1
+        arrivals.append(time.monotonic())
+
+    with visit() as graph:
+        _subscribe(graph, arguments, arrived, raw=True)  # counting does not need the content of an image
+        while count < wanted:
+            finished = graph.spin_until(lambda: count >= wanted, REPORT_PERIOD)
+            print(rate_summary(list(arrivals)) if count > reported or finished else "no new messages", flush=True)
+            reported = count
+    return 0
+
+
+def rate_summary(arrivals: Sequence[float]) -> str:
+    """Rate and intervals in the words of `ros2 topic hz`.
+
+    Args:
+        arrivals: times of arrival [s], in order.
+    """
+    if len(arrivals) < 2:
+        return "average rate: one message so far"
+    intervals = [later - earlier for earlier, later in zip(arrivals, arrivals[1:])]
+    mean = sum(intervals) / len(intervals)
+    rate = 1.0 / mean if mean > 0.0 else float("inf")
+    return (
+        f"average rate: {rate:.3f}\n\tmin: {min(intervals):.3f}s max: {max(intervals):.3f}s "
+        f"std dev: {statistics.pstdev(intervals):.5f}s window: {len(arrivals)}"
+    )
+
+
+def publish(arguments: argparse.Namespace) -> int:
+    """`topic.py pub`"""
+    message = fill(interface(arguments.type, "msg")(), parse(arguments.values, "message"))
+    with visit() as graph:
+        topic = graph.absolute(arguments.topic)
+        publisher = graph.node.create_publisher(type(message), topic, 10)
+        if arguments.once and not graph.spin_until(lambda: publisher.get_subscription_count() > 0, arguments.spin_time):
+            raise GraphError(f"topic {topic} has no subscribers")
+        publisher.publish(message)
+        while not arguments.once:
+            due = time.monotonic() + 1.0 / arguments.rate
+            graph.spin_until(lambda: time.monotonic() >= due)  # noqa: B023 (called in this turn)
+            publisher.publish(message)
+        publisher.wait_for_all_acked()
+    print(f"published one message on {topic}")
+    return 0
+
+
 def topic_type(graph: Visit, topic: str, timeout: float) -> str:
     """Name of a topic's type, as soon as somebody in the graph has the topic.
 
@@ -47,24 +136,17 @@ def topic_type(graph: Visit, topic: str, timeout: float) -> str:
     return types[0]
 
 
-def message_class(graph: Visit, topic: str, given: str | None, timeout: float) -> type:
-    """Class of a topic's messages: of the given type, or of the type that the graph knows.
-
-    Raises:
-        GraphError: the topic or the type is not known.
-    """
-    return interface(given or topic_type(graph, topic, timeout), "msg")
-
-
-def qos_of(graph: Visit, topic: str) -> QoSProfile:
-    """QoS that hears all publishers of a topic."""
+def _subscribe(graph: Visit, arguments: argparse.Namespace, callback: Callable[[Any], None], raw: bool = False) -> None:
+    """Hear the topic of the command line, from all of its publishers; its type is the one given, or the one that the graph knows."""
+    cls = interface(arguments.type or topic_type(graph, arguments.topic, arguments.spin_time), "msg")
+    topic = graph.absolute(arguments.topic)
     profiles = [endpoint.qos_profile for endpoint in graph.node.get_publishers_info_by_topic(topic)]
     profile = QoSProfile(depth=10)
     if any(p.reliability == ReliabilityPolicy.BEST_EFFORT for p in profiles):
         profile.reliability = ReliabilityPolicy.BEST_EFFORT
     if profiles and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles):
         profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    return profile
+    graph.node.create_subscription(cls, topic, callback, profile, raw=raw)
 
 
 def _sides(graph: Visit, topic: str) -> dict[str, list[str]]:

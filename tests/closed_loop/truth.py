@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from perch_core.component import Component, Input, Output
 from perch_core.values import EstimatorHealth, OdometryState
-from perch_eval.in_process.stand_ins import NoParameters
+from perch_eval.in_process.modelled_sight import NoParameters
 
 STATUS_PERIOD = 100_000_000  # [ns]
 RUNNING = 1

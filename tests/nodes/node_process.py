@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import rclpy
-from perch_eval.node_launch import NODES
+from perch_sim.scenario import NODES
 from perch_eval.nodes import executable
 from rcl_interfaces.srv import ListParameters
 from rclpy.context import Context
@@ -36,7 +36,7 @@ class Running:
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
         with self._log.open("w") as file:
             self.process = forks.Forked(
-                forks.NODES, [executable(NODES[name].package, name), "--ros-args", "-r", f"__ns:={namespace or '/'}", *given], file, file)
+                forks.NODES, [executable(NODES[name], name), "--ros-args", "-r", f"__ns:={namespace or '/'}", *given], file, file)
 
     @property
     def log(self) -> str:

@@ -5,7 +5,7 @@ import pytest
 
 from perch_core.sensors import load_sensors
 from perch_core.values import CameraImage
-from perch_eval.recordings import camera_check, clocks, sensors_command
+from perch_eval.recordings import camera_check, sensors_command
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import evaluate
 from perch_eval.recordings.imu_check import allan_deviation, longest_still
@@ -38,7 +38,7 @@ class Told(Recording):
 def few_looks(monkeypatch):
     """A dozen images and four seconds of turns are enough here."""
     monkeypatch.setattr(camera_check, "LOOKED_AT", 12)
-    monkeypatch.setattr(clocks, "SPAN", 4.0)
+    monkeypatch.setattr(camera_check, "SPAN", 4.0)
 
 
 def spoilt(heard, imu=lambda k, s: s, image=lambda k, i: i):

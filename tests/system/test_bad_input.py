@@ -18,7 +18,7 @@ from perch_core.errors import ConfigError
 from perch_core.ros.node import close_nodes, connect
 from perch_eval import demo
 from perch_eval.ros.recorded_flight import RecordedFlight
-from perch_eval.node_launch import NODES
+from perch_sim.scenario import NODES
 from perch_eval.nodes import ALL_NODES, executable
 from perch_msgs.action import Perch
 from perch_msgs.srv import PlanPerch
@@ -105,7 +105,7 @@ def context():
 
 @pytest.mark.parametrize("node", NODES)
 def test_every_node_refuses_a_parameter_that_it_does_not_have(node, context):
-    create = importlib.import_module(f"{NODES[node].package}.{node}_node").create
+    create = importlib.import_module(f"{NODES[node]}.{node}_node").create
     with pytest.raises(ConfigError, match=f"{node}: no_such_gain: unknown parameter; "):
         create(cli_args=["--ros-args", "-p", "no_such_gain:=1.0"], use_global_arguments=False)
 

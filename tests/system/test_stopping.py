@@ -16,7 +16,7 @@ import pytest
 import rclpy
 from nodes.node_process import FREE
 from perch_core import config
-from perch_eval.node_launch import NODES
+from perch_sim.scenario import NODES
 from perch_eval.nodes import executable
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -84,7 +84,7 @@ def start(node: str, folder: Path) -> Executable:
         arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
     if node == "viewer":
         arguments += ["-p", "port:=0"]
-    return Executable([executable(NODES[node].package, node), *arguments], folder / f"{node}.log", node != AS_A_USER)
+    return Executable([executable(NODES[node], node), *arguments], folder / f"{node}.log", node != AS_A_USER)
 
 
 def works(process: psutil.Process) -> bool:

@@ -9,7 +9,7 @@ from perch_core.errors import PerchError
 from perch_core.values import ImuSample, RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.flight import Flight
-from perch_eval.identification import answers, command, page
+from perch_eval.identification import answers, command
 from perch_eval.identification.fit import Found, battery, identify, rates, thrust
 from perch_eval.identification.record import Record, record_of
 from scipy.signal import lfilter, lfiltic
@@ -193,7 +193,7 @@ def test_a_gain_that_is_not_told_leaves_the_battery_untold():
 
 def test_the_battery_is_written_where_the_vehicle_file_has_it(tmp_path):
     found = [Found("actuation.thrust_gain", 0.98, 0.01, ""), battery(VOLTAGES, gains(*((np.array(VOLTAGES) / 16.4) ** 1.7)))]
-    (tmp_path / "one.yaml").write_text(page.entries(found, VEHICLE, "snapdragon_rates", "one", "a test", VOLTAGES))
+    (tmp_path / "one.yaml").write_text(command.entries(found, VEHICLE, "snapdragon_rates", "one", "a test", VOLTAGES))
     assert load_vehicle(tmp_path / "one.yaml").actuation.battery == Battery(reference=16.4, exponent=1.7, range=(14.0, 16.4))
 
 

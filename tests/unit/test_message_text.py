@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from perch_core.errors import ConfigError
 from perch_msgs.msg import MotorCommand, Trajectory
 from ros_graph.commands import GraphError
-from ros_graph.interfaces import interface
-from ros_graph.message_text import pick, to_yaml
-from ros_graph.message_values import fill, parse
-from ros_graph.rate import summary
+from ros_graph.messages import fill, interface, parse, pick, to_yaml
+from ros_graph.topics import rate_summary
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import String
 
@@ -91,7 +89,7 @@ def test_types_by_name():
 
 
 def test_rates():
-    text = summary([0.0, 0.1, 0.2, 0.4])
+    text = rate_summary([0.0, 0.1, 0.2, 0.4])
     assert "average rate: 7.500" in text and "min: 0.100s max: 0.200s" in text and "window: 4" in text
     assert math.isclose(float(text.split("std dev: ")[1].split("s")[0]), np.std([0.1, 0.1, 0.2]), abs_tol=1e-5)
-    assert "one message" in summary([1.0])
+    assert "one message" in rate_summary([1.0])

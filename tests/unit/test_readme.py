@@ -18,7 +18,7 @@ from perch_core.ros.node import close_nodes
 from perch_eval import demo
 from perch_eval.domain import reserved_domain
 from perch_eval.flyable import check_flight
-from perch_eval.node_launch import NODES
+from perch_sim.scenario import NODES
 from perch_sim.scenario import load_scenario
 from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.qos import DurabilityPolicy
@@ -102,7 +102,7 @@ def test_what_the_commands_name_exists():
         assert arguments[0] in NODES
     assert all(named[word] for word in ("demo.py", "start_stack.py", "plan.py", "bench.py"))
     for package, node in re.findall(r"ros2 run (\w+) (\w+)", README):
-        assert NODES[node].package == package
+        assert NODES[node] == package
 
 
 def test_the_scenario_of_the_example_can_be_flown(tmp_path):
@@ -142,7 +142,7 @@ def nodes(tmp_path_factory):
                     arguments += ["-p", f"file:={folder / 'flight.mcap'}"]
                 if node == "viewer":
                     arguments += ["-p", "port:=0"]
-                create = importlib.import_module(f"{NODES[node].package}.{node}_node").create
+                create = importlib.import_module(f"{NODES[node]}.{node}_node").create
                 created[node] = create(cli_args=arguments, use_global_arguments=False)
                 created[node].connect()
             yield created
@@ -209,7 +209,7 @@ def test_services_and_action(nodes):
 def test_nodes_and_executables(nodes):
     for row in TABLES["node"]:
         package, executable = code(row[1])[0].split()
-        assert NODES[executable].package == package and code(row[0]) == [executable]
+        assert NODES[executable] == package and code(row[0]) == [executable]
         assert (ROOT / "config" / f"{executable}.yaml").is_file()
 
 

@@ -96,8 +96,8 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
 def test_a_folder_of_results_belongs_to_one_process_at_a_time(tmp_path):
     # the nodes of both would read the parameters that the second one has written
     assert output_folder(tmp_path / "out") == output_folder(tmp_path / "out")
-    program = ("import sys; from pathlib import Path; from perch_eval.arguments import exit_code, output_folder; "
-               "sys.exit(exit_code(lambda: 0 * len(str(output_folder(Path(sys.argv[1]))))))")
+    program = ("import argparse, sys; from pathlib import Path; from perch_eval.arguments import command, output_folder; "
+               "sys.exit(command(argparse.ArgumentParser, lambda _: 0 * len(str(output_folder(Path(sys.argv[1])))))([]))")
 
     def another(folder):
         return subprocess.run([sys.executable, "-c", program, str(folder)], capture_output=True, text=True)

@@ -152,11 +152,6 @@ def test_nodes_that_do_not_appear_are_named(tmp_path):
             stack.wait_until_ready(lambda: {"/a"}, timeout=0.1)
 
 
-def test_wait_ends_when_the_caller_is_done(tmp_path):
-    with Stack([python("a", OBEDIENT, WAIT)], tmp_path) as stack:
-        assert stack.wait(lambda: True) == ()
-
-
 def test_what_is_not_ready_yet_is_stopped_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(stack_module, "_ESCALATION", ((signal.SIGINT, 1000.0),))
     lines = Lines()

@@ -9,7 +9,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
-from perch_eval.node_launch import NODES
+from perch_sim.scenario import NODES
 from rclpy.serialization import deserialize_message, serialize_message
 
 RNG = np.random.default_rng(3)
@@ -66,7 +66,7 @@ def test_cameras_share_a_row():
 @pytest.mark.parametrize("name", NODES)
 def test_every_port_of_every_node_has_its_row(name):
     """What a message is and how it becomes a value is found in the table, and the table says it once."""
-    component = importlib.import_module(f"{NODES[name].package}.{name}_node").NODE.component
+    component = importlib.import_module(f"{NODES[name]}.{name}_node").NODE.component
     stand_in = SimpleNamespace(config=component.config_type())
     rows = {Input: topics.topic, Output: topics.topic, Service: topics.service, Client: topics.service, Action: topics.action}
     for kind, row in rows.items():

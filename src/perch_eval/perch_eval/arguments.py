@@ -1,4 +1,4 @@
-"""What commands take: counts, folders for results, which are tried out before the work begins, and the address of the network."""
+"""Command lines: how a program begins and ends, and what it takes: counts, folders for results, the address of the network."""
 
 from __future__ import annotations
 
@@ -29,26 +29,31 @@ def command_parser(name: str, description: str | None, examples: str) -> argpars
     return argparse.ArgumentParser(prog=name, description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
-def exit_code(work: Callable[[], int], *mistakes: type[Exception], interrupted: str = "interrupted") -> int:
-    """What a command ends with: what its work returns, 2 with one line where it is refused, 130 where it is interrupted.
+def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argparse.Namespace], int], *mistakes: type[Exception],
+            interrupted: str = "interrupted") -> Callable[..., int]:
+    """A program's `main`; it ends with what its work returns, 2 with one line where it is refused, 130 where it is interrupted.
 
     Args:
-        work: of the command.
+        parser: makes the command line.
+        work: what is done with its arguments.
         mistakes: what else the caller is to blame for, beside `PerchError` and `OSError`.
         interrupted: said after Ctrl-C.
     """
-    try:
-        return work()
-    except OSError as error:
-        print(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error}", file=sys.stderr)
-    except Exception as error:
-        if not isinstance(error, (PerchError, *mistakes)):
-            raise
-        print(f"error: {error}", file=sys.stderr)
-    except KeyboardInterrupt:
-        print(interrupted, file=sys.stderr)
-        return 130
-    return 2
+    callers: tuple[type[Exception], ...] = (OSError, PerchError, *mistakes)
+
+    def main(arguments: list[str] | None = None) -> int:
+        args = parser().parse_args(arguments)
+        try:
+            return work(args)
+        except callers as error:
+            words = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+            print(f"error: {words}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print(interrupted, file=sys.stderr)
+            return 130
+
+    return main
 
 
 def output_folder(path: Path, option: str = "--out") -> Path:

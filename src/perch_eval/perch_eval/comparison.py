@@ -13,7 +13,7 @@ from typing import Any
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import command_parser, exit_code
+from perch_eval.arguments import command, command_parser
 from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins
 from perch_eval.metrics import FIGURES, figures, flight_metrics
@@ -53,23 +53,17 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point; 0 written, 2 the caller's mistake."""
-    args = parser().parse_args(arguments)
-
-    def work() -> int:
-        names = args.names or [f"{path}{namespace}" for path, namespace in zip(args.flights, args.namespace)]
-        sides = [read(*each, vehicle=args.vehicle) for each in zip(names, COLOURS, args.flights, args.namespace)]
-        page = compare(*sides)
-        try:
-            args.out.parent.mkdir(parents=True, exist_ok=True)
-            args.out.write_text(page)
-        except OSError as error:
-            raise PerchError(f"--out {args.out}: cannot be written: {error.strerror}") from None
-        print(f"page: {args.out}")
-        return 0
-
-    return exit_code(work)
+def _write(args: argparse.Namespace) -> int:
+    names = args.names or [f"{path}{namespace}" for path, namespace in zip(args.flights, args.namespace)]
+    sides = [read(*each, vehicle=args.vehicle) for each in zip(names, COLOURS, args.flights, args.namespace)]
+    page = compare(*sides)
+    try:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(page)
+    except OSError as error:
+        raise PerchError(f"--out {args.out}: cannot be written: {error.strerror}") from None
+    print(f"page: {args.out}")
+    return 0
 
 
 def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str = "") -> Side:
@@ -89,10 +83,7 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
         raise PerchError(f"{file}: no such recording")
     flight, report = RecordedFlight(file, namespace), _report(file.with_name("report.json"))
     model = load_vehicle(vehicle or report.get("vehicle") or "snapdragon")
-    try:
-        view = FlightView.of(flight, model, name, colour)
-    except LookupError as error:
-        raise PerchError(f"{file}: {error}") from None
+    view = FlightView.of(flight, model, name, colour)
     until = report.get("simulated_time_s") or float(view.truth.t[-1])
     report = {**report, **flight_metrics(flight, model, until), "flight_hash": flight.digest(until)}
     report.setdefault("margins", [one.mapping() for one in margins(flight, model)])
@@ -150,3 +141,5 @@ def _margin_table(sides: Sequence[Side]) -> str:
         rows.append((f"{name} [{one['unit']}]", limits(one), *kept))
     return table(rows, ("", "limits", *(side.view.name for side in sides))) if rows else ""
 
+
+main = command(parser, _write)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
-from perch_eval.arguments import count, exit_code, output_folder
+from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import counted
 from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
@@ -101,15 +101,14 @@ def _judge_target(sightings: list[Sightings]) -> list[Consistency]:
                               s.stop - s.start) for name, s in groups.items()]
 
 
-def main() -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="surface_90", help="perch that is flown (default: %(default)s)")
-    parser.add_argument("--runs", type=count, default=50, metavar="N", help="flights (default: %(default)s)")
-    parser.add_argument("--first-seed", type=count, default=100, metavar="N", help="first of consecutive seeds (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out/consistency"), metavar="DIR", help="folder of results (default: %(default)s)")
-    arguments = parser.parse_args()
-    return exit_code(lambda: _judge(arguments))
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = command_parser("consistency_runs", __doc__, "")
+    out.add_argument("--scenario", default="surface_90", help="perch that is flown (default: %(default)s)")
+    out.add_argument("--runs", type=count, default=50, metavar="N", help="flights (default: %(default)s)")
+    out.add_argument("--first-seed", type=count, default=100, metavar="N", help="first of consecutive seeds (default: %(default)s)")
+    out.add_argument("--out", type=Path, default=Path("out/consistency"), metavar="DIR", help="folder of results (default: %(default)s)")
+    return out
 
 
 def _judge(arguments: argparse.Namespace) -> int:
@@ -120,6 +119,8 @@ def _judge(arguments: argparse.Namespace) -> int:
     print(json.dumps(summary, indent=2))
     return 0
 
+
+main = command(parser, _judge)
 
 if __name__ == "__main__":
     sys.exit(main())

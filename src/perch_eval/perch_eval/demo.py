@@ -15,7 +15,7 @@ from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_core.jit import uncompiled
 from perch_core.vehicle import load_vehicle
-from perch_eval.arguments import command_parser, exit_code, open_network, output_folder
+from perch_eval.arguments import command, command_parser, open_network, output_folder
 from perch_eval.domain import own_domain
 from perch_eval.flyable import check_flight
 from perch_eval.goal import SUCCESSES
@@ -108,12 +108,6 @@ def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
             return FlightResult("failed", str(error), client.time, math.nan)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point; 0 perched or inspected, 1 the flight failed, 2 the caller's mistake."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _demonstrate(args), interrupted="interrupted; all nodes are stopped")
-
-
 def _demonstrate(args: argparse.Namespace) -> int:
     open_network(args.network)
     report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose, args.vehicle)
@@ -130,6 +124,9 @@ def _demonstrate(args: argparse.Namespace) -> int:
 def _composed(args: argparse.Namespace) -> Collection[str]:
     """Real time has deadlines at 500 Hz that the work of more neighbours in the same process would miss."""
     return sharing(args.composed, otherwise=() if args.separate else CHAIN_NODES if args.realtime else FAST_NODES)
+
+
+main = command(parser, _demonstrate, interrupted="interrupted; all nodes are stopped")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from perch_core.values import CameraImage, CameraModel, EstimatorHealth, ImuSamp
 from perch_core.vehicle import load_vehicle
 from perch_eval.consistency import attitude_error
 from perch_eval.in_process import Loop
-from perch_eval.in_process.stand_ins import NoParameters
+from perch_eval.in_process.modelled_sight import NoParameters
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import Estimate, UkfConfig

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from perch_core.errors import PerchError
 from perch_core.values import ControlReference, OdometryState, TrajectoryOrder, seconds
 
 HASHED = ("ground_truth/odometry", "imu/data_raw", "odometry", "vio/odometry", "target/pose", "trajectory",
@@ -58,16 +59,17 @@ class Flight:
     """The values of one flight by channel, without leading slash.
 
     Attributes:
+        source: what it is, or its recording, for messages.
         damage: why the recording could not be read to its end; empty if it could.
     """
 
-    def __init__(self, channels: Mapping[str, list[tuple[float, Any]]], damage: str = "") -> None:
+    def __init__(self, channels: Mapping[str, list[tuple[float, Any]]], source: str = "the flight", damage: str = "") -> None:
         """
         Args:
             channels: (time [s], value) of each channel, in the order in which they were emitted.
-            damage: as above.
+            source, damage: as above.
         """
-        self._channels, self.damage = channels, damage
+        self._channels, self.source, self.damage = channels, source, damage
 
     def values(self, channel: str) -> list[tuple[float, Any]]:
         """(time [s], value) of a channel, in order; empty when there are none."""
@@ -87,11 +89,11 @@ class Flight:
         """As `states`, where the flight must have them.
 
         Raises:
-            LookupError: it has not.
+            PerchError: it has not.
         """
         found = self.states(channel)
         if found is None:
-            raise LookupError(f"the flight has no {channel}")
+            raise PerchError(f"{self.source}: holds no {channel}")
         return found
 
     def vectors(self, channel: str, pick: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -50,12 +50,9 @@ class FlightView:
         """What a recording holds.
 
         Raises:
-            LookupError: no true states.
+            PerchError: no true states.
         """
-        truth = flight.states("ground_truth/odometry")
-        if truth is None:
-            raise LookupError("the recording holds no ground_truth/odometry")
-        pad = None
+        truth, pad = flight.known_states("ground_truth/odometry"), None
         if targets := flight.values("ground_truth/target"):
             pad = np.array(targets[-1][1].p), so3.quat_to_matrix(np.array(targets[-1][1].q))
         lines = flight.values("powerlines")

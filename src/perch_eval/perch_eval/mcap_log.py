@@ -38,22 +38,16 @@ class McapLog:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
-    def __contains__(self, topic: str) -> bool:
-        """Whether a topic has been declared."""
-        return topic in self._channels
-
-    def add_topic(self, topic: str, schema: Schema) -> None:
-        """Declare a topic with its type."""
-        if schema.name not in self._schemas:
-            self._schemas[schema.name] = self._writer.register_schema(name=schema.name, encoding="ros2msg", data=schema.definition.encode())
-        self._channels[topic] = self._writer.register_channel(topic=topic, message_encoding="cdr", schema_id=self._schemas[schema.name])
-
-    def write(self, topic: str, data: bytes, time: int) -> None:
-        """Append one message; `time` is simulation time [ns].
+    def write(self, topic: str, schema: Schema, data: bytes, time: int) -> None:
+        """Append one message of a topic, whose first one declares its type; `time` is simulation time [ns].
 
         Raises:
             OSError: the disk is full, or gone.
         """
+        if topic not in self._channels:
+            if schema.name not in self._schemas:
+                self._schemas[schema.name] = self._writer.register_schema(schema.name, "ros2msg", schema.definition.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[schema.name])
         self._writer.add_message(self._channels[topic], log_time=time, publish_time=time, data=data)
 
     def flush(self) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,7 @@ from perch_core.component import Input
 from perch_core.config import quantity, text
 from perch_core.ros.node import node
 from perch_core.values import CameraImage, CameraModel, OdometryState
-from perch_eval.in_process.modelled_sight import ModelledSight
-from perch_eval.in_process.stand_ins import MappedWorld
+from perch_eval.in_process.modelled_sight import MappedWorld, ModelledSight
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
@@ -36,15 +35,6 @@ class SightParameters(TargetLocalizerConfig):
 
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
-
-
-@dataclass(frozen=True)
-class MapParameters:
-    """Whose cables are mapped, and when."""
-
-    scenario: str = text("line_80", doc="config/scenarios/<name>.yaml, or a file")
-    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
-    camera: str = text("front", doc="camera whose frames start the map")
 
 
 class ModelledLocalizer(TargetLocalizer):
@@ -85,23 +75,8 @@ class ModelledLocalizer(TargetLocalizer):
         return super().covers(image) and self._sight.middle(self._exposed(image)) <= self._newest
 
 
-class ModelledMapper(MappedWorld):
-    """The map of a scenario's cables with the mapper's error."""
-
-    config_type = MapParameters  # type: ignore[assignment]
-
-    def __init__(self, config: MapParameters) -> None:
-        """
-        Raises:
-            ConfigError: no such scenario.
-            PerchError: a cable sags.
-        """
-        super().__init__(replace(MappedWorld.of(load_scenario(config.scenario), config.seed).config, camera=config.camera))
-        self.config = config  # type: ignore[assignment]
-
-
 TARGET_LOCALIZER = node("target_localizer", ModelledLocalizer)
-POWERLINE_MAPPER = node("powerline_mapper", ModelledMapper)
+POWERLINE_MAPPER = node("powerline_mapper", MappedWorld)
 NODES = {one.name: one for one in (TARGET_LOCALIZER, POWERLINE_MAPPER)}
 MODULE = "perch_eval.modelled_sight_node"
 

@@ -17,24 +17,10 @@ import yaml
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_sim.lockstep import flight_tasks
-from perch_sim.scenario import NODES as PACKAGES
-from perch_sim.scenario import Latency, Scenario
+from perch_sim.scenario import NODES, Latency, Scenario
 
-
-@dataclass(frozen=True)
-class NodeKind:
-    """What is known of a node, which is also the name of its executable.
-
-    Attributes:
-        package: its package.
-        participant: it takes part in the simulator's lockstep.
-    """
-
-    package: str
-    participant: bool = False
-
-
-NODES = {name: NodeKind(package, name in flight_tasks(Latency())) for name, package in PACKAGES.items()}
+PARTICIPANTS = frozenset(flight_tasks(Latency()))
+"""Nodes that take part in the simulator's lockstep."""
 ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
 PATIENT = 60.0  # wall-clock limit of a plan for which simulation time waits [s]
@@ -59,7 +45,7 @@ class NodeLaunch:
     @property
     def package(self) -> str:
         """Its package."""
-        return NODES[self.name].package
+        return NODES[self.name]
 
     @property
     def module(self) -> str:
@@ -182,12 +168,12 @@ def _host_parameters(node: str, lockstep: bool) -> dict[str, Any]:
     """What the simulator means for a node's host. Its time is that of `/clock`, which the vehicle publishes, in real time, too."""
     if node == "vehicle":
         return {"lockstep": lockstep, "use_sim_time": False}
-    return {"lockstep": lockstep, "use_sim_time": True} if NODES[node].participant else {"use_sim_time": True}
+    return {"lockstep": lockstep, "use_sim_time": True} if node in PARTICIPANTS else {"use_sim_time": True}
 
 
 def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str, lockstep: bool) -> dict[str, dict[str, Any]]:
     """What the scenario as a whole means for single nodes."""
-    participants = [node for node in nodes if NODES[node].participant]
+    participants = [node for node in nodes if node in PARTICIPANTS]
     vehicle = {"vehicle": scenario.vehicle}
     mission: dict[str, Any] = {"mission.planner_latency": scenario.latency.perching_planner,
                "mission.powerline_latency": scenario.latency.powerline_planner}

@@ -10,9 +10,9 @@ from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from perch_core.errors import PerchError
-from perch_eval.node_launch import NODES, NodeLaunch, choose_nodes, node_launches
+from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
-from perch_sim.scenario import Scenario
+from perch_sim.scenario import NODES, Scenario
 
 Overrides = Mapping[str, Mapping[str, Any]]
 

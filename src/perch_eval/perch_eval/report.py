@@ -11,6 +11,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from perch_control.modes import Command
+from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
@@ -154,7 +155,7 @@ def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tupl
 def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Vehicle, inspection: Inspected | None) -> str:
     title = f"{scenario.name}, seed {report['seed']}"
     view = None
-    with suppress(LookupError):
+    with suppress(PerchError):
         view = FlightView.of(flight, vehicle, scenario.name)
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))

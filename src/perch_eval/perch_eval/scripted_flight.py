@@ -6,7 +6,8 @@ measured is the controller.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission_component import RUNNING
 from perch_control.modes import Command, State
-from perch_core import so3
+from perch_core import config, so3
 from perch_core.component import Component, Input, Output, Wake
 from perch_core.errors import PerchError
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
@@ -27,10 +28,19 @@ from perch_core.values import (
 from perch_eval.in_process import arrange
 from perch_eval.in_process.parameters import NodeParameters
 from perch_sim.scenario import Scenario
+from perch_sim.scenario_files import scenario_mapping
 
 LEAD = 0.04           # from an order to its start [s]
 TAKE_OFF_SPEED = 0.8  # mean [m/s]
 PATIENCE = 11.0       # until the estimator is ready, in simulated time [s]
+EVERY_STEP = {"controller.reference_period": 0.002}
+"""Parameter of the controller: its reference is judged at every step."""
+
+
+def scenario_of(name: str, changes: Mapping[str, Any], controller: Mapping[str, Any]) -> Scenario:
+    """A scenario with changes, and parameters of the controller in the place of its own."""
+    mapping = {**scenario_mapping(name), "parameters": {"controller": {**EVERY_STEP, **controller}}, **changes}
+    return config.from_mapping(Scenario, mapping, name)
 
 
 class ScriptedMission(Component[MissionParameters]):

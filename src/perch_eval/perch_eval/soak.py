@@ -17,7 +17,7 @@ import psutil
 
 from perch_core import config
 from perch_core.errors import PerchError
-from perch_eval.arguments import command_parser, count, exit_code, output_folder
+from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.domain import own_domain
 from perch_eval.evaluation.document import machine
@@ -239,12 +239,6 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _soak(args), psutil.Error)
-
-
 def _soak(args: argparse.Namespace) -> int:
     began = time.monotonic()
     if not 0.0 < args.hours <= 1000.0:
@@ -270,3 +264,6 @@ def _write(args: argparse.Namespace, code: str, began: float, flights: Sequence[
         "flights": [asdict(flight) for flight in flights]}, separators=(",", ":")) + "\n")
     (args.out / "README.md").write_text(page(args.out))
     return problems
+
+
+main = command(parser, _soak, psutil.Error)

@@ -121,13 +121,9 @@ class Stack:
         self._ready = True
         self._memory.observe((*self.pids.values(), os.getpid()))
 
-    def wait(self, done: Callable[[], bool] = lambda: False) -> tuple[Ending, ...]:
-        """Wait until `done`, or until a program ends.
-
-        Returns:
-            The programs that have ended; none where `done` came first.
-        """
-        while not (endings := self.endings()) and not done():
+    def wait(self) -> tuple[Ending, ...]:
+        """Wait until a program ends; those that have ended."""
+        while not (endings := self.endings()):
             time.sleep(_POLL_S)
         return endings
 
@@ -145,7 +141,7 @@ class Stack:
         Returns:
             How each program ended.
         """
-        with _undisturbed():
+        with _handled_by(signal.SIG_IGN):
             self._memory.observe(self.pids.values())
             for number, patience in _ESCALATION if self._ready else _AT_START:
                 running = [program for program in self._started.values() if program.running]
@@ -159,13 +155,6 @@ class Stack:
             endings = {name: program.ending() for name, program in self._started.items()}
             self._memory.clean()
             return endings
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ignore what would interrupt."""
-    with _handled_by(signal.SIG_IGN):
-        yield
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import tempfile
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ import yaml
 
 from perch_core.errors import PerchError
 from perch_core.processes import one_thread_for_sums
+from perch_core.registry import resolved
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.results import RunResult
@@ -52,15 +52,12 @@ def resolve(name: str) -> Callable[[Task], RunResult]:
     Raises:
         PerchError: there is none.
     """
-    if name in ENGINES:
-        return ENGINES[name]
-    module, colon, function = name.partition(":")
+    if name not in ENGINES and ":" not in name:
+        raise PerchError(f"engine {name!r} is not one of {', '.join(ENGINES)}, nor of the form module:function")
     try:
-        if colon:
-            return getattr(importlib.import_module(module), function)
+        return ENGINES.get(name) or resolved(name)
     except (ImportError, AttributeError) as error:
         raise PerchError(f"engine {name!r}: {error}") from None
-    raise PerchError(f"engine {name!r} is not one of {', '.join(ENGINES)}, nor of the form module:function")
 
 
 def carry_out(task: Task) -> RunResult:

@@ -60,8 +60,7 @@ def success_map(found: Sequence[RunResult], x: str, y: str) -> Figure:
                       va="center", fontsize=8)
     axes.set_xticks(range(len(across.labels)), across.labels, fontsize=8)
     axes.set_yticks(range(len(up.labels)), up.labels, fontsize=8)
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
+    axes.set(xlabel=x, ylabel=y)
     figure.colorbar(image, label="success rate")
     return figure
 
@@ -78,9 +77,7 @@ def success_curve(found: Sequence[RunResult], name: str) -> Figure:
     axes.errorbar(range(len(cells)), value, [np.clip(value - low, 0, None), np.clip(high - value, 0, None)], fmt="o-",
                   color=GOOD, capsize=4)
     axes.set_xticks(range(len(cells)), [f"{label}\nn={r.trials}" for label, r in zip(axis.labels, rates)], fontsize=8)
-    axes.set_ylim(-0.03, 1.03)
-    axes.set_xlabel(name)
-    axes.set_ylabel("success rate")
+    axes.set(ylim=(-0.03, 1.03), xlabel=name, ylabel="success rate")
     axes.grid(alpha=0.3)
     return figure
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_eval.control_flights.scenarios import scenario_of
-from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
+from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of
 
 SCENARIO = "surface_90"
 CONTROLLERS = {"geometric": ("geometric", False), "geometric + L1": ("geometric", True),

@@ -15,10 +15,9 @@ import numpy as np
 from perch_control.modes import Command, State
 from perch_core.errors import PerchError
 from perch_core.values import Ask, OdometryState, seconds
-from perch_eval.control_flights.scenarios import scenario_of
 from perch_eval.control_flights.way_out import Search, search
 from perch_eval.metrics import tilt_degrees
-from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
+from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from perch_core.errors import PerchError
 from perch_core.registry import resolved
-from perch_eval.arguments import command_parser, count, exit_code, output_folder
+from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
 
@@ -35,9 +35,9 @@ PARTS: dict[str, Part] = {
     "p_inspection": _part("inspection:inspection_sections"), "p_cable": _part("cable:cable_sections"),
     "c_faults": _part("control:fault_sections"), "c_comparison": _part("control:comparison_sections"),
     "c_way_out": _part("ways_out:sections")}
-FLIGHTS = {"seeds": "flights of each perch condition", "line-seeds": "flights of each powerline scenario", "layouts": "random layouts of the inspection"}
-QUICK = {"seeds": 5, "line-seeds": 1, "layouts": 3}
-FULL = {"seeds": 100, "line-seeds": 10, "layouts": 20}
+FLIGHTS = {"seeds": ("flights of each perch condition", 5, 100), "line-seeds": ("flights of each powerline scenario", 1, 10),
+           "layouts": ("random layouts of the inspection", 3, 20)}
+"""Option -> what it counts, how many by default, and with --full."""
 BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out")
 """Hundreds of flights of their own: with --full, or by name."""
 
@@ -51,21 +51,15 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
-    for name, what in FLIGHTS.items():
-        out.add_argument(f"--{name}", type=count, metavar="N", help=f"{what} (default: {QUICK[name]}, with --full {FULL[name]})")
+    for name, (what, quick, full) in FLIGHTS.items():
+        out.add_argument(f"--{name}", type=count, metavar="N", help=f"{what} (default: {quick}, with --full {full})")
     out.add_argument("--fresh", action="store_true", help="fly again what an earlier evaluation of the same code has flown")
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _regenerate(args), interrupted="interrupted; finished flights are kept, the same command goes on")
-
-
 def _regenerate(args: argparse.Namespace) -> int:
     mode = "full" if args.full else "quick"
-    counts = {name: getattr(args, name.replace("-", "_")) or default for name, default in (FULL if args.full else QUICK).items()}
+    counts = {name: getattr(args, name.replace("-", "_")) or (full if args.full else quick) for name, (_, quick, full) in FLIGHTS.items()}
     made_by = ["python3 scripts/evaluate.py", *["--full"] * args.full, *(f"--{name} {n}" for name, n in counts.items()),
                *(f"--only {name}" for name in args.only or ()), f"--out {args.out}"]
     effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by), args.fresh, *counts.values())
@@ -97,3 +91,6 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
         print(f"  {time.monotonic() - began:.0f} s", flush=True)
         sections += part
     return sections
+
+
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command goes on")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,10 +11,9 @@ import numpy as np
 
 from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, Fault, fly_fault
-from perch_eval.evaluation.document import made_by
+from perch_eval.evaluation.document import write_page
 from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.page import finite
 
 MOMENTS = 20                         # of each fault
 QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
@@ -130,9 +128,3 @@ def _faulted(job: tuple[str, int]) -> dict[str, Any]:
 def _compared(job: tuple[str, str, str, int]) -> dict[str, Any]:
     controller, condition, maneuver, seed = job
     return {"controller": controller, "condition": condition, "maneuver": maneuver, "seed": seed, **asdict(fly(*job))}
-
-
-def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
-    """A page of its own beside the results, and its figures as JSON."""
-    (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by(effort), *lines[1:]]) + "\n")
-    (effort.out / f"{name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections.abc import Sequence
+from typing import Any
 
 from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, VACUOUS, Effort, Section
 from perch_eval.page import finite
@@ -15,16 +17,17 @@ _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: 
 
 def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
     """Write `README.md` and `results.json` into the folder of the figures."""
-    (effort.out / "README.md").write_text(_page(sections, effort, duration))
     content = {"commit": commit(), "digest": digest(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
-    (effort.out / "results.json").write_text(json.dumps(finite(content), indent=1) + "\n")
+    write_page(effort, "README", _page(sections, duration), content, "results")
 
 
-def made_by(effort: Effort) -> list[str]:
-    """Lines at the head of a generated page: commit, command, machine."""
-    return [banner(commit()), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
+def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any], data: str = "") -> None:
+    """A page among the results, with commit, command and machine below its heading, and its figures as JSON; `data`: another name of these."""
+    made_by = [banner(commit()), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
+    (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
+    (effort.out / f"{data or name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")
 
 
 def counts(sections: Sequence[Section]) -> dict[str, int]:
@@ -38,14 +41,12 @@ def counts(sections: Sequence[Section]) -> dict[str, int]:
 
 def machine() -> str:
     """What this runs on."""
-    import os
-
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def _page(sections: Sequence[Section], effort: Effort, duration: float) -> str:
+def _page(sections: Sequence[Section], duration: float) -> list[str]:
     found = counts(sections)
-    lines = ["# Results", "", *made_by(effort), f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
+    lines = ["# Results", f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
              f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail, {found.get(VACUOUS, 0)} are vacuous (nothing occurred that they are "
              f"about); {found.get('better', 0)} further values are better than the paper's, {found.get('worse', 0)} worse; "
              f"{found.get(MISSING, 0)} rows are not available.", "",
@@ -62,7 +63,7 @@ def _page(sections: Sequence[Section], effort: Effort, duration: float) -> str:
                       for r in section.rows]
         for name, caption in section.figures:
             lines += ["", f"![{caption}]({name})", "", f"*{caption}*"]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _cell(text: str) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.in_process.stand_ins import MAP_ERROR
+from perch_eval.in_process.modelled_sight import MAP_ERROR
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.layout import random_layout

@@ -9,8 +9,14 @@ import numpy as np
 from perch_core.errors import PerchError, PlanningRefusal
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.causes import SUCCESS
+from perch_eval.evaluation.powerline_flights import AROUND, SEEDS_WITHOUT_GRIP, flights, recovered
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.statistics import Rate, Spread
+from perch_planner.powerline import problem
+from perch_planner.powerline.picture import draw_manoeuvre, draw_visibility
+from perch_planner.powerline.planner import PowerlinePlanner
+from perch_planner.powerline.starts import random_start
+from perch_planner.powerline.visibility import visibility
 
 # case -> (position RMSE [cm], pitch-roll RMSE [deg], perch [ms], recovery [ms])
 TABLE = {"line_80": (3.1, 2.0, 432, 221), "line_80_pa": (3.4, 2.6, 1526, 584), "line_20": (2.7, 2.1, 457, 351),
@@ -26,10 +32,6 @@ def powerline_sections(effort: Effort) -> list[Section]:
 
 
 def _table(effort: Effort) -> Section:
-    from perch_planner.powerline import problem
-    from perch_planner.powerline.planner import PowerlinePlanner
-    from perch_planner.powerline.starts import random_start
-
     count = 50 if effort.full else 5
     out = Section("p_table_1", "[P] Table I: planning time of perch and recovery",
                   f"{count} random starts around the nominal one for each row (generator seeds 1 to {count}); median [range] of the "
@@ -66,8 +68,6 @@ def _table(effort: Effort) -> Section:
 
 def flown_sections(effort: Effort) -> list[Section]:
     """The errors at the perching point, flown."""
-    from perch_eval.evaluation.powerline_flights import AROUND, SEEDS_WITHOUT_GRIP, flights, recovered
-
     seeds = effort.seeds_on_lines
     flown = "seed 1" if len(seeds) == 1 else f"seeds 1 to {seeds[-1]}"
     out = Section("p_table_1_flown", "[P] Table I: errors at the perching point",
@@ -113,8 +113,6 @@ def flown_sections(effort: Effort) -> list[Section]:
 
 
 def _published() -> Section:
-    from perch_planner.powerline import problem
-
     out = Section("p_published", "[P] The authors' published trajectories",
                   "The authors' costs, vehicle and limits in our formulation; their trajectories are the reference. Without noise: no seed.")
     for name, paper in PUBLISHED.items():
@@ -133,10 +131,6 @@ def _published() -> Section:
 
 def _pictures(effort: Effort) -> list[Section]:
     """Fig. 6 and 7 (80 deg without and with perception awareness) and Fig. 8 (upside down), as planned."""
-    from perch_planner.powerline import problem
-    from perch_planner.powerline.picture import draw_manoeuvre, draw_visibility
-    from perch_planner.powerline.visibility import visibility
-
     seven = Section("p_fig_6_7", "[P] Fig. 6 and 7: the line in view at 80 deg", "Nominal start, as planned (flown: not available). No seed.")
     eight = Section("p_fig_8", "[P] Fig. 8: perching upside down", "Nominal start, as planned (flown: not available). No seed.")
     means = {}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,10 +15,17 @@ from perch_core.errors import PlanningRefusal
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.aborted import fly_aborted
-from perch_eval.evaluation.control import write_page
+from perch_eval.evaluation.document import write_page
 from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters
+from perch_planner.perching_planner import PerchingPlannerParameters
+from perch_planner.planner import plan
+from perch_planner.powerline import problem
+from perch_planner.powerline.planner import PowerlinePlanner
+from perch_planner.powerline.starts import random_start
+from perch_planner.problem import PerchProblem, StartState
+from perch_planner.way_out import plan_way_out
 from perch_sim.scenario import load_scenario
 
 RATE = 20.0                                               # instants per second of a plan [Hz]
@@ -32,8 +39,7 @@ SURE = MissionSettings().contact_early                    # nearer to the contac
 BAR = 0.99                                                # share of the instants before that
 
 
-@dataclass(frozen=True)
-class Instant:
+class Instant(NamedTuple):
     """A state of a plan: time to contact [s], and why there is no way out of it; empty: there is one."""
 
     left: float
@@ -111,47 +117,43 @@ def _planned(job: tuple[str, int]) -> dict[str, Any]:
     name, seed = job
     rng = np.random.default_rng(seed)
     try:
-        found = list(_surface(int(name), rng) if name.isdigit() else _line(name, seed, rng))
-        return {"name": name, "seed": seed, "refused": "", "instants": [[x.left, x.refusal] for x in found]}
+        found = _surface(int(name), rng) if name.isdigit() else _line(name, seed, rng)
+        return {"name": name, "seed": seed, "refused": "", "instants": found}
     except PlanningRefusal as refusal:
         return {"name": name, "seed": seed, "refused": str(refusal), "instants": []}
 
 
-def _surface(inclination: int, rng: np.random.Generator) -> Iterator[Instant]:
-    from perch_planner.perching_planner import PerchingPlannerParameters
-    from perch_planner.planner import plan
-    from perch_planner.problem import PerchProblem, StartState
-    from perch_planner.way_out import plan_way_out
-
+def _surface(inclination: int, rng: np.random.Generator) -> list[Instant]:
     settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters).settings
     vehicle = load_vehicle("snapdragon")
     place = np.array([rng.uniform(1.2, 3.0), rng.uniform(-0.5, 0.5), rng.uniform(1.2, 1.8)])
-    problem = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))
-    perch = plan(problem, settings, vehicle).trajectory
-    for t in np.arange(0.0, perch.duration, 1.0 / RATE).tolist():
-        refusal = ""
-        try:
-            plan_way_out(replace(problem, start=StartState.on(perch, t)), settings, vehicle)
-        except PlanningRefusal as problem_with_it:
-            refusal = str(problem_with_it)
-        yield Instant(perch.duration - t, refusal)
+    asked = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))
+    perch = plan(asked, settings, vehicle).trajectory
+    return _instants(perch.duration, lambda t: plan_way_out(replace(asked, start=StartState.on(perch, t)), settings, vehicle))
 
 
-def _line(name: str, seed: int, rng: np.random.Generator) -> Iterator[Instant]:
-    from perch_planner.powerline import problem
-    from perch_planner.powerline.planner import PowerlinePlanner
-    from perch_planner.powerline.starts import random_start
-
+def _line(name: str, seed: int, rng: np.random.Generator) -> list[Instant]:
     vehicle = load_vehicle("rpg")
     planner, setup = PowerlinePlanner(vehicle), problem.load(f"powerline_{name}")
     request = setup.request(vehicle) if seed == 1 else random_start(setup.request(vehicle), setup, vehicle, rng)
     perch = planner.plan(request).perch
     if perch is None:
         raise PlanningRefusal("solver", "perch", -1.0, "no perch")
-    for t in np.arange(0.0, perch.duration, 1.0 / RATE).tolist():
-        refusal, state = "", perch.states[int(np.searchsorted(perch.times, t))]
+
+    def way_out(t: float) -> None:
+        state = perch.states[int(np.searchsorted(perch.times, t))]
+        planner.plan(replace(request, start=state, recovery_only=True, hover=request.start[:3]))
+
+    return _instants(perch.duration, way_out)
+
+
+def _instants(duration: float, way_out: Callable[[float], object]) -> list[Instant]:
+    """Those of a plan, each asked for its way out, which may be refused."""
+    found = []
+    for t in np.arange(0.0, duration, 1.0 / RATE).tolist():
         try:
-            planner.plan(replace(request, start=state, recovery_only=True, hover=request.start[:3]))
-        except PlanningRefusal as problem_with_it:
-            refusal = str(problem_with_it)
-        yield Instant(perch.duration - t, refusal)
+            way_out(t)
+            found.append(Instant(duration - t, ""))
+        except PlanningRefusal as refusal:
+            found.append(Instant(duration - t, str(refusal)))
+    return found

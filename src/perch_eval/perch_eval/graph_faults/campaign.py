@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
-from perch_eval.arguments import command_parser, count, exit_code, output_folder
+from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine
@@ -49,12 +49,6 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--again", action="store_true", help="fly what has been flown, too")
     out.add_argument("--page", action="store_true", help="fly nothing")
     return out
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _strike(args), ValueError, interrupted="interrupted; what has been flown is kept, the same command goes on")
 
 
 def _strike(args: argparse.Namespace) -> int:
@@ -191,3 +185,6 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
            f"Goal: {row['goal']}" for row in rows if problems(row)]
     text += ["## Flights that are not good", "", *(bad or ["None."])]
     return "\n".join(text) + "\n"
+
+
+main = command(parser, _strike, ValueError, interrupted="interrupted; what has been flown is kept, the same command goes on")

@@ -1,8 +1,9 @@
-"""The program `identify`."""
+"""Identifies lags, gains, thrust and drag of a vehicle from a flight: a vehicle file, and a page of plots."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING
 from perch_core import config
 from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
-from perch_eval.arguments import command_parser, exit_code
+from perch_eval.arguments import command, command_parser
 from perch_eval.flight import Flight
-from perch_eval.identification import flight, page
-from perch_eval.identification.fit import battery, identify
+from perch_eval.identification import flight
+from perch_eval.identification.answers import Answer, answers_figure
+from perch_eval.identification.fit import Found, battery, identify
 from perch_eval.identification.record import record_of
 from perch_sim.scenario import load_scenario
 
@@ -33,18 +35,18 @@ exit code: 0 everything is told, 1 something is not (the reasons beside it), 2 w
 nothing, or a battery that no curve fits"""
 
 
-def command_line() -> argparse.ArgumentParser:
-    """The options."""
-    parser = command_parser("identify.py", "Identify lags, gains, thrust and drag of a vehicle from a flight.", EXAMPLES)
-    parser.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
-    parser.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
-    parser.add_argument("--voltage", type=float, nargs="+", default=[], metavar="V",
-                        help="the battery's in each flight, two or more: thrust against voltage; the first is that of the thrust curve")
-    parser.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated flight (default: %(default)s)")
-    parser.add_argument("--name", default="", help="name of the identified vehicle (default: that of the vehicle with _identified)")
-    parser.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (default: %(default)s)")
-    return parser
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = command_parser("identify.py", "Identify lags, gains, thrust and drag of a vehicle from a flight.", EXAMPLES)
+    out.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
+    out.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
+    out.add_argument("--voltage", type=float, nargs="+", default=[], metavar="V",
+                     help="the battery's in each flight, two or more: thrust against voltage; the first is that of the thrust curve")
+    out.add_argument("--scenario", default="surface_90", help="where to fly, and how the real vehicle differs (default: %(default)s)")
+    out.add_argument("--seed", type=int, default=1, help="seed of the simulated flight (default: %(default)s)")
+    out.add_argument("--name", default="", help="name of the identified vehicle (default: that of the vehicle with _identified)")
+    out.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (default: %(default)s)")
+    return out
 
 
 def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | RecordedFlight]:
@@ -80,13 +82,8 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | Re
     return flown
 
 
-def main() -> int:
-    """Fly or read, fit, write, tell."""
-    arguments = command_line().parse_args()
-    return exit_code(lambda: _identify(arguments))
-
-
 def _identify(arguments: argparse.Namespace) -> int:
+    """Fly or read, fit, write, tell."""
     vehicle = load_vehicle(arguments.vehicle)
     flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
     flown = flights(arguments, vehicle)
@@ -101,10 +98,57 @@ def _identify(arguments: argparse.Namespace) -> int:
     is_file = arguments.vehicle.endswith((".yaml", ".yml"))
     base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
     name = arguments.name or f"{vehicle.name}_identified"
-    (arguments.out / "vehicle.yaml").write_text(page.entries(found, vehicle, str(base), name, flown_as, arguments.voltage))
-    page.draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
+    (arguments.out / "vehicle.yaml").write_text(entries(found, vehicle, str(base), name, flown_as, arguments.voltage))
+    draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
     print("\n".join(map(str, found)))
     if not arguments.voltage:
         print(f"{'actuation.battery':32s} not identified: flights at two voltages and more tell it (--voltage)")
     print(f"written: {arguments.out / 'vehicle.yaml'}, {arguments.out / 'identify.png'}")
     return 1 if any(one.refused for one in found) else 0
+
+
+def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str, voltages: Sequence[float] = ()) -> str:
+    """A vehicle file that extends `base` by what was identified; all else stays as it is there, with the reason in a comment.
+
+    Args:
+        found: what was identified.
+        vehicle: as it was known so far.
+        base: its name, or its file.
+        name: of the identified vehicle.
+        flight: of which it was identified, in words.
+        voltages: of the flights [V], the first one that of the thrust curve.
+    """
+    lines: list[str] = []
+    for key in dict.fromkeys(one.key.split("[")[0] for one in found):
+        group = [one for one in found if one.key.split("[")[0] == key]
+        owner = vehicle.actuation if key.startswith("actuation.") else vehicle
+        field = key.split(".")[-1]
+        if key == "actuation.battery.exponent" and not group[0].refused:
+            text = f"{{reference: {voltages[0]:g}, exponent: {group[0].value:.4g}, range: [{min(voltages):g}, {max(voltages):g}]}}"
+            lines.append(f"  battery: {text}  # exponent +- {group[0].sigma:.2g}")
+        old = getattr(owner, field, None)
+        if old is None:
+            continue
+        new = [old[i] if one.refused else one.value for i, one in enumerate(group)] if isinstance(old, tuple) else group[0].value
+        told = not all(one.refused for one in group)
+        axes = [f"{'xyz'[i]} " if len(group) > 1 else "" for i in range(len(group))]
+        sigmas = "; ".join(f"{axis}+- {one.sigma:.2g} {one.unit}".rstrip() for axis, one in zip(axes, group) if not one.refused)
+        text = f"[{', '.join(f'{x:.4g}' for x in new)}]" if isinstance(new, list) else f"{new:.5g}"
+        indent = "  " if key.startswith("actuation.") else ""
+        lines += [f"{indent}# {field}: {axis}not identified: {one.refused}" for axis, one in zip(axes, group) if one.refused]
+        if told:
+            lines.append(f"{indent}{field}: {text}".ljust(45) + f"# {sigmas}")
+    mine, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]
+    head = [f"# Identified by scripts/identify.py, with standard deviations. Of: {flight}", f"extends: {base}", f"name: {name}"]
+    return "\n".join([*head, *mine, *(["actuation:", f"  type: {vehicle.actuation.type}", *inner] if inner else [])]) + "\n"
+
+
+def draw(file: Path, found: Sequence[Found], answers: Sequence[Answer], title: str) -> None:
+    """The answers, and below them what was found."""
+    figure = answers_figure([replace(answer, t=answer.t - answer.t[0]) for answer in answers])
+    figure.suptitle(title)
+    figure.supxlabel("\n".join(map(str, found)), family="monospace", fontsize=8, x=0.02, ha="left")
+    figure.savefig(file, dpi=95)
+
+
+main = command(parser, _identify)

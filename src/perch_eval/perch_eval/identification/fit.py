@@ -76,6 +76,16 @@ def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: fl
     return Found(key, float(value), float(sigma), unit, why)
 
 
+def _untold(answer: Answer, least: float) -> str:
+    """Why an answer tells nothing of its loop: commands of less than `least` (1 sigma), or another model; empty: it does."""
+    size = float(np.std(answer.command))
+    if size < least:
+        return f"commands of {size:.2g} {answer.unit} (1 sigma) are too small; {least:g} are needed"
+    if answer.explained < EXPLAINED:
+        return f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
+    return ""
+
+
 def rates(record: Record, axis: int, delay: float | None = None, spread: float = 0.0) -> tuple[list[Found], Answer]:
     """Lag and gain of one axis of the rate loop with a delay, or with the delay that fits it best, which is then the third.
 
@@ -97,11 +107,7 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
     x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
     answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, commanded, 0.0), w,
                     model(x, slice(None)))
-    size, why = float(np.std(answer.command)), ""
-    if size < LEAST_RATE:
-        why = f"commands of {size:.2g} rad/s (1 sigma) are too small; {LEAST_RATE:g} are needed"
-    elif answer.explained < EXPLAINED:
-        why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
+    why = _untold(answer, LEAST_RATE)
     found = [_judged(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", why),
              _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
     return found + ([_judged("actuation.delay", max(x[3], 0.0), sigma[3], "s", why, DELAY_CERTAIN)] if free else []), answer
@@ -123,11 +129,8 @@ def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) 
 
     x, sigma = _fitted(model, f, (0.04, 1.0, 0.05), (1e-3, 0.2, -5.0), (0.5, 5.0, 5.0))
     command = unit * np.sum(u**2, axis=1) if rotors else u
-    answer, why = Answer("specific thrust", "m/s^2", record.t, command, f, model(x, slice(None))), ""
-    if np.std(command) < LEAST_THRUST:
-        why = f"commands of {np.std(command):.2g} m/s^2 (1 sigma) are too small; {LEAST_THRUST:g} are needed"
-    elif answer.explained < EXPLAINED:
-        why = f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
+    answer = Answer("specific thrust", "m/s^2", record.t, command, f, model(x, slice(None)))
+    why = _untold(answer, LEAST_THRUST)
     scale = vehicle.thrust_coefficient if rotors else 1.0
     certain = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's own offset looks like thrust
     return [_judged(keys[0], x[0], float(np.hypot(sigma[0], spread)), "s", why),

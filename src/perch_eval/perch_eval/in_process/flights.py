@@ -15,9 +15,8 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, seconds
 from perch_eval.goal import goal_of, outcome_of
 from perch_eval.in_process.loop import Loop
-from perch_eval.in_process.modelled_sight import modelled_localizer
+from perch_eval.in_process.modelled_sight import MapParameters, MappedWorld, modelled_localizer
 from perch_eval.in_process.parameters import NodeParameters
-from perch_eval.in_process.stand_ins import MappedWorld
 from perch_eval.in_process.trace import FlightTrace
 from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.drawing import DrawnOnDemand
@@ -76,7 +75,7 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
         elif name == "target_localizer" and sensing.target == "model":
             components[name] = modelled_localizer(parameters.of(name, TargetLocalizerConfig), vehicle, seed)
         elif name == "powerline_mapper" and sensing.target == "model":
-            components[name] = MappedWorld.of(scenario, seed)
+            components[name] = MappedWorld(MapParameters(seed=seed), scenario)
         else:
             components[name] = parameters.component(name)
     planner = PLANNERS.get(scenario.mode)

@@ -1,6 +1,6 @@
-"""Sightings of the pad without images: corners with the measured error of the tag pipeline.
+"""Error models in the place of images: sightings of the pad with the measured error of the tag pipeline, and a map of the cables.
 
-The error model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
+The pad's model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
 calibration errors included), shaken by the error that `perch_perception.tags` makes on rendered images (0.06 px
 at 1.7 m, 0.18 px at 3 m), and solved with the nominal camera by the code that flies. What it does not model:
 blur, contrast and light.
@@ -9,14 +9,19 @@ blur, contrast and light.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from perch_core import so3
+from perch_core.component import Component, Input, Output
+from perch_core.config import quantity, text
+from perch_core.errors import PerchError
+from perch_core.lines import Segment
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
-from perch_core.values import NANOSECONDS
+from perch_core.values import NANOSECONDS, CameraModel, MappedPowerline, PowerlineMap
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import Localization, LocalizationRefusal, average_board, solve_board
@@ -24,7 +29,7 @@ from perch_perception.tags.localizer import LOST_AFTER, MIN_RANGE, SEARCH_PERIOD
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
-from perch_sim.scenario import Scenario
+from perch_sim.scenario import Cable, Scenario, load_scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
 from perch_sim.state_history import StateHistory, TrueState
 
@@ -33,6 +38,8 @@ READABLE_SIDE = 12.5    # a tag whose shortest side is smaller is not found [px]
 _SIDE, _SIGMA = 25.9, 0.06                              # shortest side of a tag [px] and its corners' error there [px]
 _GROWTH = np.log(0.18 / 0.06) / np.log(3.0 / 1.7)       # exponent with which that grows as the side shrinks
 _LARGEST = 0.6                                          # [px]
+MAP_ERROR = 0.02  # 1 sigma of each axis of both ends of a mapped line [m]; the mapper's bar is 3 cm
+MAP_PERIOD = 100_000_000  # [ns]
 
 
 def corner_sigma(side: np.ndarray) -> np.ndarray:
@@ -117,3 +124,59 @@ class ModelledSight:
         side = np.linalg.norm(np.roll(pixels, -1, axis=1) - pixels, axis=2).min(axis=1)
         keep = inside & (side >= READABLE_SIDE)
         return pixels[keep], tuple(np.array(self._board.ids)[keep].tolist()), side[keep]
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """Of a component that has none."""
+
+
+@dataclass(frozen=True)
+class MapParameters:
+    """Whose cables are mapped, and when."""
+
+    scenario: str = text("line_80", doc="config/scenarios/<name>.yaml, or a file")
+    seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
+    camera: str = text("front", doc="camera whose frames start the map")
+
+
+class MappedWorld(Component[MapParameters]):
+    """A map with the mapper's error, ten times a second of the camera's frames, in the place of `powerline_mapper`."""
+
+    config_type = MapParameters
+
+    frame = Input(CameraModel, "camera_{camera}/camera_info")
+    powerlines = Output(PowerlineMap, "powerlines")
+
+    def __init__(self, config: MapParameters, scenario: Scenario | None = None) -> None:
+        """
+        Args:
+            config: when there is a map.
+            scenario: whose cables are mapped; None: that of `config`.
+
+        Raises:
+            ConfigError: no such scenario.
+            PerchError: a cable sags: there is no error model for a map of curves.
+        """
+        super().__init__(config)
+        scenario, rng = scenario or load_scenario(config.scenario), seeding.stream(config.seed, "line_map")
+        if any(cable.sag > 0.0 for cable in scenario.world.cables):
+            raise PerchError(f"scenario {scenario.name}: cables that sag have no error model; sensing.target must be rendered")
+        self._lines = tuple(_mapped(k, cable, rng) for k, cable in enumerate(scenario.world.cables))
+        self._next = 0
+
+    def on_frame(self, frame: CameraModel) -> None:
+        """The map of a frame."""
+        if frame.stamp >= self._next:
+            self._next = frame.stamp + MAP_PERIOD
+            self.powerlines(PowerlineMap(frame.stamp, self._lines, False, ""))
+
+
+def _mapped(number: int, cable: Cable, rng: np.random.Generator) -> MappedPowerline:
+    """A cable as a mapper finds it: each end is off by `MAP_ERROR`."""
+    true = Segment.between(np.array(cable.start), np.array(cable.end), cable.radius, number)
+    first, last = (end + MAP_ERROR * rng.normal(size=3) for end in true.ends)
+    line = Segment.between(first, last, cable.radius, number)
+    start, end = (tuple(place.tolist()) for place in line.ends)
+    sigma = MAP_ERROR * np.sqrt(2.0) / (2.0 * line.half_length)
+    return MappedPowerline(number, start, end, cable.radius, MAP_ERROR**2 * np.eye(3), sigma, 100)

@@ -10,7 +10,7 @@ import numpy as np
 from perch_control.modes import Command, State
 from perch_core.errors import PerchError
 from perch_core.vehicle import Vehicle, load_vehicle
-from perch_eval.arguments import command_parser, exit_code
+from perch_eval.arguments import command, command_parser
 from perch_eval.preflight import checks
 from perch_eval.preflight.checks import Check, Verdict
 
@@ -23,17 +23,17 @@ EXAMPLES = """examples:
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
 
 
-def command_line() -> argparse.ArgumentParser:
-    """The options."""
-    parser = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
-    parser.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
-    parser.add_argument("--namespace", default="", help="namespace of its nodes")
-    parser.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
-    parser.add_argument("--shake", choices=("down", "front"),
-                        help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
-    parser.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
-    parser.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
-    return parser
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
+    out.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
+    out.add_argument("--namespace", default="", help="namespace of its nodes")
+    out.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
+    out.add_argument("--shake", choices=("down", "front"),
+                     help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
+    out.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
+    out.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
+    return out
 
 
 def listened(listener: Any, vehicle: Vehicle) -> list[Check]:
@@ -84,13 +84,8 @@ def exercised(listener: Any, allowed: bool, watchdog: bool, bound: float = check
     return [*found, checks.stopped(*last, bound), takeover]
 
 
-def main() -> int:
-    """Listen, judge, tell."""
-    arguments = command_line().parse_args()
-    return exit_code(lambda: _check(arguments))
-
-
 def _check(arguments: argparse.Namespace) -> int:
+    """Listen, judge, tell."""
     if not 1.0 <= arguments.listen <= 300.0:
         raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
     vehicle = load_vehicle(arguments.vehicle)
@@ -112,3 +107,6 @@ def _check(arguments: argparse.Namespace) -> int:
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}
     print(", ".join(f"{count} {verdict.value}" for verdict, count in counts.items()))
     return 1 if counts[Verdict.FAILED] else 0
+
+
+main = command(parser, _check)

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from perch_core.values import ImuSample
-from perch_eval.recordings.camera_check import Looker, check_camera
-from perch_eval.recordings.clocks import check_clocks
+from perch_eval.recordings.camera_check import Looker, check_camera, check_clocks
 from perch_eval.recordings.findings import Report
 from perch_eval.recordings.imu_check import check_imu
 from perch_eval.recordings.recording import Event, Recording

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from perch_core.errors import ConfigError, PerchError
 from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
-from perch_core.values import CameraImage
-from perch_eval.arguments import command_parser, exit_code, output_folder
+from perch_core.values import CameraImage, InertialState, OdometryState
+from perch_eval.arguments import command, command_parser, output_folder
 from perch_eval.node_launch import parse_overrides
 from perch_eval.page import finite
 from perch_eval.recordings import report
 from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import Evaluation, evaluate
-from perch_eval.recordings.gallery import Gallery
+from perch_eval.recordings.findings import Finding
+from perch_eval.recordings.drawing import Gallery, Shown
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Choice, Perception
 from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
@@ -68,12 +71,6 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _perceive(args))
-
-
 def _perceive(args: argparse.Namespace) -> int:
     one_thread_for_sums()
     overrides = parse_overrides(args.parameter)
@@ -104,6 +101,31 @@ def _choose(sensors: Sensors, recording: Recording, given: str | None, preferred
     return given or (preferred if preferred in there else there[0])
 
 
+@dataclass
+class Told:
+    """What is told of a recording: figures for JSON, rows of words, plots and pictures by title."""
+
+    figures: dict[str, Any]
+    rows: list[tuple[str, str]]
+    plots: dict[str, Figure] = field(default_factory=dict)
+    pictures: dict[str, Sequence[Shown]] = field(default_factory=dict)
+
+    def write(self, folder: Path, recording: Recording, findings: Sequence[Finding] = (), log: Mapping[tuple[str, str, str], int] | None = None) -> None:
+        """Into `report.json` and `report.html`, and to the terminal."""
+        _write_json(folder / "report.json", self.figures)
+        page = report.page(recording.path.name, self.rows, findings, self.plots, self.pictures, log or {})
+        (folder / "report.html").write_text(page)
+        print("\n".join(f"{name}: {text}" for name, text in self.rows))
+        for finding in findings:
+            if finding.level != "ok":
+                print(f"{finding.level}: {finding.about}: {finding.text}")
+        print(f"report: {folder / 'report.html'}")
+
+
+def _write_json(file: Path, content: Any) -> None:
+    file.write_text(json.dumps(finite(content), indent=1) + "\n")
+
+
 # -- recordings with an IMU ------------------------------------------------------------------------------------------
 
 
@@ -116,86 +138,73 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     perception = Perception(sensors, Choice(str(file), down, front, args.board, overrides, tuple(args.without)))
     for event in recording.read():
         perception.take(event)
-    findings = check(recording)
-    figures, rows, plots, vio = _figures(perception, truth)
-    if "powerline_mapper" not in args.without:
-        _write_lines(args.out, perception)
-    _write_trajectories(args.out, perception, vio, truth)
-    content = {
-        "recording": str(recording.path),
-        "camera": down,
-        "front": front,
-        "images": recording.images,
-        "imu_samples": recording.samples,
-        "damage": recording.damage,
-        **figures, "findings": [vars(f) for f in findings.findings],
-        "sensors": findings.figures
-    }
-    rows = [("recording", str(recording.path.resolve())),
-            ("sensors", f"{sensors.name}: VIO looks through {down}, the others through {front}"), *rows]
+    checked, vio = check(recording), _trajectory(perception.states)
+    told = Told({"recording": str(recording.path), "camera": down, "front": front, "images": recording.images,
+                 "imu_samples": recording.samples, "damage": recording.damage},
+                [("recording", str(recording.path.resolve())),
+                 ("sensors", f"{sensors.name}: VIO looks through {down}, the others through {front}")])
+    _tell_motion(told, perception, vio, truth)
+    _tell_surroundings(told, perception)
+    told.figures |= {"findings": [vars(f) for f in checked.findings], "sensors": checked.figures}
     if recording.damage:
-        rows.append(("damage", recording.damage))
-    pictures = {"Tracks": perception.vio.gallery.shown}
-    if perception.target is not None:
-        pictures |= {"The board": perception.target.found.shown, "Without a board": perception.target.missed.shown[:3]}
+        told.rows.append(("damage", recording.damage))
     if perception.wires is not None:
-        pictures |= {"Wires": perception.wires.gallery.shown}
-    _write(args.out, recording.path.name, content, rows, findings.findings, plots, pictures, perception.log)
-    print("\n".join(f"{name}: {text}" for name, text in rows))
-    for finding in findings.findings:
-        if finding.level != "ok":
-            print(f"{finding.level}: {finding.about}: {finding.text}")
-    print(f"report: {args.out / 'report.html'}")
+        lines = perception.lines.lines if perception.lines is not None else ()
+        _write_json(args.out / "powerlines.json", [
+            {"id": line.id, "start": list(line.start), "end": list(line.end), "radius": line.radius,
+             "covariance": line.covariance.tolist(), "observations": line.observations} for line in lines])
+    targets = Trajectory.of((target.stamp, target.p_WS, target.q_WS) for target in perception.targets)
+    for name, motion in (("vio", vio), ("estimator", _trajectory(perception.odometry)), ("target", targets), ("truth", truth)):
+        if motion is not None:
+            write_tum(args.out / f"{name}.tum", motion)
+    told.write(args.out, recording, checked.findings, perception.log)
     return 0 if perception.states else 1
 
 
-def _figures(perception: Perception, truth: Trajectory | None) -> tuple[dict[str, Any], list[tuple[str, str]], dict[str, Any], Trajectory]:
-    """What is told of a run: for JSON, for the table, as plots; and VIO's trajectory."""
+def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
+    """How VIO and estimator fared."""
     frames, states = perception.vio.frames, perception.states
     outcomes = {name: sum(f.outcome == name for f in frames) for name in dict.fromkeys(f.outcome for f in frames)}
     cost = 1e3 * np.array([f.cost for f in frames]) if frames else np.zeros(1)
-    figures: dict[str, Any] = {
-        "frames": outcomes,
-        "restarts": frames[-1].restarts if frames else 0,
-        "vio_frame_ms": {
-            "median": float(np.median(cost)),
-            "p99": float(np.percentile(cost, 99))
-        }
-    }
-    rows = [("VIO frames", ", ".join(f"{n} {name.lower()}" for name, n in outcomes.items()) or "none"),
-            ("restarts", str(figures["restarts"])),
-            ("VIO, CPU time of a frame", f"{np.median(cost):.1f} ms in the median, {np.percentile(cost, 99):.1f} ms p99")]
-    plots: dict[str, Any] = {}
-    vio = _trajectory([(s.stamp, s.p_WB, s.q_WB) for s in states])
+    median, p99 = float(np.median(cost)), float(np.percentile(cost, 99))
+    restarts = frames[-1].restarts if frames else 0
+    told.figures |= {"frames": outcomes, "restarts": restarts, "vio_frame_ms": {"median": median, "p99": p99}}
+    told.rows += [("VIO frames", ", ".join(f"{n} {name.lower()}" for name, n in outcomes.items()) or "none"), ("restarts", str(restarts)),
+                  ("VIO, CPU time of a frame", f"{median:.1f} ms in the median, {p99:.1f} ms p99")]
     compared = None
     if len(vio) > 1:
         moved = np.linalg.norm(vio.p - vio.p[0], axis=1)
-        figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
-        rows.append(
-            ("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
+        told.figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
+        told.rows.append(("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
         if truth is not None:
             compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
-            figures["vio"] |= compared.figures()
-            rows += _evaluation_rows("VIO", compared)
-            odometry = perception.odometry[::max(1, len(perception.odometry) // 5000)]
-            against = evaluate(_trajectory([(o.stamp, o.p_WB, o.q_WB) for o in odometry]), truth)
-            figures["estimator"] = against.figures()
-            rows += _evaluation_rows("estimator", against)[:2]
-        plots["The path"] = report.path_figure(vio, compared)
+            against = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth)
+            told.figures["vio"] |= compared.figures()
+            told.figures["estimator"] = against.figures()
+            told.rows += [*_evaluation_rows("VIO", compared), *_evaluation_rows("estimator", against)[:2]]
+        told.plots["The path"] = report.path_figure(vio, compared)
         if compared is not None:
             index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}
-            plots["Error and covariance"] = report.error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
-        plots["Biases"] = report.bias_figure(perception)
+            told.plots["Error and covariance"] = report.error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
+        told.plots["Biases"] = report.bias_figure(perception)
     if frames:
-        plots["Tracks"] = report.frames_figure(frames)
+        told.plots["Tracks"] = report.frames_figure(frames)
+    told.pictures["Tracks"] = perception.vio.gallery.shown
+
+
+def _tell_surroundings(told: Told, perception: Perception) -> None:
+    """What was found of board and wires."""
     if perception.sightings:
-        figures["target"], words = _board(perception)
-        rows.append(("board", words))
+        told.figures["target"], words = _board(perception)
+        told.rows.append(("board", words))
     if perception.lines is not None:
-        figures["powerlines"] = len(perception.lines.lines)
-        rows.append(("powerlines", f"{len(perception.lines.lines)} segments" +
-                     (f"; {perception.lines.message}" if perception.lines.message else "")))
-    return figures, rows, plots, vio
+        told.figures["powerlines"] = len(perception.lines.lines)
+        words = f"{len(perception.lines.lines)} segments" + (f"; {perception.lines.message}" if perception.lines.message else "")
+        told.rows.append(("powerlines", words))
+    if perception.target is not None:
+        told.pictures |= {"The board": perception.target.found.shown, "Without a board": perception.target.missed.shown[:3]}
+    if perception.wires is not None:
+        told.pictures["Wires"] = perception.wires.gallery.shown
 
 
 def _board(perception: Perception) -> tuple[dict[str, float], str]:
@@ -227,38 +236,8 @@ def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
             (f"{name}: scale", f"{e.scale:.4f}"), nees]
 
 
-def _trajectory(rows: list[tuple[int, Any, Any]]) -> Trajectory:
-    return Trajectory(np.array([row[0] for row in rows], np.int64),
-                      np.array([row[1] for row in rows], float).reshape(-1, 3),
-                      np.array([row[2] for row in rows], float).reshape(-1, 4))
-
-
-def _write_trajectories(folder: Path, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
-    write_tum(folder / "vio.tum", vio)
-    write_tum(folder / "estimator.tum",
-              _trajectory([(o.stamp, o.p_WB, o.q_WB) for o in perception.odometry]))
-    write_tum(folder / "target.tum", _trajectory([(t.stamp, t.p_WS, t.q_WS) for t in perception.targets]))
-    if truth is not None:
-        write_tum(folder / "truth.tum", truth)
-
-
-def _write_lines(folder: Path, perception: Perception) -> None:
-    lines = perception.lines.lines if perception.lines is not None else ()
-    rows = [{
-        "id": line.id,
-        "start": list(line.start),
-        "end": list(line.end),
-        "radius": line.radius,
-        "covariance": line.covariance.tolist(),
-        "observations": line.observations
-    } for line in lines]
-    (folder / "powerlines.json").write_text(json.dumps(finite(rows), indent=1) + "\n")
-
-
-def _write(folder: Path, title: str, content: dict[str, Any], rows: list[tuple[str, str]], findings: Any, plots: dict[str, Any],
-           pictures: dict[str, Any], log: Any) -> None:
-    (folder / "report.json").write_text(json.dumps(finite(content), indent=1) + "\n")
-    (folder / "report.html").write_text(report.page(title, rows, findings, plots, pictures, log))
+def _trajectory(states: Sequence[InertialState] | Sequence[OdometryState]) -> Trajectory:
+    return Trajectory.of((state.stamp, state.p_WB, state.q_WB) for state in states)
 
 
 # -- images alone ----------------------------------------------------------------------------------------------------
@@ -287,16 +266,10 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
             ("images", f"{len(seen)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
             ("board", f"posed in {poses}"), ("wires", str(sum(len(s["wires"]) for s in seen.values())))]
     rows += [("problem", problem) for problem in problems]
-    (args.out / "detections.json").write_text(json.dumps(finite(seen), indent=1) + "\n")
-    _write(args.out, recording.path.name, {
-        "images": len(seen),
-        "tags": tags,
-        "boards": poses,
-        "problems": problems
-    }, rows, (), {}, {"What was found": gallery.shown}, {})
-    print("\n".join(f"{name}: {text}" for name, text in rows) + f"\nreport: {args.out / 'report.html'}")
+    _write_json(args.out / "detections.json", seen)
+    figures = {"images": len(seen), "tags": tags, "boards": poses, "problems": problems}
+    Told(figures, rows, pictures={"What was found": gallery.shown}).write(args.out, recording)
     return 0 if seen else 1
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = command(parser, _perceive)

@@ -1,8 +1,9 @@
-"""What was found, drawn onto the images."""
+"""Pictures for a report: what was found, drawn onto images, and a few of a stream whose length is not known."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -66,3 +67,42 @@ def _whole(pixel: np.ndarray) -> tuple[int, int]:
 def _line(image: np.ndarray, pixels: np.ndarray, colour: tuple[int, int, int], closed: bool = False) -> None:
     if len(pixels) and np.isfinite(pixels).all() and np.abs(pixels).max() < 1e5:
         cv2.polylines(image, [np.rint(16 * pixels).astype(np.int32)], closed, colour, 1, cv2.LINE_AA, 4)
+
+
+class Shown(NamedTuple):
+    """A picture.
+
+    Attributes:
+        stamp: of the image [ns].
+        caption: what it shows.
+        pixels: bgr, uint8 (height, width, 3).
+    """
+
+    stamp: int
+    caption: str
+    pixels: np.ndarray
+
+
+class Gallery:
+    """Takes every n-th picture that is offered; when it is full, every other goes and n is doubled.
+
+    Attributes:
+        shown: the pictures, in their order.
+    """
+    def __init__(self, most: int = 12) -> None:
+        self.shown: list[Shown] = []
+        self._most, self._step, self._offered = most, 1, 0
+
+    def due(self, within: int = 1) -> bool:
+        """Whether the next picture, or one of the next few, will be taken."""
+        return -self._offered % self._step < within
+
+    def offer(self, draw: Callable[[], Shown | None]) -> None:
+        """Draw and take the next picture, if it is due and there is one."""
+        picture = draw() if self.due() else None
+        self._offered += 1
+        if picture is None:
+            return
+        self.shown.append(picture)
+        if len(self.shown) >= self._most:
+            self.shown, self._step = self.shown[::2], 2 * self._step

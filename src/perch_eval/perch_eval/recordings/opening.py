@@ -1,14 +1,49 @@
-"""Which kind of recording a path is."""
+"""Which kind of recording a path is: a bag, a folder in the ASL format, or images, of which nothing is known but what each one shows."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from perch_core.sensors import Sensors
 from perch_eval.recordings.asl import AslRecording, root_of
 from perch_eval.recordings.bag import BagRecording, is_bag
-from perch_eval.recordings.pictures import PictureFolder, pictures_in
-from perch_eval.recordings.recording import Recording, RecordingError
+from perch_eval.recordings.recording import PICTURES, Event, Recording, RecordingError, picture
+
+PERIOD = 1_000_000_000  # between the stamps that the images are given [ns]
+
+
+def pictures_in(path: Path) -> list[Path]:
+    """The image files of a folder in the order of their names; of a file, itself."""
+    files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
+    return [file for file in files if file.suffix.lower() in PICTURES and file.is_file()]
+
+
+class PictureFolder(Recording):
+    """Images without a time of their own."""
+    def __init__(self, path: Path, sensors: Sensors | None) -> None:
+        """
+        Raises:
+            RecordingError: there is no image.
+        """
+        super().__init__(path, sensors)
+        self.files = pictures_in(path)
+        if not self.files:
+            raise RecordingError(f"{path}: no image in it")
+        self.camera = next(iter(sensors.cameras), "camera") if sensors is not None else "camera"
+        self.images = {self.camera: len(self.files)}
+
+    def events(self) -> Iterator[Event]:
+        """The images in the order of their names, one a second; those that are none are left out and said in `damage`."""
+        bad = []
+        for number, file in enumerate(self.files):
+            try:
+                image = picture(file, number * PERIOD, self.camera, None)
+            except RecordingError:
+                bad.append(file.name)
+                continue
+            yield Event(self.camera, image.stamp, image)
+        self.damage = f"cannot be decoded: {', '.join(bad)}" if bad else ""
 
 
 def open_recording(path: Path, sensors: Sensors | None) -> Recording:

@@ -16,8 +16,7 @@ from perch_core.tag_board import load_board
 from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState, OdometryState, PowerlineMap,
                                TargetPose, TargetSighting)
 from perch_eval.node_launch import read_parameters
-from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_wires
-from perch_eval.recordings.gallery import Gallery, Shown
+from perch_eval.recordings.drawing import Gallery, Shown, canvas, caption, draw_board, draw_wires
 from perch_eval.recordings.recording import Event
 from perch_perception.camera_component import CameraComponent
 from perch_perception.estimator_component import StateEstimator

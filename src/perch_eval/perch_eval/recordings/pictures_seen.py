@@ -12,8 +12,7 @@ from perch_core import so3
 from perch_core.camera import Camera, CameraMount, PinholeCamera
 from perch_core.tag_board import FAMILIES, Tag, TagBoard
 from perch_core.values import CameraImage, TargetPose
-from perch_eval.recordings.drawing import canvas, caption, draw_board, draw_tags, draw_wires
-from perch_eval.recordings.gallery import Shown
+from perch_eval.recordings.drawing import Shown, canvas, caption, draw_board, draw_tags, draw_wires
 from perch_perception.images import mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting, detect_lines
 from perch_perception.tags import BoardLocalizer, BoardPose, TagDetector, refine_corners

@@ -11,7 +11,7 @@ from perch_eval.page import image, images, section, table
 from perch_eval.page import page as document
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
-from perch_eval.recordings.gallery import Shown
+from perch_eval.recordings.drawing import Shown
 from perch_eval.recordings.perception import Frame, Perception
 from perch_eval.recordings.trajectory import Trajectory
 
@@ -53,8 +53,7 @@ def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:
             axes.plot(evaluation.truth_W[:, i], evaluation.truth_W[:, j], color="0.3", lw=1.6, label="truth")
         axes.plot(estimate.p[:, i], estimate.p[:, j], color="C1", lw=1.2, label="VIO")
         axes.plot(*estimate.p[0, [i, j]], "o", color="C1", ms=5)
-        axes.set_xlabel(f"{'xyz'[i]} [m]")
-        axes.set_ylabel(f"{'xyz'[j]} [m]")
+        axes.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")
         axes.axis("equal")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
@@ -80,8 +79,7 @@ def frames_figure(frames: Sequence[Frame]) -> Figure:
                      lw=0,
                      label=None if outcome in named else outcome.lower())
         named.add(outcome)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("tracks, observations")
+    axes.set(xlabel="time [s]", ylabel="tracks, observations")
     axes.legend(fontsize=8, ncol=4)
     axes.grid(alpha=0.3)
     return figure
@@ -99,8 +97,7 @@ def bias_figure(perception: Perception) -> Figure:
             axes.plot(t, values[:, i], color=f"C{i}", lw=1.2, label="xyz"[i])
             band = 3.0 * sigma[:, first + i]
             axes.fill_between(t, values[:, i] - band, values[:, i] + band, color=f"C{i}", alpha=0.12, lw=0)
-        axes.set_ylabel(f"{name.replace('_', ' ')} [{unit}]")
-        axes.set_xlabel("time [s]")
+        axes.set(ylabel=f"{name.replace('_', ' ')} [{unit}]", xlabel="time [s]")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.sensors import load_sensors
-from perch_eval.arguments import command_parser, exit_code
+from perch_eval.arguments import command, command_parser
 from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_eval.recordings.check import check
@@ -34,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
                             help="make a sensor file from a calibration",
                             epilog=EXAMPLES,
                             formatter_class=argparse.RawDescriptionHelpFormatter)
+    read.set_defaults(work=_import)
     read.add_argument("kind", choices=("kalibr", "euroc"))
     read.add_argument("files",
                       nargs="+",
@@ -50,17 +50,12 @@ def parser() -> argparse.ArgumentParser:
                       metavar=("X", "Y", "Z", "W"),
                       help="axes of the IMU in the body (forward, left, up), as a quaternion (default: the body has the IMU's axes)")
     judge = verbs.add_parser("check", help="find what would make perception fail on a recording")
+    judge.set_defaults(work=_check)
     judge.add_argument("recording", type=Path, metavar="RECORDING")
     judge.add_argument("--sensors",
                        metavar="FILE",
                        help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
     return out
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _import(args) if args.verb == "import" else _check(args))
 
 
 def _import(args: argparse.Namespace) -> int:
@@ -111,5 +106,4 @@ def _check(args: argparse.Namespace) -> int:
     return 1 if found.fails else 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = command(parser, lambda args: args.work(args))

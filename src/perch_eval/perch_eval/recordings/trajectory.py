@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +30,13 @@ class Trajectory:
     stamps: np.ndarray
     p: np.ndarray
     q: np.ndarray
+
+    @classmethod
+    def of(cls, poses: Iterable[tuple[int, Any, Any]]) -> Trajectory:
+        """(stamp [ns], position, attitude) of each pose."""
+        rows = list(poses)
+        return cls(np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], float).reshape(-1, 3),
+                   np.array([row[2] for row in rows], float).reshape(-1, 4))
 
     def __len__(self) -> int:
         return len(self.stamps)

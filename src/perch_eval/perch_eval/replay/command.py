@@ -13,10 +13,9 @@ from matplotlib.figure import Figure
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import command_parser, count, exit_code
+from perch_eval.arguments import command, command_parser, count
 from perch_eval.flight_view import FlightView
-from perch_eval.replay.animation import write_animation
-from perch_eval.replay.scene import Scene
+from perch_eval.replay.animation import Scene, write_animation
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
 
@@ -47,12 +46,6 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry point."""
-    args = parser().parse_args(arguments)
-    return exit_code(lambda: _show(args), LookupError)
-
-
 def _show(args: argparse.Namespace) -> int:
     if not args.flight.is_file():
         raise PerchError(f"{args.flight}: no such recording")
@@ -62,10 +55,7 @@ def _show(args: argparse.Namespace) -> int:
     flight, vehicle = RecordedFlight(args.flight, args.namespace), load_vehicle(args.vehicle)
     if flight.damage:
         print(f"warning: {args.flight} is cut off or damaged, and shown as far as it goes ({flight.damage})", file=sys.stderr)
-    try:
-        view = FlightView.of(flight, vehicle)
-    except LookupError as error:
-        raise PerchError(f"{args.flight}: {error}") from None
+    view = FlightView.of(flight, vehicle)
     path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
@@ -111,3 +101,6 @@ def write_plots(view: FlightView, folder: Path) -> None:
     for name, draw in figures.items():
         if figure := draw(view):
             figure.savefig(folder / f"{name}.png", dpi=95)
+
+
+main = command(parser, _show)

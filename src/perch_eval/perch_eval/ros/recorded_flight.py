@@ -64,7 +64,7 @@ class RecordedFlight(Flight):
             if channel is not None:
                 names[key] = channel
                 messages.setdefault(key, []).append((time, data))
-        super().__init__(_Channels(names, messages), damage[0] if damage else "")
+        super().__init__(_Channels(names, messages), str(path), damage[0] if damage else "")
 
 
 @lru_cache(maxsize=None)
@@ -91,8 +91,6 @@ def write(path: Path, values: Iterable[tuple[str, int, Any]], namespace: str = "
     try:
         for channel, time, value in values:
             topic = channel if channel.startswith("/") else f"{namespace}/{channel}"
-            if topic not in log:
-                log.add_topic(topic, schema_of(topics.message_type(channel)))
-            log.write(topic, topics.encode(channel, value), time)
+            log.write(topic, schema_of(topics.message_type(channel)), topics.encode(channel, value), time)
     finally:
         log.close()

@@ -101,9 +101,7 @@ class Recorder(Listener[RecorderParameters]):
         if self._log is None:
             return
         try:
-            if message.topic not in self._log:
-                self._log.add_topic(message.topic, schema_of(message.message))
-            self._log.write(message.topic, message.data, message.stamp)
+            self._log.write(message.topic, schema_of(message.message), message.data, message.stamp)
             self._messages += 1
         except OSError as error:
             self._give_up(error)

@@ -1,8 +1,8 @@
-"""What a person wants to see of a flight, as markers: vehicle, pad, cables, planned and flown path, waypoints."""
+"""What a person wants to see of a flight, as markers in `map`: vehicle, pad, cables, planned and flown path, waypoints."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -11,9 +11,12 @@ from perch_core.catenary import Catenary
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import Marker, OdometryState, PowerlineMap, Shape
 from perch_core.vehicle import Vehicle
-from perch_eval.view.markers import arrow, box_edges, label, marker, polyline, removed
 from perch_sim.scenario import Scenario
 
+Colour = tuple[float, float, float, float]
+Floats = tuple[float, ...]
+Vector = Sequence[float] | np.ndarray
+_ORIGIN, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 ESTIMATE, TRUTH, PLANNED, FOUND = (1.0, 0.6, 0.1, 1.0), (0.3, 0.6, 0.9, 1.0), (0.2, 0.8, 0.3, 1.0), (0.95, 0.9, 0.2, 1.0)
 ROOM, SURFACE, PAD, GHOST = (0.6, 0.6, 0.6, 0.4), (0.55, 0.55, 0.55, 0.5), (0.95, 0.95, 0.95, 1.0), (0.3, 0.6, 0.9, 0.35)
 CABLES = {"red": (0.75, 0.1, 0.1, 1.0), "grey": (0.45, 0.45, 0.45, 1.0)}
@@ -24,6 +27,46 @@ PATH_STEP = 0.02     # least distance between drawn points of a flown path [m]
 PATH_POINTS = 3000   # of a flown path; then every other one is dropped
 _ROTOR = 0.1         # where the vehicle's file does not tell [m]
 SIGHT = 0.4          # length of the camera's axis [m]
+
+
+def _floats(values: Iterable[float]) -> Floats:
+    return tuple(float(v) for v in values)
+
+
+def marker(shape: Shape, ns: str, id: int, colour: Colour, scale: Vector, p: Vector = _ORIGIN,
+           q: Vector = _UPRIGHT) -> Marker:
+    """A shape at a pose in `map`."""
+    return Marker(shape, ns, id, colour, _floats(scale), _floats(p), _floats(q))
+
+
+def polyline(ns: str, id: int, colour: Colour, width: float, points: Iterable[Vector], pieces: bool = False) -> Marker:
+    """A line through points in `map` [m], or (pieces) a line between each two of them; fewer than two points remove it."""
+    shape, corners = Shape.LINE_LIST if pieces else Shape.LINE_STRIP, tuple(_floats(p) for p in points)
+    if len(corners) < 2:
+        return removed(shape, ns, id)
+    return Marker(shape, ns, id, colour, (float(width), 0.0, 0.0), points=corners)
+
+
+def removed(shape: Shape, ns: str, id: int) -> Marker:
+    """A marker that is drawn no longer."""
+    return Marker(shape, ns, id, (0.0, 0.0, 0.0, 0.0), _ORIGIN, removed=True)
+
+
+def arrow(ns: str, id: int, colour: Colour, start: Vector, end: Vector) -> Marker:
+    """An arrow between two points in `map`."""
+    return Marker(Shape.ARROW, ns, id, colour, (0.02, 0.05, 0.08), points=(_floats(start), _floats(end)))
+
+
+def label(ns: str, id: int, colour: Colour, height: float, p: Vector, text: str) -> Marker:
+    """A text that always faces the viewer; its letters are `height` high [m]."""
+    return Marker(Shape.TEXT, ns, id, colour, (0.0, 0.0, height), _floats(p), text=text)
+
+
+def box_edges(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+    """End points of the twelve edges of a box, for a line of pieces."""
+    corners = np.array(np.meshgrid(*zip(low, high), indexing="ij")).reshape(3, 8).T
+    pairs = [(a, b) for a in range(8) for b in range(a) if np.count_nonzero(corners[a] != corners[b]) == 1]
+    return [corners[k] for pair in pairs for k in pair]
 
 
 class Path:
