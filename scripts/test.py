@@ -17,14 +17,13 @@ from typing import IO, NoReturn
 from perch_setup import EXTRAS, ROOT, command_parser, enter
 
 PARTS = (
-    ("tests/system/test_restart.py", "tests/system/test_stopping.py", "tests/nodes/"),
-    ("tests/system/test_flight_surface.py",), ("tests/system/test_campaign.py",), ("tests/system/test_bad_input.py",),
-    ("tests/unit/test_goals_in_a_row.py",), ("tests/unit/test_autopilot_firmware.py",), ("tests/recordings/",),
-    ("tests/fuzz/test_messages.py",), ("tests/unit/test_vio_filter.py",),
+    ("tests/system/test_flight_surface.py",), ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/unit/test_autopilot_firmware.py",),
+    ("tests/recordings/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",), ("tests/unit/test_goals_in_a_row.py",),
+    ("tests/fuzz/test_messages.py",), ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",), ("tests/unit/test_control_nmpc.py",),
 )
 """What takes longest, so it begins first; files and folders of one part share what is dear to make. Each other file is a part."""
-PROCESSES = 1 + min(os.cpu_count() or 1, 5)
-"""One more than there are cores: some tests wait for clocks, or for processes that they have started."""
+PROCESSES = 2 + min(os.cpu_count() or 1, 4)
+"""Two more than there are cores: some tests wait for clocks, or for processes that they have started."""
 KEPT = ROOT / ".perch" / "pycache"
 
 EXAMPLES = """examples:

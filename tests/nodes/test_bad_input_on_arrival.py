@@ -5,21 +5,19 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
-import rclpy
 from nav_msgs.msg import Odometry
 from nodes.good import messages, requests
-from nodes.node_process import PATIENCE, Running, plain
+from nodes.node_process import PATIENCE, Running, plain, watching
 from nodes.spoiled import kinds, plain_ways, spoilt
 from perch_core.ros import topics
-
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 PERIOD = 10_000_000  # of the good samples [ns]
-AGAIN = 0.1          # [s] a line of one kind is said once a second: what shall lead to one is sent this often until it does
+AGAIN = 0.2          # [s] a line of one kind is said once a second: what shall lead to one is sent this often until it does
 EXAMINED = ("estimator", "vio", "target_localizer", "controller", "mission", "description")
 STAMPS = ("header.stamp is past", "header.stamp is negative", "header.stamp is future")
 POSE = ("pose.pose.position.x is nan", "pose.pose.position.y is inf", "pose.pose.orientation is zero", "pose.pose.orientation.x is 1e+300")
@@ -59,12 +57,8 @@ REFUSED = [  # topic, what is wrong, who says so, and what with
 class Stranger:
     """Publishes good messages of the present, and others between them."""
 
-    def __init__(self) -> None:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context)
-        self.node = Node("stranger", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
+        self.node, self._executor = node, executor
         self.stamp, self._answered, self._steps = time.time_ns(), 0, 0
         good = messages(self.stamp)
         self.topics = tuple(good)
@@ -111,10 +105,9 @@ class Stranger:
         stamp = self.stamp + PERIOD
         self._until(lambda: self._answered >= stamp or (self._go_on() and False), "a good sample is not answered")
 
-    def spoilt(self, topic: str, wrong: str) -> object:
-        """A message of the present that is wrong in something."""
-        message = messages(self.stamp + PERIOD // 2)[topic]
-        return spoilt(message, [plain_ways(message)[wrong]])
+    def good(self) -> dict[str, Any]:
+        """Messages of the present."""
+        return messages(self.stamp + PERIOD // 2)
 
     def ask(self, kind, name: str, request):
         """The answer to a request."""
@@ -125,18 +118,12 @@ class Stranger:
         self.node.destroy_client(client)
         return future.result()
 
-    def close(self) -> None:
-        """Leave the graph."""
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
 
 @pytest.fixture
 def stranger(graph: dict[str, Running]) -> Iterator[Stranger]:
     """A process beside the nodes."""
-    one = Stranger()
-    yield one
-    one.close()
+    with watching() as (node, executor):
+        yield Stranger(node, executor)
 
 
 def test_what_is_wrong_is_said(stranger, graph):
@@ -147,9 +134,10 @@ def test_what_is_wrong_is_said(stranger, graph):
     end = time.monotonic() + PATIENCE
     while waiting:  # one of each topic at a time, so that a line can be told from the next
         assert time.monotonic() < end, {topic: some[0] for topic, some in waiting.items()}
+        good = stranger.good()
         for topic, some in waiting.items():
             begun.setdefault(topic, {name: len(graph[name].log) for name in some[0][1]})
-            stranger.publishers[topic].publish(stranger.spoilt(topic, some[0][0]))
+            stranger.publishers[topic].publish(spoilt(good[topic], [plain_ways(good[topic])[some[0][0]]]))
         stranger.go_on()
         time.sleep(AGAIN)
         for topic, some in list(waiting.items()):
@@ -163,7 +151,7 @@ def test_what_is_wrong_is_said(stranger, graph):
 
 def test_whatever_is_sent_every_node_goes_on(stranger, graph):
     for topic in stranger.topics:
-        for _, message in kinds(messages(stranger.stamp + PERIOD // 2)[topic]):
+        for _, message in kinds(stranger.good()[topic]):
             stranger.publishers[topic].publish(message)
         stranger.go_on()
     seen = plain("states.py", "200", "200")

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-import rclpy
-from nodes.node_process import PATIENCE
+from nodes.node_process import PATIENCE, watching
 from perch_msgs.action import Perch
 from perch_msgs.srv import SetController
 from rclpy.action import ActionClient
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -22,12 +20,8 @@ ROOM = QoSProfile(depth=CALLS)  # a client of ROS keeps ten answers that it has 
 class Crowd:
     """Somebody who asks all at once."""
 
-    def __init__(self) -> None:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context)
-        self.node = Node("crowd", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
+        self.node, self._executor = node, executor
 
     def wait(self, done) -> None:
         """Hear answers until `done`."""
@@ -36,19 +30,12 @@ class Crowd:
                 return
             self._executor.spin_once(timeout_sec=0.01)
 
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
 
 @pytest.fixture
 def crowd(graph) -> Iterator[Crowd]:
     """Beside the nodes."""
-    one = Crowd()
-    yield one
-    one.close()
+    with watching() as (node, executor):
+        yield Crowd(node, executor)
 
 
 def test_every_choice_of_a_law_is_answered(crowd):

@@ -51,10 +51,17 @@ def run(command: list[str]) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
 
 
+def call(command: list[str], capsys) -> tuple[int, str, str]:
+    """Exit code of a command that nobody stops, and what it writes: its workers are processes of their own, it is none."""
+    code = main(command[3:])
+    return code, *capsys.readouterr()
+
+
 def refused(command: list[str], capsys) -> str:
-    """What a command says that ends as the caller's mistake: in this process, before a worker is started."""
-    assert main(command[3:]) == 2
-    return capsys.readouterr().err
+    """What a command says that ends as the caller's mistake, before a worker is started."""
+    code, _, words = call(command, capsys)
+    assert code == 2
+    return words
 
 
 def numbers(folder: Path) -> list[int]:
@@ -73,7 +80,7 @@ def wait_for_results(folder: Path, count: int) -> None:
     raise AssertionError(f"no {count} results within {PATIENCE:g} s")
 
 
-def test_a_killed_campaign_resumes_to_the_200_results_of_an_undisturbed_one(campaign, tmp_path):
+def test_a_killed_campaign_resumes_to_the_200_results_of_an_undisturbed_one(campaign, tmp_path, capsys):
     process = subprocess.Popen(campaign("held", 200), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for_results(tmp_path, 37)
     workers = psutil.Process(process.pid).children(recursive=True)
@@ -83,12 +90,11 @@ def test_a_killed_campaign_resumes_to_the_200_results_of_an_undisturbed_one(camp
     kept = numbers(tmp_path)
     assert 37 <= len(kept) < 200
     (tmp_path / "killed").touch()  # the others may go on
-    refusal = run(campaign("held", 200))
-    assert refusal.returncode == 2 and "--resume" in refusal.stderr
-    again = run(campaign("held", 200, "--resume"))
-    assert again.returncode == 0, again.stderr
+    assert "--resume" in refused(campaign("held", 200), capsys)
+    code, again, words = call(campaign("held", 200, "--resume"), capsys)
+    assert code == 0, words
     assert numbers(tmp_path) == list(range(200))
-    assert f"{200 - len(kept)} of 200 runs to fly" in again.stdout
+    assert f"{200 - len(kept)} of 200 runs to fly" in again
     found = read_results(tmp_path / "out" / "results.jsonl")
     assert len({r.values["wind.gust_sigma"] for r in found}) == 200 and len({r.seed for r in found}) == 200
     assert all((r.cause == "perched") == (r.values["wind.gust_sigma"] < 0.5) for r in found)
@@ -127,19 +133,21 @@ def cluster(campaign, tmp_path) -> Iterator[str]:
         process.stdin.close()
 
 
-def test_a_killed_worker_loses_no_result(campaign, tmp_path):
-    lost_none(campaign, tmp_path)
+def test_a_killed_worker_loses_no_result(campaign, tmp_path, capsys):
+    code, _, words = call(campaign("mortal", 40), capsys)
+    assert code == 0, words
+    lost_none(tmp_path)
 
 
 def test_a_killed_worker_of_a_cluster_loses_no_result_and_all_add_on_one_thread(campaign, tmp_path, cluster):
-    lost_none(campaign, tmp_path, "--cluster", cluster)
+    finished = run(campaign("mortal", 40, "--cluster", cluster))
+    assert finished.returncode == 0, finished.stderr
+    lost_none(tmp_path)
     assert {r.message for r in read_results(tmp_path / "out" / "results.jsonl")} == {"1"}
 
 
-def lost_none(campaign, tmp_path, *where: str) -> None:
-    finished = run(campaign("mortal", 40, *where))
+def lost_none(tmp_path) -> None:
     assert (tmp_path / "killed").exists()
-    assert finished.returncode == 0, finished.stderr
     assert numbers(tmp_path) == list(range(40))
     assert not [r for r in read_results(tmp_path / "out" / "results.jsonl") if r.cause == "error"]
 
@@ -160,8 +168,7 @@ def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_pa
 
 
 def test_runs_that_break_are_results_and_do_not_mix_with_those_of_other_settings(campaign, tmp_path, capsys):
-    finished = run(campaign("broken", 12, "--jobs", "1"))
-    assert finished.returncode == 1
+    assert call(campaign("broken", 12, "--jobs", "1"), capsys)[0] == 1
     found = read_results(tmp_path / "out" / "results.jsonl")
     assert [r.number for r in found if r.cause == "error"] == [0, 4, 8]
     assert "the simulator is out of fuel" in found[0].message

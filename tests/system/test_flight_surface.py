@@ -12,6 +12,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,8 +21,9 @@ import pytest
 from mcap.reader import make_reader
 from perch_eval import demo
 from perch_eval.flight import HASHED, Flight, numbers
-from perch_eval.nodes import ALL_NODES
+from perch_eval.nodes import ALL_NODES, executable
 from perch_eval.ros.recorded_flight import RecordedFlight
+from system import forks
 from system.scripts import PATIENCE, ROOT
 
 SCENARIO, SEED = "surface_90", 1
@@ -96,22 +98,25 @@ def test_the_page_is_complete(flight):
 
 
 @pytest.fixture
-def crowd(ros_domain, monkeypatch) -> Iterator[list[subprocess.Popen]]:
+def crowd(ros_domain, tmp_path, monkeypatch) -> Iterator[list[forks.Forked]]:
     """A foreign publisher on every topic, a viewer and two who measure rates, in the domain that the next demo flies in."""
     monkeypatch.setattr(demo, "own_domain", lambda: contextlib.nullcontext(ros_domain))
-    stranger = subprocess.Popen([sys.executable, str(Path(__file__).parent / "stranger.py")], stdout=subprocess.PIPE, text=True,
-                                env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")))})
-    scripts = [("run_node.py", "viewer", "--ros-args", "-p", "port:=0"), *(("topic.py", "hz", *topic) for topic in WATCHED)]
-    others = [subprocess.Popen([sys.executable, str(ROOT / "scripts" / script), *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-              for script, *arguments in scripts]
-    try:
-        assert stranger.stdout.readline().startswith("up")
-        yield [stranger, *others]
-    finally:
-        for process in (stranger, *others):
-            process.terminate()
-        for process in (stranger, *others):
-            process.wait(PATIENCE)
+    topic = str(ROOT / "scripts" / "topic.py")
+    with (tmp_path / "crowd.log").open("w+") as log:
+        everybody = [forks.Forked(forks.NODES, [str(Path(__file__).with_name("stranger.py"))], log, log),
+                     forks.Forked(forks.NODES, [executable("perch_eval", "viewer"), "--ros-args", "-p", "port:=0"], log, log),
+                     *(forks.Forked(forks.SCRIPTS, [topic, "hz", *watched], log, log) for watched in WATCHED)]
+        try:
+            end = time.monotonic() + PATIENCE
+            while "up\n" not in (tmp_path / "crowd.log").read_text():
+                assert everybody[0].poll() is None and time.monotonic() < end
+                time.sleep(0.05)
+            yield everybody
+        finally:
+            for process in everybody:
+                process.terminate()
+            for process in everybody:
+                process.wait(PATIENCE)
 
 
 def test_one_process_per_node_in_a_crowd_is_the_same_flight(flight, crowd, tmp_path, monkeypatch):

@@ -8,17 +8,15 @@ from __future__ import annotations
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import psutil
 import pytest
-import rclpy
-from nodes.node_process import FREE
+from nodes.node_process import FREE, watching
 from perch_core import config
 from perch_sim.scenario import NODES
 from perch_eval.nodes import executable
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
@@ -33,12 +31,8 @@ AS_A_USER = "vehicle"
 class Watch:
     """Sees when nodes work: they answer to a request, which they do only once their constructor is through."""
 
-    def __init__(self) -> None:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context)
-        self._node = Node("watch", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
+        self._node, self._executor = node, executor
 
     def wait_for(self, name: str, process: Executable) -> None:
         """Wait until a node answers."""
@@ -55,10 +49,12 @@ class Watch:
             assert time.monotonic() < end, "the node does not answer"
             self._executor.spin_once(timeout_sec=0.02)
 
-    def close(self) -> None:
-        """Leave the graph."""
-        self._node.destroy_node()
-        self._context.try_shutdown()
+
+@pytest.fixture
+def watch(ros_domain: int) -> Iterator[Watch]:
+    """In the domain of the test."""
+    with watching() as (node, executor):
+        yield Watch(node, executor)
 
 
 class Executable:
@@ -96,11 +92,10 @@ def works(process: psutil.Process) -> bool:
 
 
 @pytest.mark.parametrize("number, names", [(signal.SIGINT, set(NODES)), (signal.SIGTERM, set(NODES) - set(FREE))])
-def test_every_executable_stops_cleanly(number, names, ros_domain, tmp_path, record_property, capsys):
+def test_every_executable_stops_cleanly(number, names, watch, tmp_path, record_property, capsys):
     """SIGTERM ends the others when the tests of `tests/nodes` are over, which assert it. SIGALRM: Fast DDS has waited for ever."""
     processes = {node: start(node, tmp_path) for node in NODES if node in names}
     durations, problems = {}, []
-    watch = Watch()
     try:
         for node, process in processes.items():
             watch.wait_for(f"/alone_{node}/{node}", process)
@@ -116,7 +111,6 @@ def test_every_executable_stops_cleanly(number, names, ros_domain, tmp_path, rec
                 time.sleep(0.02)
             problems += [f"{node} leaves {child}" for child in children if works(child)]
     finally:
-        watch.close()
         for process in processes.values():
             process.process.kill()
             process.process.wait(PATIENCE)
