@@ -9,6 +9,7 @@ from math import acos, degrees
 
 import numpy as np
 
+from perch_control.modes import State
 from perch_core import so3
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import CameraModel, ControllerStatus, ImuSample, OdometryState, Transform, seconds
@@ -30,6 +31,7 @@ DESCENDED = 5.0   # ... and where an autopilot levels and descends first [s]
 RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
          "camera_front/camera_info": (5.0, 120.0)}
 """Channel -> lowest and highest rate of its stamps [Hz]; a tenth is forgiven."""
+_STATES = {state.value: state.name.lower() for state in State}
 
 
 class Verdict(Enum):
@@ -201,7 +203,7 @@ def obeyed(name: str, order: Order, state: int, armed: bool) -> Check:
     good = status is not None and status.state == state and order.delay <= ANSWER and order.armed is armed
     sent = "none" if order.armed is None else "armed" if order.armed else "disarmed"
     said = "no controller/status" if status is None else (
-        f"state {status.state} after {order.delay:.2f} s, commands {sent}: {status.message[:80]}")
+        f"{_STATES.get(status.state, status.state)} after {order.delay:.2f} s, commands {sent}: {status.message[:80]}")
     return judged(name, good, said, "the controller's message says why; odometry must be there, and the vehicle stand level")
 
 
