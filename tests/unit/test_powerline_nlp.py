@@ -24,9 +24,9 @@ def state(p: list[float], q: np.ndarray = np.array([0.0, 0, 0, 1]), w: list[floa
 
 
 @pytest.mark.parametrize("solver", ["fatrop", "ipopt"])
-@pytest.mark.parametrize("perception", [False, True])
-def test_assembled_derivatives_are_those_of_the_chain_rule(solver: str, perception: bool) -> None:
-    problem = nlp.Problem(nlp.Structure(4, 2, perception, solver), STAGES)
+@pytest.mark.parametrize("perception, end", [(False, ""), (True, "perched"), (False, "hovering")])
+def test_assembled_derivatives_are_those_of_the_chain_rule(solver: str, perception: bool, end: str) -> None:
+    problem = nlp.Problem(nlp.Structure(4, 2, perception, end, solver), STAGES)
     f, g, jac, hess = (problem._solver.get_function(name) for name in ("nlp_f", "nlp_g", "nlp_jac_g", "nlp_hess_l"))
     x, p, lam_f, lam_g = (ca.SX.sym(name, size) for name, size in
                           (("x", f.size1_in(0)), ("p", f.size1_in(1)), ("f", 1), ("g", g.size1_out(0))))
@@ -102,7 +102,7 @@ def test_spin_between_the_nodes_sees_a_peak_that_both_nodes_miss() -> None:
 
 
 def test_defects_make_two_steps_as_exact_as_eight() -> None:
-    problem = nlp.Problem(nlp.Structure(4, 0, False, "ipopt"), STAGES)
+    problem = nlp.Problem(nlp.Structure(4, 0, False, solver="ipopt"), STAGES)
     rng = np.random.default_rng(2)
     states = np.array([state([0, 0, 2], so3.quat_exp(rng.normal(size=3)), rng.normal(0, 3, 3)) for _ in range(5)])
     states[:, 17] = 0.3  # intervals of 75 ms, as in flight

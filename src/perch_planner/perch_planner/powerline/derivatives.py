@@ -97,6 +97,7 @@ class Rows:
         start: first of 17 rows of the start condition.
         turn: row of the middle of every interval, shape (N,).
         inner: first row of the path constraints of nodes 1..N, shape (N,).
+        end: first row of what vanishes at the last node.
         count: number of all rows.
     """
 
@@ -104,15 +105,17 @@ class Rows:
     start: int
     turn: np.ndarray
     inner: np.ndarray
+    end: int
     count: int
 
 
-def constraint_rows(N: int, path: int) -> Rows:
-    """Rows of a problem with N intervals and `path` constraints at every node but the first."""
+def constraint_rows(N: int, path: int, end: int) -> Rows:
+    """Rows of a problem with N intervals, `path` constraints at every node but the first, and `end` more at the last."""
     first = STAGE_STATES + STATES + 1
     later = first + np.arange(N - 1) * (STAGE_STATES + path + 1)
     inner = np.append(later + STAGE_STATES, first + (N - 1) * (STAGE_STATES + path + 1))
-    return Rows(np.append(0, later), STAGE_STATES, np.append(first - 1, inner[:-1] + path), inner, int(inner[-1]) + path)
+    last = int(inner[-1]) + path
+    return Rows(np.append(0, later), STAGE_STATES, np.append(first - 1, inner[:-1] + path), inner, last, last + end)
 
 
 def path_functions(p: Parameters) -> list[tuple[str, ca.MX]]:
@@ -120,11 +123,16 @@ def path_functions(p: Parameters) -> list[tuple[str, ca.MX]]:
     return [*(("clear", line) for line in p.lines), ("spin", p.body_rate)]
 
 
-def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int) -> ca.MX:
-    """Jacobian of all constraints."""
+def end_size(stages: StageFunctions, end: str) -> int:
+    """Number of constraints at the last node."""
+    return int(stages.functions[end].size1_out(0)) if end else 0
+
+
+def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, end: str) -> ca.MX:
+    """Jacobian of all constraints; `end`: function that vanishes at the last node, "" where none does."""
     f, path = stages.functions, path_functions(p)
     X, U = split(x, N)
-    at = constraint_rows(N, len(path))
+    at = constraint_rows(N, len(path), end_size(stages, end))
     out = Gather(at.count, N * STRIDE + STAGE_STATES)
 
     rows, columns = _pattern(stages.jacobian["step"])
@@ -141,15 +149,18 @@ def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int) -> ca.MX:
         rows, columns = _pattern(stages.jacobian[name])
         values = f[f"{name}_jac"].map(N)(X[:, 1:], parameter)
         out.add(ca.vec(values), (at.inner[:, None] + i + rows).ravel(), ((k + 1) * STRIDE + columns).ravel())
+    if end:
+        rows, columns = _pattern(stages.jacobian[end])
+        out.add(f[f"{end}_jac"](X[:, N], p.reference), at.end + rows, N * STRIDE + columns)
     return out.matrix()
 
 
 def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.MX, lam_g: ca.MX, perception: bool,
-            gauss_newton: bool = False) -> tuple[ca.MX, ca.MX]:
+            end: str, gauss_newton: bool = False) -> tuple[ca.MX, ca.MX]:
     """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g; with `gauss_newton` the perception costs' never bends down."""
     f, path = stages.functions, path_functions(p)
     X, U = split(x, N)
-    at = constraint_rows(N, len(path))
+    at = constraint_rows(N, len(path), end_size(stages, end))
     size = N * STRIDE + STAGE_STATES
     out = Gather(size, size)
     pieces: list[tuple[ca.MX, int]] = []  # gradients of one function over the stages, and the first stage
@@ -170,6 +181,8 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
         values = f[f"{name}_hess"].map(N)(X[:, 1:], parameter, lam_g[(at.inner + i).tolist()].T)
         take(name, values, STAGE_STATES, 1, N)
     take("end", f["end_hess"](X[:, N], p.reference, p.end, lam_f), STAGE_STATES, N, 1)
+    if end:
+        take(end, f[f"{end}_hess"](X[:, N], p.reference, lam_g[at.end:]), STAGE_STATES, N, 1)
 
     gradient = ca.MX.zeros(STRIDE, N + 1)
     for values, first in pieces:

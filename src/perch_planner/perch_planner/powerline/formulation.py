@@ -34,20 +34,18 @@ class Formulation:
 
     Attributes:
         perch, recovery: cost weights; of a recovery, upright and at rest matters, where it ends hardly.
-        end_factor: end weights of the second phase over those of the first.
+        hard_end: the end is a constraint of the program, within a fifth of `accuracy`; else it has its costs alone, as in the paper.
         ramp: input in the impulse of [P:eq15]; 0: as the equation says.
-        correct_drift: remove the integrator's error, see `Problem.defects_of`.
         accuracy: position [m] at the end of a perch, tilt [deg] and speed [m/s] at every end; a plan that is worse is refused.
     """
 
     perch: Weights = Weights()
     recovery: Weights = Weights(thrust=0.08, xy_end=0.5, z_end=0.1, tilt_end=1000.0, v_end=1000.0, thrust_end=10.0)
-    end_factor: float = 300.0
+    hard_end: bool = True
     ramp: float = 0.0
-    correct_drift: bool = True
     accuracy: tuple[float, float, float] = (0.001, 0.1, 0.02)
 
 
 OURS = Formulation()
-PUBLISHED = replace(OURS, perch=Weights(rate_between=0.0), end_factor=1.0, ramp=0.5, correct_drift=False, accuracy=(0.005, 1.0, 0.2))
+PUBLISHED = replace(OURS, perch=Weights(rate_between=0.0), hard_end=False, ramp=0.5, accuracy=(0.005, 1.0, 0.2))
 """The authors' code, to compare with its trajectories."""

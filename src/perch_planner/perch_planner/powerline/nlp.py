@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from perch_core.rotor_model import INPUTS, STATES
-from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, hessian, jacobian, path_functions, split
+from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, end_size, hessian, jacobian, path_functions, split
 from perch_planner.powerline.stage_functions import (
     END_WEIGHTS, LINE_SIZE, REFERENCE, RUN_WEIGHTS, SEE_WEIGHTS, STAGE_STATES, StageFunctions,
 )
@@ -26,12 +26,14 @@ class Structure:
         intervals: N.
         lines: number of segments to avoid; the first is the target.
         perception: whether the costs of [P:eq9, P:eq12, P:eq13] are part of it.
+        end: what vanishes at the last node, "perched" or "hovering" of the stage functions; "": nothing, the end has costs alone.
         solver: "fatrop" or "ipopt".
     """
 
     intervals: int
     lines: int
     perception: bool
+    end: str = ""
     solver: str = "fatrop"
 
 
@@ -50,6 +52,7 @@ class Numbers:
         height_min: z_min with its margin [m]. [P:eq14e]
         thrust: bounds of a rotor's thrust [N]. [P:eq14f]
         body_rate: bound of |w_WB_B| [rad/s].
+        end_room: how far from zero what vanishes at the last node may be, one value or as many as there are.
         clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line at each node but the first, see
             `stage_functions`, shape (N,). [P:eq14j]
         states, inputs: initial guess, shapes (N + 1, 18) and (N, 4), inputs in [-1, 1].
@@ -66,6 +69,7 @@ class Numbers:
     height_min: float
     thrust: tuple[float, float]
     body_rate: float
+    end_room: np.ndarray
     clearance: np.ndarray
     states: np.ndarray
     inputs: np.ndarray
@@ -115,6 +119,7 @@ class Problem:
     _solver: ca.Function = field(init=False, repr=False)
     _equality: np.ndarray = field(init=False, repr=False)
     _clearances: np.ndarray = field(init=False, repr=False)
+    _end: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         N, count, f = self.structure.intervals, self.structure.lines, self.stages.functions
@@ -133,16 +138,20 @@ class Problem:
         inside = ca.vertcat(*[f[name].map(N)(X[:, 1:], parameter) for name, parameter in path])
         turn = f["turn"].map(N)(X[:, :N], U, 1.0 / N, body_rate)
         later = ca.vec(ca.vertcat(gaps[:, 1:], inside[:, :-1], turn[1:]))
-        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, turn[0], later, inside[:, -1])
-        at = constraint_rows(N, len(path))
+        end_name = self.structure.end
+        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, turn[0], later, inside[:, -1],
+                       *([f[end_name](X[:, N], reference)] if end_name else []))
+        at = constraint_rows(N, len(path), end_size(self.stages, end_name))
         self._clearances = (at.inner[:, None] + np.arange(count)).ravel()
         self._equality = np.ones(at.count, bool)
         self._equality[self._clearances] = self._equality[at.inner + count] = self._equality[at.turn] = False
+        self._equality[at.end:] = False
+        self._end = at.end
 
         lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.shape[0])
-        gradient, H = hessian(self.stages, x, parameters, N, lam_f, lam_g, self.structure.perception,
+        gradient, H = hessian(self.stages, x, parameters, N, lam_f, lam_g, self.structure.perception, end_name,
                               self.gauss_newton)
-        jac_g = ca.Function("nlp_jac_g", [x, p], [g, jacobian(self.stages, x, parameters, N)], ["x", "p"], ["g", "jac_g_x"])
+        jac_g = ca.Function("nlp_jac_g", [x, p], [g, jacobian(self.stages, x, parameters, N, end_name)], ["x", "p"], ["g", "jac_g_x"])
         if self.structure.solver == "fatrop":
             hess_l = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [gradient, H], ["x", "p", "lam_f", "lam_g"],
                                  ["grad_gamma_x", "hess_gamma_x_x"])
@@ -197,9 +206,11 @@ class Problem:
         low, high = self._bounds(numbers)
         least = np.zeros(len(self._equality))
         least[self._clearances] = np.repeat(numbers.clearance, self.structure.lines)
+        most = np.where(self._equality, 0.0, _FREE)
+        least[self._end:], most[self._end:] = -numbers.end_room, numbers.end_room
         begin, cpu = time.perf_counter(), time.process_time()
         answer = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
-                              lbg=least, ubg=np.where(self._equality, 0.0, _FREE))
+                              lbg=least, ubg=most)
         elapsed, cpu = time.perf_counter() - begin, time.process_time() - cpu
         statistics = self._solver.stats()
         found = np.concatenate([np.array(answer["x"]).ravel(), np.zeros(INPUTS)]).reshape(N + 1, STRIDE)

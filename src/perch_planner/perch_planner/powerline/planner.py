@@ -20,7 +20,7 @@ from perch_planner.powerline.nlp import Numbers, Solution, Structure
 from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
 from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import Margins, PowerlineSettings
-from perch_planner.powerline.solving import PHASES, Solver, end_weights, run_weights, see_weights
+from perch_planner.powerline.solving import PHASES, Solver, end_room, end_weights, run_weights, see_weights
 from perch_planner.powerline.stage_functions import line_parameters
 from perch_planner.powerline.validation import check_request
 
@@ -41,8 +41,8 @@ class _Task:
         lines: in the problem, the target first.
         known: every line, for the check.
         perception: keep the first line in view.
-        weights: of the first phase.
-        pinned: factors on the end weights in the later phases, shape (6,).
+        weights: of the costs.
+        end: what vanishes at the end, see `nlp.Structure`.
         duration: bounds of T [s].
         margins: by which the nodes keep away from the limits.
         leaving: clearance that the margins grow to within a quarter of the time, if there is a plan; 0: they stay as they are.
@@ -62,7 +62,7 @@ class _Task:
     known: tuple[Segment, ...]
     perception: bool
     weights: Weights
-    pinned: np.ndarray
+    end: str
     duration: tuple[float, float]
     margins: Margins
     leaving: float
@@ -86,13 +86,13 @@ class PowerlinePlanner:
     solver: Solver = field(init=False)
 
     def __post_init__(self) -> None:
-        self.solver = Solver(self.vehicle, self.gravity, self.settings.camera, self.formulation.correct_drift)
+        self.solver = Solver(self.vehicle, self.gravity, self.settings.camera)
 
     def warm_up(self, lines: int = 3) -> None:
         """Build the solvers of the usual structures beforehand, so that the first plan is as fast as the others."""
-        for perception in (False, True):
+        for perception, end in ((False, "perched"), (True, "perched"), (False, "hovering")):
             for phase in PHASES:
-                self.solver.problem(Structure(self.settings.intervals, lines, perception), phase)
+                self.solver.problem(Structure(self.settings.intervals, lines, perception, end), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
         """Plan a perch with its recovery, or a recovery alone; a perch after which no recovery is found says so.
@@ -129,7 +129,7 @@ class PowerlinePlanner:
         approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
         at_end = _share(0.5 * self._clearance(np.concatenate([pose.p_WB, pose.q_WB]), request.lines))
         return _Task("perch", request.start, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), request.lines,
-                     request.perception, formulation.perch, np.full(6, formulation.end_factor), s.duration, s.margins, 0.0, approaching, at_end,
+                     request.perception, formulation.perch, "perched" if formulation.hard_end else "", s.duration, s.margins, 0.0, approaching, at_end,
                      0.0, first_guess, formulation.accuracy, request.solver, request.deadline or s.deadline)
 
     def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
@@ -143,9 +143,9 @@ class PowerlinePlanner:
                                         (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
 
         nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
-        pinned = np.array([1.0, 1.0, *[formulation.end_factor] * 4])  # upright and at rest, but not at one place
         return _Task("recovery", start, PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover), request.lines,
-                     False, formulation.recovery, pinned, s.recovery_duration, margins, margins.leaving, 0.0, 1.0, reduction, first_guess,
+                     False, formulation.recovery, "hovering" if formulation.hard_end else "", s.recovery_duration, margins, margins.leaving,
+                     0.0, 1.0, reduction, first_guess,
                      (np.inf, *formulation.accuracy[1:]), request.solver, request.deadline or s.deadline)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
@@ -178,7 +178,7 @@ class PowerlinePlanner:
         s, vehicle = self.settings, self.vehicle
         thrust_max = max(s.thrust_share * vehicle.thrust_max, float(task.start[THRUST].max()))
         margins, wish, intervals, lines, solver_name = task.margins, 1.0, s.intervals, task.lines, task.solver
-        iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, "first"
+        iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, "sight"
         for attempt in range(ATTEMPTS):
             if time > task.deadline:  # a refusal with its cause is worth more than being stopped
                 break
@@ -192,12 +192,12 @@ class PowerlinePlanner:
                 thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
                 body_rate=vehicle.body_rate_max - margins.body_rate, states=states, inputs=inputs,
                 clearance=_clearances(margins.clearance, wish * task.leaving, wish * task.approaching, task.at_end, intervals),
-                defects=np.zeros((intervals, STATES + 1)))
-            structure = Structure(intervals, len(lines), task.perception, solver_name)
-            found = self.solver.solve(structure, numbers, numbers.end_weights * task.pinned, phase)
+                defects=np.zeros((intervals, STATES + 1)), end_room=end_room(task.end, *task.accuracy))
+            structure = Structure(intervals, len(lines), task.perception, task.end, solver_name)
+            found = self.solver.solve(structure, numbers, phase)
             iterations, time, cpu_time = iterations + found.iterations, time + found.time, cpu_time + found.cpu_time
             if not (found.converged and np.all(np.isfinite(found.states))):
-                previous, phase, wish = None, "first", EASED * wish
+                previous, phase, wish = None, "sight", EASED * wish
                 solver_name = "ipopt" if attempt >= 1 else solver_name
                 continue
             rates = vehicle.thrust_rate_max * np.clip(found.inputs, -1.0, 1.0)
@@ -215,7 +215,7 @@ class PowerlinePlanner:
             if not drifted:
                 intervals = int(np.ceil(1.5 * intervals))
                 wish *= EASED if missed else 1.0
-            previous, phase = _resampled(found, intervals), "polish" if drifted else "second"
+            previous, phase = _resampled(found, intervals), "polish" if drifted else "solve"
         if worst is not None:
             raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {task.name} within the limits: {worst}")
         raise PlanningRefusal("infeasible", task.name, -1.0,

@@ -1,11 +1,10 @@
-"""The two-phase solve: a loose first answer with the paper's end weights, then the end pinned down from there.
-
-The paper's end weights leave up to 29 mm at the perch. Weights 300 times as large leave microns, but from a cold start the
-solver needs twice the iterations; from the loose answer of the first phase it needs a dozen.
+"""The solve, and with perception costs the approach to it.
 
 Perception costs bend down far from their minimum: with the exact Hessian fatrop then crawls behind its regularisation, 30 to
 80 iterations. Gauss-Newton comes near in a dozen and would never arrive (it goes to and fro over the kinks of the soft
-constraints), so that it is stopped there, and the second phase ends what it began.
+constraints), so that it is stopped there, and the solve ends what it began.
+
+The end is a box, not an equality: fatrop 1 loops for ever over eleven equalities at the last node.
 """
 
 from __future__ import annotations
@@ -23,14 +22,17 @@ from perch_planner.powerline.nlp import Numbers, Problem, Solution, Structure
 from perch_planner.powerline.settings import PerceptionWeights
 from perch_planner.powerline.stage_functions import StageFunctions, StageModel, stage_functions
 
-# Phase: tolerance, first barrier parameter, push off active bounds. The nearer the guess, the smaller the latter two.
-# "sight" is the first phase of a problem with perception costs.
+# Tolerance, first barrier parameter, push off active bounds: of a solve, of the approach to it with perception costs, and of
+# one that starts from the solution of the same problem, which is right but for the integrator's error.
 PHASES: dict[str, dict[str, Any]] = {
-    "first": {"tolerance": 1e-2},
     "sight": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
-    "second": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
-    "polish": {"tolerance": 1e-5, "barrier": 1e-5, "push": 1e-7},
+    "solve": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 100},
+    "polish": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
 }
+IPOPT_ITERATIONS = 300  # the last resort may take as many
+END_SHARE = 0.2     # of the accuracy that is asked for at the end: the room that the program has there
+RATE_ROOM = 0.02    # of the body rate at the end [rad/s]
+THRUST_ROOM = 0.02  # of a rotor's thrust where a hover follows [N]
 
 REPROJECTION_DECAY = 0.1  # of the cost [P:eq9], per thirtieth of the horizon
 SOFT_DECAY = 0.3          # of the soft constraints [P:eq14h, P:eq14i], the same, from SOFT_UNTIL on
@@ -45,13 +47,11 @@ class Solver:
         vehicle: body, limits, cameras.
         gravity: [m/s^2].
         camera: name of the camera that the perception costs are about.
-        correct_drift: remove the integrator's error, see `Problem.defects_of`.
     """
 
     vehicle: Vehicle
     gravity: float = GRAVITY
     camera: str = "front"
-    correct_drift: bool = True
     model: RotorModel = field(init=False)
     compiled: bool = field(init=False)
     _stages: StageFunctions = field(init=False, repr=False)
@@ -66,34 +66,44 @@ class Solver:
         """The solver of a structure and phase; building one takes about 50 ms."""
         key = (structure, phase)
         if key not in self._problems:
-            self._problems[key] = Problem(structure, self._stages, **PHASES[phase])
+            options = PHASES[phase] | ({"max_iterations": IPOPT_ITERATIONS} if structure.solver == "ipopt" else {})
+            self._problems[key] = Problem(structure, self._stages, **options)
         return self._problems[key]
 
-    def solve(self, structure: Structure, numbers: Numbers, pinned_end: np.ndarray, start_phase: str = "first") -> Solution:
+    def solve(self, structure: Structure, numbers: Numbers, start_phase: str = "sight") -> Solution:
         """All phases that a guess of this quality needs.
 
         Args:
             structure: which solver.
-            numbers: the problem with the end weights of the first phase and no defects.
-            pinned_end: end weights of the later phases, shape (6,).
-            start_phase: "first" for a cold guess, "second" for the solution of a similar problem, "polish" for one that
+            numbers: the problem without defects.
+            start_phase: "sight" for a cold guess, "solve" for the solution of a similar problem, "polish" for one that
                 is right but for the integrator's error.
 
         Returns:
             The last phase's solution, with iterations and times of all; where the first phase diverges, its own.
         """
         iterations, time, cpu_time = 0, 0.0, 0.0
-        if start_phase == "first":
-            first = self.problem(structure, "sight" if structure.perception else "first").solve(numbers)
+        sight = start_phase == "sight" and structure.perception
+        if sight:
+            first = self.problem(structure, "sight").solve(numbers)
             iterations, time, cpu_time = first.iterations, first.time, first.cpu_time
             if not np.all(np.isfinite(first.states)):
                 return first
             numbers = replace(numbers, states=first.states, inputs=first.inputs)
-        last = self.problem(structure, "polish" if start_phase == "polish" else "second")
-        defects = last.defects_of(numbers.states, numbers.inputs) if self.correct_drift else numbers.defects
-        found = last.solve(replace(numbers, end_weights=pinned_end, defects=defects))
+        last = self.problem(structure, "polish" if start_phase == "polish" else "solve")
+        if sight or start_phase != "sight":
+            numbers = replace(numbers, defects=last.defects_of(numbers.states, numbers.inputs))
+        found = last.solve(numbers)
         return replace(found, iterations=iterations + found.iterations, time=time + found.time,
                        cpu_time=cpu_time + found.cpu_time)
+
+
+def end_room(end: str, position: float, tilt_deg: float, speed: float) -> np.ndarray:
+    """How far from zero the values of `perched`, `hovering` or nothing ("") of the stage functions may be, for an accuracy."""
+    turned, moving = [np.radians(tilt_deg)] * 2, [speed] * 3
+    shares: list[float] = {"perched": [position] * 3 + turned + moving, "hovering": turned + moving, "": []}[end]
+    rest = {"perched": [RATE_ROOM] * 3, "hovering": [RATE_ROOM] * 3 + [THRUST_ROOM] * 4, "": []}[end]
+    return np.array([*(END_SHARE * np.array(shares)), *rest])
 
 
 def run_weights(weights: Weights, ramp: float, thrust_rate_max: float, intervals: int) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from perch_core import lines, rotor_model
 from perch_core.arrays import quaternion, vector3
 from perch_core.camera import CameraMount
-from perch_core.components import Scalar, Vector, components, dot, matrix_of
+from perch_core.components import Scalar, Vector, components, dot, matrix_of, rotate_back
 from perch_core.rotor_model import INPUTS, P, Q, STATES, THRUST, V, W, RotorModel
 from perch_core.so3 import quat_from_matrix
 
@@ -127,6 +127,22 @@ def _end(model: StageModel, x: Vector, reference: Vector, weights: Vector) -> Sc
             + weights[3] * off(x[V], 6) + weights[4] * off(x[W], 9) + weights[5] * dot(idle, idle))
 
 
+def _turned(x: Vector, reference: Vector) -> Vector:
+    """What vanishes where b3 is s3: the first two components of s3 in the body frame. (Where b3 is -s3, too.)"""
+    return rotate_back(x[Q], reference[3:6])[:2]
+
+
+def _perched(x: Vector, reference: Vector) -> Vector:
+    """What vanishes where a perch ends: errors of position, direction of b3, velocity and body rate, 11 values."""
+    moving = tuple(value - wanted for value, wanted in zip((*x[V], *x[W]), reference[6:12], strict=True))
+    return (*(value - wanted for value, wanted in zip(x[P], reference[:3], strict=True)), *_turned(x, reference), *moving)
+
+
+def _hovering(model: StageModel, x: Vector, reference: Vector) -> Vector:
+    """What vanishes where a recovery ends, wherever that is: as `_perched`, with the rotor thrusts for the position, 12 values."""
+    return (*_perched(x, reference)[3:], *(gamma - model.rotor.hover for gamma in x[THRUST]))
+
+
 def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
     """[P:eq7] divided by |o x l|^2 + |l|^2 + k: (d^2 - 1) / (d^2 + 1) of the scaled distance d.
 
@@ -160,6 +176,7 @@ class StageFunctions:
     Attributes:
         functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, 1/N, weights)`, `see(x, line, weights)`,
             `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint,
+            `perched(x, reference)`, `hovering(x, reference)` -> what vanishes at the end,
             with x of 18 values (17 states, T) and u of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the
             Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f and then the nonzeros
             of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
@@ -190,6 +207,8 @@ def stage_functions(model: StageModel) -> StageFunctions:
         "run": ([x, u], [unit_step, run], _run(model, xs, us, unit_step, rw)),
         "see": ([x], [line, see], _see(model, xs, ls, sw)),
         "end": ([x], [reference, end], _end(model, xs, rs, ew)),
+        "perched": ([x], [reference], ca.vertcat(*_perched(xs, rs))),
+        "hovering": ([x], [reference], ca.vertcat(*_hovering(model, xs, rs))),
         "clear": ([x], [line], _clear(model, xs, ls)),
         "spin": ([x], [limit], _spin(xs, limit)),
         "turn": ([x, u], [unit_step, limit], _turn(model, xs, us, unit_step, limit)),
