@@ -92,7 +92,8 @@ class PowerlinePlanner:
         """Build the solvers of the usual structures beforehand, so that the first plan is as fast as the others."""
         for perception, end in ((False, "perched"), (True, "perched"), (False, "hovering")):
             for phase in PHASES:
-                self.solver.problem(Structure(self.settings.intervals, lines, perception, end), phase)
+                if perception or phase != "sight":  # nobody solves that one without perception costs
+                    self.solver.problem(Structure(self.settings.intervals, lines, perception, end), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
         """Plan a perch with its recovery, or a recovery alone; a perch after which no recovery is found says so.
