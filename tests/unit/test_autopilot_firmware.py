@@ -27,6 +27,7 @@ from perch_core.values import RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.identification import command
 from perch_eval.in_process import fly
+from perch_eval.preflight.ros.listener import CHANNELS, GraphListener
 from perch_sim.scenario import load_scenario
 from scipy.spatial.transform import Rotation
 
@@ -281,6 +282,34 @@ def test_the_node_arms_flies_levels_and_hands_over(vehicle):
         until(lambda: min(vehicle.motors) > 0.2, often=lambda: poll(True))        # and gives it back
         node.close()                                                              # as a node that is killed
         until(lambda: not vehicle.turning)                                        # level, down, off
+    finally:
+        node.close()
+
+
+@pytest.mark.parametrize("switched", [True, False])
+def test_preflight_sees_whether_the_pilot_takes_over(vehicle, switched):
+    """The node and the firmware, without the graph between them and preflight."""
+    node, got = component(vehicle)
+    listener = object.__new__(GraphListener)
+    listener.values = {channel: [] for channel in CHANNELS}
+
+    def listen(duration):
+        last = time.monotonic() + duration
+        while time.monotonic() < last:
+            node.on_rates_thrust(order := RatesThrust(0, True, STILL, 9.81))
+            node.on_poll(time.monotonic_ns())
+            listener.values["rates_thrust_command"].append((time.monotonic(), order))
+            told = listener.values["/diagnostics"]
+            told += [(time.monotonic(), said) for said in got["diagnostics"][len(told):]]
+            if switched and told and told[-1][1].values.get("armed"):
+                vehicle.radio[6], vehicle.radio[4] = OFF, OFF
+            time.sleep(0.005)
+
+    listener.listen = listen
+    try:
+        node.on_rates_thrust(RatesThrust(0, False, STILL, 9.81))
+        assert listener.await_takeover(10.0 if switched else 4.0) == (True, True if switched else None)
+        assert vehicle.turning is not switched
     finally:
         node.close()
 

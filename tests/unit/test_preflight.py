@@ -132,22 +132,40 @@ class Graph:
         status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, "said")
         return Order(status, 0.1, state == command.State.ARMED and self.obeys)
 
+    def await_takeover(self, patience):
+        assert self.orders[-1] == command.Command.ARM
+        return True, True
+
     def await_end_of_commands(self, patience):
+        assert self.orders[-1] == command.Command.ARM
         return 10.0, 10.4
+
+
+def asked(*options):
+    return command.parser().parse_args(["--vehicle", "snapdragon", *options])
+
+
+ALL = asked("--props-off", "--takeover", "--watchdog")
 
 
 def test_motors_start_only_where_the_propellers_are_off():
     graph = Graph()
-    assert {check.verdict for check in command.exercised(graph, False, True)} == {OPEN} and not graph.orders
-    seen = verdicts(command.exercised(graph, True, True))
-    assert [seen[name] for name in ("armed state", "disarming", "kill", "watchdog", "pilot's takeover")] == [PASSED] * 4 + [OPEN]
+    assert {check.verdict for check in command.exercised(graph, asked("--takeover", "--watchdog"))} == {OPEN} and not graph.orders
+    seen = verdicts(command.exercised(graph, ALL))
+    assert [seen[name] for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")] == [PASSED] * 5
     assert graph.orders[-1] == command.Command.KILL, "it is left with the motors off"
 
 
 def test_who_does_not_arm_fails_and_is_not_tried_further():
     graph = Graph(obeys=False)
-    seen = verdicts(command.exercised(graph, True, True))
-    assert seen["armed state"] is FAILED and seen["watchdog"] is OPEN and graph.orders == [command.Command.ARM, command.Command.DISARM, command.Command.ARM]
+    seen = verdicts(command.exercised(graph, ALL))
+    assert seen["armed state"] is FAILED and seen["watchdog"] is seen["pilot's takeover"] is OPEN
+    assert graph.orders == [command.Command.ARM, command.Command.DISARM, command.Command.ARM, command.Command.ARM]
+
+
+@pytest.mark.parametrize("turned, armed, verdict", [(True, True, PASSED), (True, None, FAILED), (True, False, OPEN), (False, None, OPEN)])
+def test_motors_that_go_on_though_the_pilot_has_taken_over_fail(turned, armed, verdict):
+    assert checks.taken_over(turned, armed).verdict is verdict
 
 
 @pytest.mark.parametrize("motion, verdict", [(10.3, PASSED), (11.5, FAILED), (None, OPEN)])
@@ -158,8 +176,8 @@ def test_motors_that_go_on_without_commands_fail(motion, verdict):
 def test_an_autopilot_may_descend_before_its_motors_stop():
     graph = Graph()
     graph.await_end_of_commands = lambda patience: (10.0, 14.2)  # its watchdog's four seconds
-    assert verdicts(command.exercised(graph, True, True))["watchdog"] is FAILED
-    assert verdicts(command.exercised(graph, True, True, checks.DESCENDED))["watchdog"] is PASSED
+    assert verdicts(command.exercised(graph, ALL))["watchdog"] is FAILED
+    assert verdicts(command.exercised(graph, ALL, checks.DESCENDED))["watchdog"] is PASSED
 
 
 @pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),

@@ -25,7 +25,8 @@ FIGURES: dict[str, tuple[str, str, float]] = {
     "target_error_position_m": ("target error, position", "cm", 100.0), "target_error_attitude_deg": ("target error, attitude", "deg", 1.0),
 }
 """Figure of a flight, as `figures` names it -> what it is, unit in which it is shown, factor to that unit."""
-_DURATION = re.compile(r"_(ms|us)(?=_|$)")
+DURATION = re.compile(r"_(ms|us)(?=_|$)")
+"""In names of diagnostics that are durations."""
 
 
 def _rmse(difference: np.ndarray) -> list[float]:
@@ -197,9 +198,9 @@ def node_durations(flight: Flight) -> dict[str, dict[str, float]]:
         series: dict[str, list[float]] = {}
         for values in reports:
             for key, value in values.items():
-                unit = _DURATION.search(key)
+                unit = DURATION.search(key)
                 if unit is not None:
-                    series.setdefault(_DURATION.sub("_ms", key), []).append(value * (1e-3 if unit[1] == "us" else 1.0))
+                    series.setdefault(DURATION.sub("_ms", key), []).append(value * (1e-3 if unit[1] == "us" else 1.0))
         if series:
             out[node] = {key: float(np.median(v)) for key, v in series.items()}
     return out

@@ -21,7 +21,7 @@ from perch_eval.identification.answers import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected, recorded
 from perch_eval.margins import limits, margins
-from perch_eval.metrics import diagnostics, flight_metrics, missed_deadlines, node_durations, rates
+from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
 from perch_eval.page import Html, finite, image, page, section, table, text
 from perch_eval.ros.recorded_flight import RecordedFlight
@@ -76,7 +76,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
     return report
 
 
-UNITS = {"per_s": "per s", "us": "us", "ms": "ms", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
+UNITS = {"per_s": "per s", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
 _UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 
 
@@ -160,7 +160,8 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
-    nodes = [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items())) for node, reports in diagnostics(flight).items()]
+    nodes = [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if not DURATION.search(k)))
+             for node, reports in diagnostics(flight).items()]
     kept = [(m["name"], f"{m['value']:.2f} {m['unit']} ({limits(m)}): {m['left']:+.2f} left") for m in report["margins"]]
     flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"])]
     return page(
@@ -170,5 +171,5 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
         section("What the cameras saw", clip(flight), "No images were recorded."),
         *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
-        section("Durations that the nodes measured", table(timings)), section("Last diagnostics", table(nodes)),
+        section("Durations that the nodes measured", table(timings)), section("Diagnostics of the last second", table(nodes)),
         heading=Html(f'{text(title)}: <span class="{good}">{text(report["outcome"])}</span>'))

@@ -218,3 +218,18 @@ def stopped(last_command: float | None, last_motion: float | None, bound: float 
     return judged(title, last_motion - last_command <= bound,
                   f"the motors stopped {last_motion - last_command:.2f} s after the last command",
                   f"they must stop within {bound:g} s: fly nothing until they do")
+
+
+def taken_over(turned: bool, armed: bool | None) -> Check:
+    """Whether the pilot's switch stops the motors though commands go on.
+
+    Args:
+        turned: whether the motors turned before.
+        armed: whether the commands to the vehicle went on, armed, when the motors stopped; None: they did not stop.
+    """
+    title = "pilot's takeover"
+    if not turned or armed is False:
+        return Check(title, Verdict.OPEN, "the commands ended" if turned else "nobody tells that the motors turn (rotor_state, or `armed` in /diagnostics)",
+                     "with the props off: --takeover, and flip the pilot's switch when asked")
+    return judged(title, armed is True, "the motors stopped while commands went on" if armed else "the motors went on turning",
+                  "with his own arming switch off, the pilot's switch must stop them: see its channel and range (MSP OVERRIDE)")

@@ -18,9 +18,11 @@ EXAMPLES = """examples:
   python3 scripts/preflight.py --vehicle mine.yaml                     listen for 5 s to a vehicle that stands still on its feet
   python3 scripts/preflight.py --vehicle mine.yaml --shake down        then shake it by hand: rotation between camera and IMU
   python3 scripts/preflight.py --vehicle mine.yaml --props-off         then arm, disarm and kill: NO PROPELLERS MAY BE MOUNTED
+  python3 scripts/preflight.py --vehicle mine.yaml --props-off --takeover   then wait until the pilot takes over by his switch
   python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and see the motors stop
 
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
+PATIENCE = 60.0  # with the hands that are asked for something [s]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -32,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--shake", choices=("down", "front"),
                      help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
     out.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
+    out.add_argument("--takeover", action="store_true", help="with --props-off: the pilot will take over, with his own arming switch off")
     out.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
     return out
 
@@ -63,25 +66,28 @@ def shaken(listener: Any, vehicle: Vehicle, camera: str) -> Check:
     return checks.shaken(camera, turned_B, turned_C, vehicle)
 
 
-def exercised(listener: Any, allowed: bool, watchdog: bool, bound: float = checks.STOPPED) -> list[Check]:
-    """Arming, disarming, killing, and the watchdog, where the propellers are off."""
-    takeover = Check("pilot's takeover", Verdict.OPEN, "this program has no switch",
-                     "props off, armed: flip the pilot's switch, and see the autopilot's `mode` in /diagnostics")
-    if not allowed:
+def exercised(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOPPED) -> list[Check]:
+    """Arming, disarming, killing, the pilot's takeover and the watchdog, where the propellers are off; `bound`: see `checks.stopped`."""
+    if not arguments.props_off:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
-                for name in ("armed state", "disarming", "kill", "watchdog")] + [takeover]
+                for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")]
     found = [checks.obeyed("armed state", listener.order(Command.ARM, State.ARMED), State.ARMED, True),
              checks.obeyed("disarming", listener.order(Command.DISARM, State.DISARMED), State.DISARMED, False)]
     if found[0].verdict is Verdict.PASSED:
         listener.order(Command.ARM, State.ARMED)
         found.append(checks.obeyed("kill", listener.order(Command.KILL, State.FAILED), State.FAILED, False))
         listener.order(Command.DISARM, State.DISARMED)
-    last = None, None
-    if watchdog and listener.order(Command.ARM, State.ARMED).armed:
-        print("armed: stop the controller's process now (within 60 s) ...", flush=True)
-        last = listener.await_end_of_commands(60.0)
+    taken, last = (False, None), (None, None)
+    if arguments.takeover and listener.order(Command.ARM, State.ARMED).armed:
+        print(f"armed: pilot, your arming switch off, then take over (within {PATIENCE:g} s) ...", flush=True)
+        taken = listener.await_takeover(PATIENCE)
+        listener.order(Command.DISARM, State.DISARMED)
+        print("disarmed: hand over again", flush=True)
+    if arguments.watchdog and listener.order(Command.ARM, State.ARMED).armed:
+        print(f"armed: stop the controller's process now (within {PATIENCE:g} s) ...", flush=True)
+        last = listener.await_end_of_commands(PATIENCE)
         listener.order(Command.KILL, State.FAILED)
-    return [*found, checks.stopped(*last, bound), takeover]
+    return [*found, checks.taken_over(*taken), checks.stopped(*last, bound)]
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -99,8 +105,7 @@ def _check(arguments: argparse.Namespace) -> int:
         listener.await_first("imu/data_raw", arguments.listen)
         listener.listen(arguments.listen)
         found = [*listened(listener, vehicle), shaken(listener, vehicle, arguments.shake or ""),
-                 *exercised(listener, arguments.props_off, arguments.watchdog,
-                            checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
+                 *exercised(listener, arguments, checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
     finally:
         listener.close()
     print("\n".join(map(str, found)))

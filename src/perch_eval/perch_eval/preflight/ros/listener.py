@@ -100,9 +100,25 @@ class GraphListener(GraphNode):
                 return last, self._last_motion(last)
         return None, None
 
+    def await_takeover(self, patience: float) -> tuple[bool, bool | None]:
+        """Whether the motors turned, and whether commands went on, armed, when they stopped; see `checks.taken_over`."""
+        begun, turned = time.monotonic(), False
+        while time.monotonic() < begun + patience:
+            self.listen(0.1)
+            told = self._motion(begun)
+            turned = turned or any(turns for _, turns in told)
+            if turned and not told[-1][1]:
+                sent = [value.armed for channel in COMMANDS for arrival, value in self.values[channel][-1:] if time.monotonic() - arrival < SETTLING]
+                return True, any(sent)
+        return turned, None
+
     def _last_motion(self, since: float) -> float | None:
+        told = self._motion(since)
+        return max((arrival for arrival, turns in told if turns), default=since) if told else None
+
+    def _motion(self, since: float) -> list[tuple[float, bool]]:
+        """What has been told since a time [s] of the motors: when, and whether they turn."""
         rotors: list[tuple[float, RotorState]] = [entry for entry in self.values["rotor_state"] if entry[0] > since]
         told = [(arrival, max(state.speed) > TURNING * self._fastest) for arrival, state in rotors]
-        told += [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
-                 if arrival > since and "armed" in said.values]
-        return max((arrival for arrival, turns in told if turns), default=since) if told else None
+        return told or [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
+                        if arrival > since and "armed" in said.values]
