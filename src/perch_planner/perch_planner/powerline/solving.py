@@ -31,6 +31,7 @@ PHASES: dict[str, dict[str, Any]] = {
 }
 IPOPT_ITERATIONS = 300  # the last resort may take as many
 END_SHARE = 0.2     # of the accuracy that is asked for at the end: the room that the program has there
+MOMENT_ROOM = 0.01  # of the moment at the end of a perch [N m]
 RATE_ROOM = 0.02    # of the body rate at the end [rad/s]
 THRUST_ROOM = 0.02  # of a rotor's thrust where a hover follows [N]
 
@@ -102,7 +103,7 @@ def end_room(end: str, position: float, tilt_deg: float, speed: float) -> np.nda
     """How far from zero the values of `perched`, `hovering` or nothing ("") of the stage functions may be, for an accuracy."""
     turned, moving = [np.radians(tilt_deg)] * 2, [speed] * 3
     shares: list[float] = {"perched": [position] * 3 + turned + moving, "hovering": turned + moving, "": []}[end]
-    rest = {"perched": [RATE_ROOM] * 3, "hovering": [RATE_ROOM] * 3 + [THRUST_ROOM] * 4, "": []}[end]
+    rest = {"perched": [RATE_ROOM] * 3 + [MOMENT_ROOM] * 3, "hovering": [RATE_ROOM] * 3 + [THRUST_ROOM] * 4, "": []}[end]
     return np.array([*(END_SHARE * np.array(shares)), *rest])
 
 

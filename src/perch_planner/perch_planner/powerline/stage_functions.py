@@ -132,15 +132,20 @@ def _turned(x: Vector, reference: Vector) -> Vector:
     return rotate_back(x[Q], reference[3:6])[:2]
 
 
-def _perched(x: Vector, reference: Vector) -> Vector:
-    """What vanishes where a perch ends: errors of position, direction of b3, velocity and body rate, 11 values."""
+def _perched(model: StageModel, x: Vector, reference: Vector) -> Vector:
+    """What vanishes where a perch ends: the errors of `_ended`, and the moment, so that a gripper has time to close; 14 values."""
+    return (*_ended(x, reference), *(dot(row, x[THRUST]) for row in model.rotor.torque))
+
+
+def _ended(x: Vector, reference: Vector) -> Vector:
+    """Errors of position, direction of b3, velocity and body rate at the end, 11 values."""
     moving = tuple(value - wanted for value, wanted in zip((*x[V], *x[W]), reference[6:12], strict=True))
     return (*(value - wanted for value, wanted in zip(x[P], reference[:3], strict=True)), *_turned(x, reference), *moving)
 
 
 def _hovering(model: StageModel, x: Vector, reference: Vector) -> Vector:
-    """What vanishes where a recovery ends, wherever that is: as `_perched`, with the rotor thrusts for the position, 12 values."""
-    return (*_perched(x, reference)[3:], *(gamma - model.rotor.hover for gamma in x[THRUST]))
+    """What vanishes where a recovery ends, wherever that is: as `_ended`, with the rotor thrusts for the position, 12 values."""
+    return (*_ended(x, reference)[3:], *(gamma - model.rotor.hover for gamma in x[THRUST]))
 
 
 def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
@@ -207,7 +212,7 @@ def stage_functions(model: StageModel) -> StageFunctions:
         "run": ([x, u], [unit_step, run], _run(model, xs, us, unit_step, rw)),
         "see": ([x], [line, see], _see(model, xs, ls, sw)),
         "end": ([x], [reference, end], _end(model, xs, rs, ew)),
-        "perched": ([x], [reference], ca.vertcat(*_perched(xs, rs))),
+        "perched": ([x], [reference], ca.vertcat(*_perched(model, xs, rs))),
         "hovering": ([x], [reference], ca.vertcat(*_hovering(model, xs, rs))),
         "clear": ([x], [line], _clear(model, xs, ls)),
         "spin": ([x], [limit], _spin(xs, limit)),
