@@ -3,6 +3,7 @@
 from perch_core.component import Diagnostics
 from perch_eval.flight import Flight
 from perch_eval.metrics import missed_deadlines, node_durations
+from perch_eval.report import last_diagnostics
 
 
 def flight(*reports):
@@ -24,3 +25,8 @@ def test_lockstep_has_no_deadlines():
 def test_durations_are_medians_in_milliseconds_whatever_their_unit():
     flown = flight(*(("vio", {"image_ms": v, "step_us_median": 1000 * v, "state": "running"}) for v in (9.0, 2.0, 3.0)))
     assert node_durations(flown) == {"vio": {"image_ms": 3.0, "step_ms_median": 3.0}}
+
+
+def test_the_last_diagnostics_leave_durations_to_the_other_table():
+    flown = flight(("vio", {"tracks": 10, "step_us_p99": 12.5}), ("vio", {"tracks": 40, "step_us_p99": 12.5, "image_ms": 3.0, "clock_offset_s": 0.25}))
+    assert last_diagnostics(flown) == [("vio", "tracks 40, clock offset 0.25 s")]

@@ -96,6 +96,12 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
     return sorted(rows)
 
 
+def last_diagnostics(flight: Flight) -> list[tuple[str, str]]:
+    """What each node said last of itself, in words, without its durations: `node_durations` has those of the whole flight."""
+    return [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if not DURATION.search(k)))
+            for node, reports in diagnostics(flight).items()]
+
+
 def _with_unit(key: str, value: float) -> str:
     """A figure of a node's diagnostics, whose unit is a part of its name, in words."""
     unit = _UNIT.search(key)
@@ -160,8 +166,6 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
-    nodes = [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if not DURATION.search(k)))
-             for node, reports in diagnostics(flight).items()]
     kept = [(m["name"], f"{m['value']:.2f} {m['unit']} ({limits(m)}): {m['left']:+.2f} left") for m in report["margins"]]
     flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"])]
     return page(
@@ -171,5 +175,5 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
         section("What the cameras saw", clip(flight), "No images were recorded."),
         *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
-        section("Durations that the nodes measured", table(timings)), section("Diagnostics of the last second", table(nodes)),
+        section("Durations that the nodes measured", table(timings)), section("Diagnostics of the last second", table(last_diagnostics(flight))),
         heading=Html(f'{text(title)}: <span class="{good}">{text(report["outcome"])}</span>'))

@@ -73,16 +73,16 @@ def exercised(listener: Any, arguments: argparse.Namespace, bound: float = check
                 for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")]
     found = [checks.obeyed("armed state", listener.order(Command.ARM, State.ARMED), State.ARMED, True),
              checks.obeyed("disarming", listener.order(Command.DISARM, State.DISARMED), State.DISARMED, False)]
+    taken, last = (False, None), (None, None)
     if found[0].verdict is Verdict.PASSED:
         listener.order(Command.ARM, State.ARMED)
         found.append(checks.obeyed("kill", listener.order(Command.KILL, State.FAILED), State.FAILED, False))
         listener.order(Command.DISARM, State.DISARMED)
-    taken, last = (False, None), (None, None)
-    if arguments.takeover and listener.order(Command.ARM, State.ARMED).armed:
-        print(f"armed: pilot, your arming switch off, then take over (within {PATIENCE:g} s) ...", flush=True)
-        taken = listener.await_takeover(PATIENCE)
-        listener.order(Command.DISARM, State.DISARMED)
-        print("disarmed: hand over again", flush=True)
+        if arguments.takeover and listener.order(Command.ARM, State.ARMED).armed:
+            print(f"armed: pilot, your arming switch off, then take over (within {PATIENCE:g} s) ...", flush=True)
+            taken = listener.await_takeover(PATIENCE)
+            listener.order(Command.DISARM, State.DISARMED)
+            print("disarmed: hand over again", flush=True)
     if arguments.watchdog and listener.order(Command.ARM, State.ARMED).armed:
         print(f"armed: stop the controller's process now (within {PATIENCE:g} s) ...", flush=True)
         last = listener.await_end_of_commands(PATIENCE)

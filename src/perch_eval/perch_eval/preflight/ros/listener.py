@@ -105,20 +105,21 @@ class GraphListener(GraphNode):
         begun, turned = time.monotonic(), False
         while time.monotonic() < begun + patience:
             self.listen(0.1)
-            told = self._motion(begun)
-            turned = turned or any(turns for _, turns in told)
-            if turned and not told[-1][1]:
+            sources = self._motion(begun)
+            turned = any(turns for told in sources for _, turns in told)
+            if turned and not any(told[-1][1] for told in sources):
                 sent = [value.armed for channel in COMMANDS for arrival, value in self.values[channel][-1:] if time.monotonic() - arrival < SETTLING]
                 return True, any(sent)
         return turned, None
 
     def _last_motion(self, since: float) -> float | None:
-        told = self._motion(since)
+        told = [entry for source in self._motion(since) for entry in source]
         return max((arrival for arrival, turns in told if turns), default=since) if told else None
 
-    def _motion(self, since: float) -> list[tuple[float, bool]]:
-        """What has been told since a time [s] of the motors: when, and whether they turn."""
+    def _motion(self, since: float) -> list[list[tuple[float, bool]]]:
+        """What each source has told since a time [s] of the motors: when, and whether they turn; without sources that are silent."""
         rotors: list[tuple[float, RotorState]] = [entry for entry in self.values["rotor_state"] if entry[0] > since]
-        told = [(arrival, max(state.speed) > TURNING * self._fastest) for arrival, state in rotors]
-        return told or [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
-                        if arrival > since and "armed" in said.values]
+        turning = [(arrival, max(state.speed) > TURNING * self._fastest) for arrival, state in rotors]
+        armed = [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
+                 if arrival > since and "armed" in said.values]
+        return [told for told in (turning, armed) if told]
