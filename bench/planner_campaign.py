@@ -3,7 +3,7 @@
 
 Plans are checked by the independent verifier, refusals by planning again with the values that they name.
 
-    nice -n 10 python3 bench/planner_campaign.py --count 10000 --out docs/results/planner/campaign.json
+    nice -n 10 python3 bench/planner_campaign.py --count 10000 --step 1e-3 --out docs/results/planner/campaign.json
 
 Takes about 0.1 s per problem; it can be stopped at any time (Ctrl-C, kill) and still writes what it has.
 """
@@ -21,10 +21,11 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from random_perches import random_problem, requirements
+from random_perches import random_problem, requirements, shipped_settings
 
 from perch_core import config
 from perch_core.vehicle import load_vehicle
+from perch_eval.revision import commit, digest
 from perch_planner.planner import plan
 from perch_planner.problem import PerchSettings
 from perch_planner.refusals import PerchRefusal
@@ -52,7 +53,7 @@ def main() -> int:
     arguments = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    vehicle, settings = load_vehicle("snapdragon"), PerchSettings()
+    vehicle, settings = load_vehicle("snapdragon"), shipped_settings()
     codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
     begin = time.time()
     try:
@@ -80,7 +81,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     ms = 1e3 * np.array(times or [np.nan])
-    result = {"problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
+    result = {"commit": commit(), "digest": digest(), "problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
               "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}
