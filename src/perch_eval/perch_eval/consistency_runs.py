@@ -22,6 +22,8 @@ from perch_eval.campaign.progress import counted
 from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
+from perch_eval.evaluation.document import machine
+from perch_eval.revision import commit, digest
 from perch_eval.target_sightings import Sightings, see_target
 from perch_sim.scenario import load_scenario
 
@@ -112,8 +114,9 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _judge(arguments: argparse.Namespace) -> int:
-    out = output_folder(arguments.out)
+    out, code = output_folder(arguments.out), {"commit": commit(), "digest": digest(), "machine": machine(), "first_seed": arguments.first_seed}
     results, summary = run(arguments.scenario, arguments.runs, arguments.first_seed)
+    summary = code | summary
     (out / "consistency.json").write_text(json.dumps(summary, indent=2))
     consistency.plot(results, out / "consistency.png", {"take-off": 1.0, "hover": 3.0, "perch": 4.5})
     print(json.dumps(summary, indent=2))

@@ -82,9 +82,10 @@ def chained(value: float, slope: float, slope_reach: float, bend: float, bend_re
 
 @compiled(inline=True)
 def inverse_root(a: Taylor) -> Taylor:
-    """`a^(-1/2)` where `least(a)` is positive; its derivatives are convex or concave, so they change most towards `least(a)`."""
-    here, most = 1.0 / sqrt(max(a[0], _POSITIVE)), 1.0 / sqrt(max(least(a), _POSITIVE))
-    return chained(here, -0.5 * here**3, 0.5 * (most**3 - here**3), 0.75 * here**5, 0.75 * (most**5 - here**5), a)
+    """`a^(-1/2)` where `least(a)` is positive; its derivatives are monotonic, so they differ most from those at the middle where a is least or greatest."""
+    here, most, fewest = 1.0 / sqrt(max(a[0], _POSITIVE)), 1.0 / sqrt(max(least(a), _POSITIVE)), 1.0 / sqrt(max(greatest(a), _POSITIVE))
+    return chained(here, -0.5 * here**3, 0.5 * max(most**3 - here**3, here**3 - fewest**3),
+                   0.75 * here**5, 0.75 * max(most**5 - here**5, here**5 - fewest**5), a)
 
 
 @compiled(inline=True)
