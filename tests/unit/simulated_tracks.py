@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_perception.ukf.imu_buffer import ImuBuffer

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perch_core.camera import (CameraMount, EquidistantCamera, PinholeCamera, RadialTangentialCamera, camera_of, camera_parameters)
+from perch_core.camera import EquidistantCamera, PinholeCamera, RadialTangentialCamera, camera_of, camera_parameters
+from perch_core.camera_mount import CameraMount
 from perch_core.errors import ConfigError
 from unit.camera_mounts import looking_along
 

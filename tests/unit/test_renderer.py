@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from oracles.ray_caster import cast
-from perch_core.camera import CameraMount, EquidistantCamera
+from perch_core.camera import EquidistantCamera
+from perch_core.camera_mount import CameraMount
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
+from perch_core.camera import EquidistantCamera, PinholeCamera
+from perch_core.camera_mount import CameraMount
 from perch_core.catenary import Catenary
 from perch_core.surface import PerchSurface
 from perch_sim.rendering import CableCurve, Renderer, Scene, build_scene

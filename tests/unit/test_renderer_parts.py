@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from perch_core.camera import CameraMount, EquidistantCamera, PinholeCamera
+from perch_core.camera import EquidistantCamera, PinholeCamera
+from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import load_board
 from perch_sim.rendering import textures
 from perch_sim.rendering.grid import build_grid, sample_weights

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.camera import CameraMount, PinholeCamera
+from perch_core.camera import PinholeCamera
+from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import Tag, TagBoard, TagGrid
 from perch_perception.tags import BoardLocalizer, TagDetector, refine_corners
 

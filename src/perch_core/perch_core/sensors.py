@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import Camera, CameraMount, camera_of
+from perch_core.camera import Camera, camera_of
+from perch_core.camera_mount import CameraMount
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import Camera, CameraMount, EquidistantCamera, PinholeCamera
+from perch_core.camera import Camera, EquidistantCamera, PinholeCamera
+from perch_core.camera_mount import CameraMount
 from perch_core.config import LARGEST, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import extended_mapping

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.component import Component, Input, Output
 from perch_core.processes import frozen_heap
 from perch_core.timing import CONTROL_PERIOD

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from perch_core import config
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.component import Component, Input
 from perch_core.errors import ConfigError
 from perch_core.values import CameraImage, CameraModel, OdometryState, Transform, seconds

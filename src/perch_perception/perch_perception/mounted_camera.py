@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from perch_core.camera import Camera, CameraMount
+from perch_core.camera import Camera
+from perch_core.camera_mount import CameraMount
 from perch_core.values import CameraModel, Transform
 from perch_perception.static_transforms import BASE, StaticTransforms
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perch_core import config
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Output
 from perch_core.covariance import largest_sigma
 from perch_core.values import CameraImage, MappedPowerline, PowerlineMap, nanoseconds

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from perch_core import config
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.errors import ConfigError
 from perch_core.sensors import CalibrationSigmas, load_sensors
 from perch_perception.tags.map_pose import CalibrationSigma

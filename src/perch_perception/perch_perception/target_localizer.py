@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import CameraMount, Region
+from perch_core.camera import Region
+from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Output
 from perch_core.covariance import largest_sigma
 from perch_core.tag_board import load_board

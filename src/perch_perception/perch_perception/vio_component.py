@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Input, Output
 from perch_core.values import CameraImage, ImuSample, InertialState, OdometryState, Transform, rotated
 from perch_core.vehicle import load_vehicle

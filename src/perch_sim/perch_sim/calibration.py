@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_sim import seeding
 from perch_sim.scenario import Scenario
 

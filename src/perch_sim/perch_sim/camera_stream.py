@@ -10,7 +10,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_sim.camera_timing import CameraTiming, Frame
 from perch_sim.drawing import Exposure, ImageToCome
 from perch_sim.rendering import Pose

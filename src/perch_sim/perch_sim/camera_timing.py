@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 
 NANOSECONDS = 1_000_000_000
 TRIGGER_JITTER = 50_000  # of the exposure's start, one sigma [ns]

@@ -15,7 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from perch_core.camera import CameraMount, Region
+from perch_core.camera import Region
+from perch_core.camera_mount import CameraMount
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
 from perch_sim.drawing_process import GREETING

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import Camera, CameraMount, PinholeCamera
+from perch_core.camera import Camera, PinholeCamera
+from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import FAMILIES, Tag, TagBoard
 from perch_core.values import CameraImage, TargetPose
 from perch_eval.recordings.drawing import Shown, canvas, caption, draw_board, draw_tags, draw_wires

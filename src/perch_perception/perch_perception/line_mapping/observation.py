@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_perception.line_mapping.detection import LineSighting
 from perch_perception.pose_buffer import BodyState
 

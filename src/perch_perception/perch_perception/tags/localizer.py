@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core.camera import CameraMount, Region
+from perch_core.camera import Region
+from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.average import average_board

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.pose import BoardPose
 

@@ -3,16 +3,7 @@
 A single small square has two nearly equally good poses (the IPPE ambiguity): averages over single-tag poses flip and
 are 12-20 deg off at 3 m. All corners together, over the pad's 0.56 m, have one clear minimum.
 
-The lens is known to a few tenths of a per cent, which is more of a pixel than the corners' noise: k = (fx, fy, cx, cy) is
-considered. With the corners' derivative G by k, whitened and in k's sigmas, the residuals' covariance is I + G G^T, and
-
-    W = (I + G G^T)^-1 = I - G (I + G^T G)^-1 G^T,   A = (J^T W J)^-1 J^T W,   cov = A A^T (noise) + A G G^T A^T (lens).
-
-Tags are printed or glued as a whole, each a little beside its place: their shifts in the board's plane, of one sigma in both directions,
-are columns of G like the lens's, but for by_intrinsics; what they do to the pose is part of its noise.
-
-What no pose and no lens explains is noise: prints and paper put corners elsewhere, too, and the corners' sigmas grow by it. Otherwise
-the lens, which has one sigma whatever the number of corners, is bent to fit what is not its own.
+What the least squares over the corners know of lens and print: `corners.py`.
 
 Errors of a pose T_AB = (p_AB, R_AB) are (dp, dtheta) in the axes of A: p = p^ + dp, R = exp(dtheta) R^. That is also what
 the covariance of geometry_msgs/PoseWithCovariance means.
@@ -21,7 +12,6 @@ the covariance of geometry_msgs/PoseWithCovariance means.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -29,16 +19,13 @@ import numpy as np
 from perch_core import so3
 from perch_core.camera import Camera
 from perch_core.errors import PerchError
-from perch_core.probability import chi2_quantile
+from perch_perception.tags.corners import EXACT_LENS, Corners, limit, refine
 
-MAX_ITERATIONS = 12
 SAME_POSE = np.radians(0.5)        # branches closer than this are one and the same minimum [rad]
 PRIOR_SIGMA = np.radians(10.0)     # how far the attitude may have turned since it was predicted [rad]
-CONSISTENT = 0.999                 # share of boards that pass where corners are off by what is expected
 MODEL_SHARE = 0.02                 # print, paper and lens put corners where they belong within this share of the tag's longest side
 OUTLIER = 10.0                     # a tag that is so many times less consistent than the others is not where it should be
 SUSPECTS = 4                       # tags that are tried one by one as the one that is not
-EXACT_LENS = np.zeros(4)
 
 
 class LocalizationRefusal(PerchError):
@@ -97,7 +84,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
     keep, dropped = np.arange(len(ids)), list[int]()
     best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start)
     # of two tags that disagree, either may be wrong
-    while best.misfit > _limit(_freedom(len(keep))) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
+    while best.misfit > limit(_freedom(len(keep))) and len(keep) >= 3 and 2 * len(dropped) < len(ids) - 2:
         if best.misfit * _freedom(len(keep)) < 8.0 * OUTLIER:
             break  # no tag's leaving could explain so much
         expected, seen = camera.project(corners_S[keep] @ best.R_CS.T + best.p_CS)[0], camera.project(rays_C[keep])[0]
@@ -116,7 +103,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         dropped.append(ids[out])
     pixels = camera.project(rays_C[keep])[0]
     model = MODEL_SHARE * np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).max(axis=1, keepdims=True)
-    if best.misfit > _limit(_freedom(len(keep))) * float(np.mean(1.0 + (model / sigma[keep]) ** 2)):
+    if best.misfit > limit(_freedom(len(keep))) * float(np.mean(1.0 + (model / sigma[keep]) ** 2)):
         raise LocalizationRefusal(f"tags {list(ids)} do not fit the board: residual {best.rms:.2f} px RMS")
     if best.unexplained > 1.0:
         noise = sigma[keep] * np.sqrt(best.unexplained)
@@ -129,23 +116,17 @@ def _freedom(tags: int) -> int:
     return 8 * tags - 6
 
 
-@lru_cache(maxsize=256)
-def _limit(freedom: int) -> float:
-    """chi^2 over its degrees of freedom that `CONSISTENT` of the boards keep."""
-    return float(chi2_quantile(CONSISTENT, freedom)) / freedom
-
-
 def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start=None) -> BoardPose:
     """Best of the two IPPE branches, or of the start alone, after refinement."""
     points, rays = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3)
     pixels, seen = camera.project(rays)
     if not np.all(seen):
         raise LocalizationRefusal("a corner lies beyond the lens's field of view")
-    corners = _Corners(camera, points, sigma.reshape(-1), pixels, lens_sigma, print_sigma)
+    corners = Corners(camera, points, sigma.reshape(-1), pixels, lens_sigma, print_sigma)
     branches = []
     for p, R in [start] if start is not None else planar_branches(points, rays):
         corners.start(p, R)
-        refined = _refine(corners, p, R)
+        refined = refine(corners, p, R)
         if refined is None or refined[0][2] <= 0.0 and camera.max_angle <= np.pi / 2:
             continue
         p, R, chi_square = refined
@@ -201,7 +182,7 @@ def intrinsics_sensitivity(camera: Camera, corners_S: np.ndarray, sigma: np.ndar
     """Derivative of (dp, dtheta) of the least-squares pose by the true lens's fx, fy (relative), cx, cy [px], shape (6, 4)."""
     points = corners_S.reshape(-1, 3)
     pixels = camera.project(points @ R_CS.T + p_CS)[0]
-    return _Corners(camera, points, sigma.reshape(-1), pixels, EXACT_LENS).errors(p_CS, R_CS)[1]
+    return Corners(camera, points, sigma.reshape(-1), pixels, EXACT_LENS).errors(p_CS, R_CS)[1]
 
 
 def reprojection_rms(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, p_CS: np.ndarray,
@@ -210,129 +191,3 @@ def reprojection_rms(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, 
     projected, seen = camera.project(corners_S @ R_CS.T + p_CS)
     residual = projected - camera.project(rays_C)[0]
     return float(np.sqrt(np.mean(residual**2))) if np.all(seen) else np.inf
-
-
-class _Corners:
-    """Least squares over measured corners.
-
-    Args:
-        camera: the lens.
-        points_S: the corners in S, shape (m, 3).
-        noise: 1-sigma of each [px], shape (m,).
-        pixels: where they were measured, shape (m, 2).
-        lens_sigma: 1-sigma of fx, fy (relative), cx, cy [px], shape (4,).
-        print_sigma: 1-sigma of the place of four corners together [m].
-    """
-
-    def __init__(self, camera: Camera, points_S: np.ndarray, noise: np.ndarray, pixels: np.ndarray, lens_sigma: np.ndarray,
-                 print_sigma: float = 0.0) -> None:
-        self._camera, self._points, self._noise, self._pixels, self._lens_sigma = camera, points_S, noise, pixels, lens_sigma
-        self._print_sigma = print_sigma
-        self._by_print = np.zeros((2 * len(points_S), 0))  # by the tags' shifts, in their sigmas
-        self._consider(pixels)
-
-    def start(self, p: np.ndarray, R: np.ndarray) -> None:
-        """Take the lens's derivatives at a pose: at the measured pixels their noise would correlate with the residuals', as a longer lens."""
-        pixels, seen = self._camera.project(self._points @ R.T + p)
-        self._by_print = self._printed(p, R)
-        self._consider(np.where(seen[:, None], pixels, self._pixels))
-
-    def _consider(self, pixels: np.ndarray) -> None:
-        by_lens = np.zeros((len(pixels), 2, 4))
-        by_lens[:, 0, 0], by_lens[:, 1, 1] = pixels[:, 0] - self._camera.cx, pixels[:, 1] - self._camera.cy
-        by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
-        self._by_lens = (by_lens / self._noise[:, None, None]).reshape(-1, 4)
-        self._G = np.concatenate([self._by_lens * self._lens_sigma, self._by_print], axis=1)
-        self._back = np.linalg.solve(np.eye(self._G.shape[1]) + self._G.T @ self._G, self._G.T)
-
-    def _printed(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
-        """Derivative of the whitened pixels by the shift of each tag in its plane, in sigmas, shape (2m, m / 2); (2m, 0) where it has none."""
-        m = len(self._points)
-        if self._print_sigma == 0.0:
-            return np.zeros((2 * m, 0))
-        by_shift = self._camera.project_jacobian(self._points @ R.T + p) @ (self._print_sigma * R[:, :2]) / self._noise[:, None, None]
-        out = np.zeros((m // 4, 8, m // 4, 2))
-        tags = np.arange(m // 4)
-        out[tags, :, tags] = np.nan_to_num(by_shift).reshape(m // 4, 8, 2)
-        return out.reshape(2 * m, m // 2)
-
-    def linearise(self, p: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
-        jacobian, projected = self._jacobian(p, R)
-        residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
-        if not np.all(np.isfinite(residual)):
-            return None
-        weighed = self._weighed(residual)
-        return float(residual @ weighed), jacobian.T @ weighed, jacobian.T @ self._weighed(jacobian)
-
-    def errors(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """At the minimum: covariance of (dp, dtheta) from noise and print, (6, 6), and their derivative by the true lens, (6, 4).
-
-        Pixels that a longer lens makes larger bring the solution nearer than the truth, which is ahead: -A dr/dk.
-        """
-        jacobian, projected = self._jacobian(p, R)
-        self._by_print = self._printed(p, R)
-        self._consider(projected)
-        weighed = self._weighed(jacobian)
-        A = np.linalg.solve(jacobian.T @ weighed, weighed.T)
-        by_print = A @ self._by_print
-        return A @ A.T + by_print @ by_print.T, -A @ self._by_lens
-
-    def unexplained(self, p: np.ndarray, R: np.ndarray) -> float:
-        """Mean square of the whitened residuals that no pose and no lens explains, of corners or of whole tags; 1 where it may be chance.
-
-        Pose and lens together move a plane's corners as the homographies do, which have eight parameters. Tags are printed or glued as
-        a whole, so what their corners have in common counts as one error.
-        """
-        jacobian, projected = self._jacobian(p, R)
-        residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
-        explaining = np.concatenate([jacobian, self._by_lens], axis=1)
-        if self._by_print.size:  # by what print leaves open, residuals are correlated
-            root = np.linalg.cholesky(np.eye(len(residual)) + self._by_print @ self._by_print.T)
-            residual, explaining = np.linalg.solve(root, residual), np.linalg.solve(root, explaining)
-        explaining = explaining / np.linalg.norm(explaining, axis=0)
-        rest = residual - explaining @ np.linalg.lstsq(explaining, residual, rcond=1e-6)[0]
-        of_tags = 2.0 * rest.reshape(-1, 4, 2).mean(axis=1).ravel()
-        means = [(float(part @ part) / (len(part) - 8), len(part) - 8) for part in (rest, of_tags) if len(part) > 8]
-        return max((mean for mean, freedom in means if mean > _limit(freedom)), default=1.0)
-
-    def rms(self, p: np.ndarray, R: np.ndarray) -> float:
-        """Residual per image axis [px]; corners that are known better count more."""
-        residual = self._camera.project(self._points @ R.T + p)[0] - self._pixels
-        return float(np.sqrt(np.sum((residual / self._noise[:, None]) ** 2) / np.sum(2.0 / self._noise**2)))
-
-    def _weighed(self, whitened: np.ndarray) -> np.ndarray:
-        """W times residuals or derivatives, shape (2m, ...)."""
-        return whitened - self._G @ (self._back @ whitened)
-
-    def _jacobian(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative of the whitened pixels by (dp, dtheta), shape (2m, 6), and the pixels (m, 2); NaN beyond the lens."""
-        turned = self._points @ R.T
-        points_C = turned + p
-        by_point = self._camera.project_jacobian(points_C) / self._noise[:, None, None]
-        by_turn = -by_point @ so3.hat(turned)  # d X_C = dtheta x R X
-        return np.concatenate([by_point, by_turn], axis=-1).reshape(-1, 6), self._camera.project(points_C)[0]
-
-
-def _refine(corners: _Corners, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Levenberg-Marquardt on SE(3); returns p, R and chi^2, or None where it leaves the lens."""
-    state = corners.linearise(p, R)
-    if state is None:
-        return None
-    chi2, gradient, information = state
-    damping = 1e-6
-    for _ in range(MAX_ITERATIONS):
-        step = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
-        p_new, R_new = p + step[:3], so3.exp(step[3:]) @ R
-        trial = corners.linearise(p_new, R_new)
-        if trial is None or trial[0] > chi2 + 1e-9:
-            damping = max(10.0 * damping, 1e-4)
-            if damping > 1e6:
-                break
-            continue
-        gain = chi2 - trial[0]
-        p, R, (chi2, gradient, information) = p_new, R_new, trial
-        damping *= 0.1
-        if gain < 1e-4 * max(chi2, 1.0) or np.abs(step).max() < 1e-7:
-            break
-    return p, R, chi2

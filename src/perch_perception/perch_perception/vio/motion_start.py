@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.covariance import largest_sigma
 from perch_core.vehicle import GRAVITY
 

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 from perch_core import so3
-from perch_core.camera import Camera, CameraMount
+from perch_core.camera import Camera
+from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.stillness import MOST_ACCEL_BIAS, MOST_GYRO_BIAS, WINDOW, energy, still, window

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 from perch_core import so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 

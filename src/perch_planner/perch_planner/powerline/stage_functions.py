@@ -16,7 +16,7 @@ import numpy as np
 
 from perch_core import lines, rotor_model
 from perch_core.arrays import quaternion, vector3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.components import Scalar, Vector, components, dot, matrix_of, rotate_back
 from perch_core.rotor_model import INPUTS, P, Q, STATES, THRUST, V, W, RotorModel
 from perch_core.so3 import quat_from_matrix

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core import lines, so3
-from perch_core.camera import CameraMount
+from perch_core.camera_mount import CameraMount
 from perch_core.components import components
 from perch_core.rotor_model import P, Q
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from perch_core import so3
-from perch_core.camera import CameraMount, Region
+from perch_core.camera import Region
+from perch_core.camera_mount import CameraMount
 from perch_sim.rendering.atlas import build_atlas
 from perch_sim.rendering.cables import CablePainter
 from perch_sim.rendering.grid import build_grid

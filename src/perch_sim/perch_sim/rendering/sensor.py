@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perch_core.camera import Camera, CameraMount, Region
+from perch_core.camera import Camera, Region
+from perch_core.camera_mount import CameraMount
 
 BLUR_REACH = 2   # of the filter that stands for it [px]
 PSF_SIGMA = 0.6  # blur of lens and pixel together [px]
