@@ -15,32 +15,28 @@ from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
-from perch_perception.ukf.stillness import MOST_ACCEL_BIAS, MOST_GYRO_BIAS, WINDOW, energy, still, window
+from perch_perception.ukf.stillness import energy, still, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, Bearings, observe, residuals
 from perch_perception.vio.config import VioConfig
+from perch_perception.vio.divergence import SPEED_MAX, divergence, velocity_sigma
 from perch_perception.vio.msckf import FrameReport, Msckf
 from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.recent_views import LEAST_TRACKS, STANDS, RecentViews
 from perch_perception.vio.result import FrameOutcome, VioPoseEstimate, VioResult
 from perch_perception.vio.start import KnownPose
 from perch_perception.vio.tracker import Features, Tracker
 from perch_perception.vio.triangulation import triangulate
 
-_REST_MOTION = 0.7  # largest median motion of tracks at rest [px]
 _REST_LAG = 0.25  # the filter stays this far behind while it stands still [s]
 _UNNOTICED = 0.02  # 1 sigma of a take-off that is not yet noticed [m/s]
-_LEAST_TRACKS = 8  # below which a frame says nothing
 _DARK = 0.15  # time without a visual update that is blindness where nothing is tracked [s]
 _BLIND = 0.5  # the same whatever is tracked [s]
 _LEAVING = 1.0  # from rest on, in which a take-off may go on blind [s]
 _LEAVING_VELOCITY = 0.05  # 1 sigma up to which it may [m/s]
 _FATES = 15  # frames over which observations that are refused and used are counted
-_REFUSED = 20  # a run ends where more are refused than used, and than this
-_LOST_VELOCITY = 1.0  # 1 sigma that ends a run [m/s]
-_SPEED = 25.0  # faster flies no vehicle that this is for: the filter has diverged [m/s]
-_STANDS = 0.8  # what is seen not to move for so long stands, however it is shaken [s]
 _FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
 
@@ -68,7 +64,7 @@ class VisualInertialOdometry:
         self._known = start.told(p_WB, yaw)
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposed, features) of frames at rest that the filter has not passed
-        self._seen: deque[tuple[int, Features]] = deque()   # frames over which motion in view is judged
+        self._seen = RecentViews()
         self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
         self._lost: tuple[int, float] | None = None  # when the last filter ended, and how fast it was [ns, m/s]
         self._resting = False
@@ -179,9 +175,7 @@ class VisualInertialOdometry:
                 self._turned = self._turned[0] @ part.dR, part.dR.T @ self._turned[1] + part.J[:3, :3]
                 slack = 2e-9 * self._moving.gyro_sigma * (exposed - self._last_exposed)
         features = self.tracker.track(image, R_BC.T @ turn.T @ R_BC, slack)
-        self._seen.append((exposed, features))
-        while len(self._seen) > 2 and self._seen[1][0] <= exposed - round(1e9 * _STANDS):
-            self._seen.popleft()
+        self._seen.add(exposed, features)
         return features
 
     # -- before the start --------------------------------------------------------------------------------------------
@@ -190,7 +184,7 @@ class VisualInertialOdometry:
         """Start at rest or, when the vehicle moves, from the frames of the last half second and more."""
         steps = window(self._imu, exposed)
         biases, variance = self._biases or (None, None)
-        if self._quiet() is not False and still(steps, biases, variance, bool(self._quiet(_STANDS))):
+        if self._seen.still() is not False and still(steps, biases, variance, bool(self._seen.still(STANDS))):
             self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known_with(steps[:, GYRO].mean(axis=0))))
             return self._hold(exposed, features)
         self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
@@ -240,24 +234,10 @@ class VisualInertialOdometry:
         state = self._running.state
         if self._sight is not None and exposed - self._sight < round(1e9 * _DARK):
             return False
-        quiet = self._quiet()
+        quiet = self._seen.still()
         return (quiet is not False and (self._resting or rest.can_stand(state))
                 and still(window(self._imu, exposed), *_biases(state),
-                          seen=bool(quiet) and (self._resting or bool(self._quiet(_STANDS)))))
-
-    def _quiet(self, duration: float = WINDOW) -> bool | None:
-        """Whether nothing has moved in the image for so long [s], whatever the gyro says; None where there is nothing in it.
-
-        A hover, too, stands still for the duration in which rest is judged, which is the default: it is not for the image alone to say.
-        """
-        until, now = self._seen[-1]
-        since, then = next(((t, f) for t, f in reversed(self._seen) if t <= until - round(0.8e9 * duration)), self._seen[0])
-        if len(now.ids) < _LEAST_TRACKS:
-            return None
-        _, i, j = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
-        if len(i) < _LEAST_TRACKS or until - since < round(0.8e9 * duration):
-            return False
-        return float(np.median(np.linalg.norm(now.pixels[j] - then.pixels[i], axis=1))) < _REST_MOTION
+                          seen=bool(quiet) and (self._resting or bool(self._seen.still(STANDS)))))
 
     def _hold(self, exposed: int, features: Features) -> VioResult:
         """Tell the filter that the vehicle stood still, up to a little before now.
@@ -308,26 +288,14 @@ class VisualInertialOdometry:
             self._informed = exposed
         self._fates.append((report.used, report.refused))
         used, refused = np.sum(self._fates, axis=0)
-        sigma, speed = np.sqrt(np.diag(s.P)), float(np.linalg.norm(s.v_WB))
-        gyro, accel = float(np.linalg.norm(s.gyro_bias)), float(np.linalg.norm(s.accel_bias))
-        why = ""
-        if not np.isfinite(s.P).all() or not np.isfinite(s.p_WB).all():
-            why = "state is not finite"
-        elif refused > max(used, _REFUSED):
-            why = f"{refused} observations refused and {used} used in {len(self._fates)} frames"
-        elif sigma[at.VELOCITY].max() > _LOST_VELOCITY:
-            why = f"velocity known only to {sigma[at.VELOCITY].max():.1f} m/s"
-        elif speed > _SPEED:
-            why = f"a speed of {speed:.1f} m/s"
-        elif gyro > 2.0 * MOST_GYRO_BIAS or accel > 2.0 * MOST_ACCEL_BIAS:
-            why = f"biases of {gyro:.2f} rad/s and {accel:.1f} m/s^2: gravity and motion do not fit"
+        why = divergence(s, used, refused, len(self._fates))
         if why:
             return self._lose(features, why)
         blind = (exposed - self._informed) * 1e-9
         outcome = FrameOutcome.TRACKING
-        if blind > (_BLIND if len(features.ids) - features.new >= _LEAST_TRACKS else _DARK):
+        if blind > (_BLIND if len(features.ids) - features.new >= LEAST_TRACKS else _DARK):
             # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
-            leaving = self._sight is None and blind < _LEAVING and sigma[at.VELOCITY].max() < _LEAVING_VELOCITY
+            leaving = self._sight is None and blind < _LEAVING and velocity_sigma(s) < _LEAVING_VELOCITY
             outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 
@@ -340,7 +308,7 @@ class VisualInertialOdometry:
         self._know()
         s = self._running.state
         speed = float(np.linalg.norm(s.v_WB))
-        self._lost = s.stamp, speed if speed < _SPEED else _SPEED
+        self._lost = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
         self._await()
         self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
 
