@@ -195,3 +195,23 @@ def test_halves_are_the_polynomial_on_their_halves(seed):
     for s in np.linspace(0.0, 1.0, 7):
         assert bernstein.evaluate(left, s) == pytest.approx(bernstein.evaluate(whole, 0.5 * s), abs=1e-12)
         assert bernstein.evaluate(right, s) == pytest.approx(bernstein.evaluate(whole, 0.5 + 0.5 * s), abs=1e-12)
+
+
+@pytest.mark.parametrize("limit", [1e-2, 1e-3, 1e-6])
+def test_a_small_limit_of_the_body_rate_is_proved_not_sampled(limit):
+    """A yaw rate of 1 rad/s that vanishes at the 13 places where rates are sampled."""
+    nodes, samples = bernstein.basis(13, np.linspace(0.0, 1.0, 14)), np.linspace(0.0, 1.0, 13)
+    rate = np.linalg.solve(nodes, [np.prod(s - samples) for s in np.linspace(0.0, 1.0, 14)])
+    rate /= np.abs(bernstein.evaluate(rate, np.linspace(0.0, 1.0, 1001))).max()
+    still, T, up = np.zeros((1, 3, 15)), np.ones(1), np.array([0.0, 0.0, 1.0])
+    thrust, _, _ = plan_checks.thrust_extrema(still, T, 1.0, 20.0)
+
+    def holds(yaw):
+        return plan_checks.check(still, yaw, T, thrust, -5.0 * up, 0.0 * up, up, 1.0, 20.0, 5.0, -1.0, 1.0, 0.1, 0.0, limit)[2]
+
+    assert not holds(np.concatenate([[0.0], np.cumsum(rate) / 14.0])[None])
+    assert holds(np.zeros((1, 15)))
+
+
+def test_algorithm_1_sees_what_begins_on_its_bound_with_a_multiple_root():
+    assert not sturm.global_bound_check(np.array([0.0, 0.0, 0.5, -1.0]), 0.0, 0.0, 1.0)  # t^2 (0.5 - t)

@@ -104,3 +104,11 @@ def test_a_plan_through_free_fall_is_not_proved(planned):
 def test_limits_of_the_shipped_planner_are_those_that_are_proved():
     low, high = Limits.of(PerchSettings(), VEHICLE).rotor_thrust
     assert VEHICLE.thrust_min <= low < high <= VEHICLE.thrust_max
+
+
+def test_the_proof_does_not_depend_on_the_origin():
+    rng, grid = np.random.default_rng(3), 2.0**-24
+    velocity = np.cumsum(np.cumsum(rng.normal(0.0, 0.001, (3, 14)), axis=1), axis=1)
+    position = np.round(np.hstack([np.zeros((3, 1)), np.cumsum(velocity, axis=1) * 0.01]) / grid)[None] * grid
+    answers = [prove_rotors(position + far, np.zeros((1, 15)), np.ones(1), 0.6, 0.6, -50.0, 50.0, *ROTORS) for far in (0.0, 2.0**13)]
+    assert answers[0] == answers[1] and answers[0][0]

@@ -215,7 +215,7 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
 
     forces, squares, jerks, distances = np.empty((f, 3, 13)), np.empty((f, 25)), np.empty((f, 3, 12)), np.empty((f, 15))
     # Backwards, as the vehicle turns and comes near at the end: most segments before need no samples then.
-    gap_wanted, rate_wanted = np.inf, 1e-3
+    gap_wanted, rate_wanted = np.inf, min(1e-3, 0.5 * rate)
     coarse = np.empty(f)
     for i in range(f - 1, -1, -1):
         T, c, heading = durations[i], coefficients[i], yaw[i:i + 1]
@@ -239,8 +239,8 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
         _doubt(where, CLEARANCE, i, place)
     out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,
                                                                     rate_wanted)
-    if i >= 0:
-        _doubt(where, BODY_RATE, i, place)
+    if out[BODY_RATE, MAXIMUM] > rate:
+        _doubt(where, BODY_RATE, max(i, 0), place)
     if found >= 0:
         out[BODY_RATE, MAXIMUM_AT] = begins[found] + found_at * durations[found]
     holds = True

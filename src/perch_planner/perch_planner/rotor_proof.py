@@ -167,7 +167,8 @@ def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: floa
     rows, length = np.empty((_DEPTH + 2, 12, _POWERS)), np.empty(_DEPTH + 2)
     nodes = 0
     for i in range(len(durations) - 1, -1, -1):  # backwards: the end asks most of the rotors
-        rows[0, :9], length[0] = motion(coefficients[i], durations[i], _DERIVATIVES[0]), durations[i]
+        here = coefficients[i] - coefficients[i][:, :1]  # exact differences: rounding would grow with the distance from the origin
+        rows[0, :9], length[0] = motion(here, durations[i], _DERIVATIVES[0]), durations[i]
         three_derivatives(yaw[i:i + 1], 0, durations[i], _DERIVATIVES[1], rows[0, 9:])
         top = 1
         while top > 0:

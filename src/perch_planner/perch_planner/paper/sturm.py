@@ -94,6 +94,6 @@ def global_bound_check(powers: Array, bound: float, low: float, high: float) -> 
     for i in range(len(f) - 1, -1, -1):
         at_low = at_low * low + f[i]
         at_high = at_high * high + f[i]
-    if at_low > 0.0 or at_high > 0.0:
+    if at_low >= 0.0 or at_high >= 0.0:  # a multiple root there takes the whole chain to zero, which then counts nothing
         return False
     return count_roots(f, low, high) <= 0
