@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import signal
 import sys
 import time
@@ -63,8 +64,8 @@ def main() -> int:
         parser.error(f"--view {arguments.view} is outside [0, 65535]")
     if not 0.0 < arguments.ready_timeout < math.inf:
         parser.error(f"--ready-timeout {arguments.ready_timeout} is not > 0 s")
-    if arguments.namespace and not arguments.namespace.startswith("/"):
-        parser.error(f"--namespace {arguments.namespace}: must begin with '/', as in /quad1")
+    if arguments.namespace and not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", arguments.namespace):
+        parser.error(f"--namespace {arguments.namespace}: must be '/' and a name of letters, digits and '_', as in /quad1")
     if arguments.domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(arguments.domain)
     enter(*["view"] * (arguments.view is not None or "viewer" in arguments.only))
