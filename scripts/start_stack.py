@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import signal
 import sys
 import time
@@ -45,7 +46,7 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--domain", type=int, metavar="N", help="ROS domain id, 0 to 101 (default: $ROS_DOMAIN_ID)")
     parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
-    parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>)")
+    parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>-<process>)")
     parser.add_argument("--ready-timeout", type=float, default=180.0, metavar="S", help="how long nodes may take to come up (default: %(default)g s)")
     parser.add_argument(
         "-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE", help="over every file; repeatable"
@@ -63,8 +64,8 @@ def main() -> int:
         parser.error(f"--view {arguments.view} is outside [0, 65535]")
     if not 0.0 < arguments.ready_timeout < math.inf:
         parser.error(f"--ready-timeout {arguments.ready_timeout} is not > 0 s")
-    if arguments.namespace and not arguments.namespace.startswith("/"):
-        parser.error(f"--namespace {arguments.namespace}: must begin with '/', as in /quad1")
+    if arguments.namespace and not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", arguments.namespace):
+        parser.error(f"--namespace {arguments.namespace}: must be '/' and a name of letters, digits and '_', as in /quad1")
     if arguments.domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(arguments.domain)
     enter(*["view"] * (arguments.view is not None or "viewer" in arguments.only))
@@ -120,7 +121,7 @@ def run(arguments: argparse.Namespace) -> None:
         lockstep=not arguments.realtime,
         overrides=overrides,
     )
-    folder = output_folder((arguments.log_dir or ROOT / "out" / "stack" / time.strftime("%Y%m%d-%H%M%S")).absolute(), "--log-dir")
+    folder = output_folder((arguments.log_dir or own_folder()).absolute(), "--log-dir")
     programs = node_programs(launches, folder, namespace=arguments.namespace, composed=sharing(arguments.composed))
     stack = Stack(programs, folder, on_line=printer([program.name for program in programs]))
     try:
@@ -133,6 +134,11 @@ def run(arguments: argparse.Namespace) -> None:
         stack.raise_if_ended()
     finally:
         stack.stop()
+
+
+def own_folder() -> Path:
+    """Where logs go by default: several stacks, one for each vehicle, may start in the same second."""
+    return ROOT / "out" / "stack" / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"
 
 
 def printer(names: list[str]):

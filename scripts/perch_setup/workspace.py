@@ -54,16 +54,13 @@ def _environment(wanted: Platform) -> dict[str, str]:
 
 
 def _narrator() -> Callable[[str], Optional[str]]:
-    """Turns colcon's lines into the name of the package at work, and make's percentage."""
-    package = ""
+    """Turns colcon's lines into the name of a package that begins, and make's percentage of one with messages."""
 
     def describe(line: str) -> Optional[str]:
-        nonlocal package
         started = re.match(r"Starting >>> (\S+)", line)
-        percentage = re.match(r"\[ *(\d+)%\]", line)
+        percentage = re.match(r"\[ *(\d+)%\] .*?\b(\w+?_msgs)", line)  # several packages are built at the same time
         if started:
-            package = started.group(1)
-            return package
-        return f"perch_msgs {percentage.group(1)} %" if percentage else None
+            return started.group(1)
+        return f"{percentage.group(2)} {percentage.group(1)} %" if percentage else None
 
     return describe

@@ -76,6 +76,7 @@ def test_scenarios_are_refused_before_anything_is_started(content, words, tmp_pa
 @pytest.mark.parametrize("arguments, words", [
     (["--scenario", "surface_91"], "scenarios: surface_91: unknown; there are: "),
     (["--scenario", "nowhere.yaml"], "nowhere.yaml: no such file"),
+    (["--vehicle", "snapdragn"], "error: vehicles: snapdragn: unknown; there are: "),
     (["--seed", "-1"], "--seed: -1: is outside [0, 2147483647]"),
     (["--out", "/proc/flight"], "--out: /proc/flight: cannot be written"),
 ])

@@ -121,7 +121,8 @@ def test_a_killed_node_is_named_and_the_others_are_stopped(start):
     (["-p", "gain=2"], "expected NODE.PARAMETER:=VALUE"),
     (["--domain", "200"], "200 is outside [0, 101]"),
     (["--view", "70000"], "70000 is outside [0, 65535]"),
-    (["--namespace", "quad1"], "must begin with '/'"),
+    (["--namespace", "quad1"], "must be '/' and a name"),
+    (["--namespace", "/quad-1"], "must be '/' and a name"),
 ])
 def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, tmp_path):
     result = call_script("start_stack.py", *arguments, *([] if "--domain" in arguments else ["--domain", "1"]), "--log-dir", str(tmp_path))

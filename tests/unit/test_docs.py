@@ -41,6 +41,13 @@ def test_files_that_are_named_exist(page):
     assert [name for name in named if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()] == []
 
 
+@pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
+def test_tests_that_are_named_exist(page):
+    named = re.findall(r"`(?:tests/\w+/)?(test_\w+\.py)(?:::(\w+))?`", page.read_text())
+    texts = {path.name: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
+    assert [f"{file}::{test}" for file, test in named if f"def {test}" not in texts.get(file, "")] == []
+
+
 def leaves(nav) -> list[str]:
     """The pages of a navigation."""
     if isinstance(nav, str):

@@ -22,13 +22,18 @@ from perch_sim.scenario import load_scenario
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
-def start_stack_parser():
-    """The command line of start_stack.py, which is a script and not in a package."""
+def start_stack():
+    """start_stack.py, which is a script and not in a package."""
     sys.path.insert(0, str(SCRIPTS))
     try:
-        return importlib.import_module("start_stack").command_line()
+        return importlib.import_module("start_stack")
     finally:
         sys.path.remove(str(SCRIPTS))
+
+
+def start_stack_parser():
+    """Its command line."""
+    return start_stack().command_line()
 
 
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
@@ -84,3 +89,13 @@ def test_links_lead_somewhere():
         for link in re.findall(r"\]\(([^)#]+)\)", guide.read_text()):
             target = (guide.parent / link).resolve()
             assert target.exists() or target.is_relative_to(root / "docs" / "results"), f"{guide.name}: {link}"
+
+
+def test_stacks_that_start_in_the_same_second_have_logs_of_their_own(monkeypatch):
+    script = start_stack()
+    monkeypatch.setattr(script.time, "strftime", lambda _: "20260101-120000")
+    folders = []
+    for process in (1, 2):
+        monkeypatch.setattr(script.os, "getpid", lambda: process)  # noqa: B023 (called in this turn)
+        folders.append(script.own_folder())
+    assert folders[0] != folders[1]

@@ -259,6 +259,16 @@ def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "build" / "perch_x").exists() and (tmp_path / "build" / "perch_y").exists()
 
 
+@pytest.mark.parametrize("line, words", [
+    ("Starting >>> perch_core\n", "perch_core"),
+    ("[ 73%] Built target tf2_msgs__rosidl_typesupport_introspection_cpp\n", "tf2_msgs 73 %"),
+    ("[  8%] Building C object CMakeFiles/perch_msgs__rosidl_generator_c.dir/perch_msgs/msg/detail/contact__functions.c.o\n", "perch_msgs 8 %"),
+    ("[  1%] Generating C code for ROS interfaces\n", None),
+])
+def test_the_progress_of_a_build_names_the_package_it_is_of(line, words):
+    assert workspace._narrator()(line) == words
+
+
 # -- steps -----------------------------------------------------------------------------------------------------------
 
 

@@ -72,8 +72,8 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
     source = config.find("scenarios", scenario_name)
     scenario = load_scenario(source)
     if vehicle:
-        is_file = vehicle.endswith((".yaml", ".yml"))
-        scenario = replace(scenario, vehicle=str(config.find("vehicles", vehicle).resolve()) if is_file else vehicle)
+        found = config.find("vehicles", vehicle)
+        scenario = replace(scenario, vehicle=str(found.resolve()) if vehicle.endswith((".yaml", ".yml")) else vehicle)
     with uncompiled():
         check_flight(scenario, source)
     if load_vehicle(scenario.vehicle).actuation.firmware:
