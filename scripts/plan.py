@@ -106,7 +106,8 @@ def main() -> int:
         _apply(mapping, arguments.set)
         if arguments.animation and mapping["kind"] not in ANIMATED:
             raise ConfigError("--animation", mapping["kind"], f"only for {', '.join(ANIMATED)}")
-        return KINDS[mapping["kind"]](mapping, str(path), arguments.out, arguments.animation)
+        source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
+        return KINDS[mapping["kind"]](mapping, source, arguments.out, arguments.animation)
     except PlanningRefusal as refusal:
         print(f"refused ({refusal.code}): {refusal}", file=sys.stderr)
         return 2 if refusal.code == "bad_input" else 1

@@ -68,7 +68,7 @@ def echo(arguments: argparse.Namespace) -> int:
 
 def measure_rate(arguments: argparse.Namespace) -> int:
     """`topic.py hz`: prints the rate every second; with `-n`, ends after so many messages."""
-    arrivals: deque[float] = deque(maxlen=arguments.window)
+    arrivals: deque[float] = deque(maxlen=max(arguments.window, 2))
     wanted, count, reported = arguments.n or math.inf, 0, 0
 
     def arrived(_: bytes) -> None:

@@ -230,7 +230,7 @@ def config_dir() -> Path:
     for folder in Path(__file__).resolve().parents:
         for candidate in (folder / "config", folder / "share" / "perch_core" / "config"):
             if (candidate / "vehicles").is_dir():
-                return candidate
+                return candidate.resolve()
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         candidate = Path(prefix) / "share" / "perch_core" / "config"
         if candidate.is_dir():

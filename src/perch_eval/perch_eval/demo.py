@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Collection
-from contextlib import closing
+from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,9 +80,8 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         firmware.ensured()
     if not 0 <= seed < 2**31:
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
-    (output_folder(out) / "flight.mcap").unlink(missing_ok=True)  # of an earlier flight: this one may end before it records
     say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
-    with own_domain():
+    with own_domain(), _replaced(output_folder(out) / "flight.mcap"):
         started = programs(scenario, seed, scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
                            record=out / "flight.mcap", hold_for_goal=not realtime)
         stack = Stack(started, out / "logs", on_line=say)
@@ -92,6 +91,21 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
             result = _flown(scenario, stack)
     return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
                         result.start_time)
+
+
+@contextmanager
+def _replaced(recording: Path) -> Iterator[None]:
+    """Put the recording of an earlier flight aside, as this one may end before it records; a caller's mistake puts it back."""
+    aside = recording.with_suffix(".earlier")
+    if recording.exists():
+        recording.replace(aside)
+    try:
+        yield
+    except PerchError:
+        if aside.exists():
+            aside.replace(recording)
+        raise
+    aside.unlink(missing_ok=True)
 
 
 def _flown(scenario: Scenario, stack: Stack) -> FlightResult:

@@ -1,0 +1,28 @@
+"""`demo.py`: what becomes of an earlier flight in the same folder."""
+
+from __future__ import annotations
+
+import pytest
+
+from perch_core.errors import PerchError
+from perch_eval.demo import _replaced
+
+
+def test_a_flight_that_is_refused_leaves_the_earlier_recording(tmp_path):
+    recording = tmp_path / "flight.mcap"
+    recording.write_text("earlier")
+    with pytest.raises(PerchError), _replaced(recording):
+        recording.write_text("begun")
+        raise PerchError("a parameter is refused")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["earlier"]
+
+
+@pytest.mark.parametrize("records", [True, False])
+def test_a_flight_that_ends_leaves_its_own_recording_or_none(tmp_path, records):
+    recording = tmp_path / "flight.mcap"
+    recording.write_text("earlier")
+    with _replaced(recording):
+        assert not recording.exists()
+        if records:
+            recording.write_text("new")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["new"] * records
