@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 from pathlib import Path
-from typing import Callable, Iterable, Optional
+from typing import Iterable, Optional
 
 from .environment import variables
 from .layout import BUILD, INSTALL, ROOT, SOURCES, STATE, VENV, VENV_PYTHON
@@ -40,7 +40,7 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
             *("--packages-select", *names),
             *("--cmake-args", "-DCMAKE_BUILD_TYPE=Release", "--no-warn-unused-cli"),
         ]
-        step.run(command, "build", _environment(wanted), _narrator())
+        step.run(command, "build", _environment(wanted), _narrated)
 
 
 def _environment(wanted: Platform) -> dict[str, str]:
@@ -53,14 +53,10 @@ def _environment(wanted: Platform) -> dict[str, str]:
     return environment
 
 
-def _narrator() -> Callable[[str], Optional[str]]:
-    """Turns colcon's lines into the name of a package that begins, and make's percentage of one with messages."""
-
-    def describe(line: str) -> Optional[str]:
-        started = re.match(r"Starting >>> (\S+)", line)
-        percentage = re.match(r"\[ *(\d+)%\] .*?\b(\w+?_msgs)", line)  # several packages are built at the same time
-        if started:
-            return started.group(1)
-        return f"{percentage.group(2)} {percentage.group(1)} %" if percentage else None
-
-    return describe
+def _narrated(line: str) -> Optional[str]:
+    """What a line of colcon tells: the name of a package that begins, or make's percentage of one with messages."""
+    started = re.match(r"Starting >>> (\S+)", line)
+    percentage = re.match(r"\[ *(\d+)%\] .*?\b(\w+?_msgs)", line)  # several packages are built at the same time
+    if started:
+        return started.group(1)
+    return f"{percentage.group(2)} {percentage.group(1)} %" if percentage else None

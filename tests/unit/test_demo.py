@@ -17,6 +17,15 @@ def test_a_flight_that_is_refused_leaves_the_earlier_recording(tmp_path):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["earlier"]
 
 
+def test_an_interrupted_flight_leaves_what_it_has_recorded_alone(tmp_path):
+    recording = tmp_path / "flight.mcap"
+    recording.write_text("earlier")
+    with pytest.raises(KeyboardInterrupt), _replaced(recording):
+        recording.write_text("begun")
+        raise KeyboardInterrupt
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["begun"]
+
+
 @pytest.mark.parametrize("records", [True, False])
 def test_a_flight_that_ends_leaves_its_own_recording_or_none(tmp_path, records):
     recording = tmp_path / "flight.mcap"

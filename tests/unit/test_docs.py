@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -41,11 +42,16 @@ def test_files_that_are_named_exist(page):
     assert [name for name in named if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()] == []
 
 
+@cache
+def texts_of_tests() -> dict[str, str]:
+    """Name of each file of tests, and its text."""
+    return {path.name: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
+
+
 @pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
 def test_tests_that_are_named_exist(page):
     named = re.findall(r"`(?:tests/\w+/)?(test_\w+\.py)(?:::(\w+))?`", page.read_text())
-    texts = {path.name: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
-    assert [f"{file}::{test}" for file, test in named if f"def {test}" not in texts.get(file, "")] == []
+    assert [f"{file}::{test}" for file, test in named if f"def {test}" not in texts_of_tests().get(file, "")] == []
 
 
 def leaves(nav) -> list[str]:

@@ -266,7 +266,7 @@ def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
     ("[  1%] Generating C code for ROS interfaces\n", None),
 ])
 def test_the_progress_of_a_build_names_the_package_it_is_of(line, words):
-    assert workspace._narrator()(line) == words
+    assert workspace._narrated(line) == words
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------

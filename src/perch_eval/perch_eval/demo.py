@@ -105,7 +105,8 @@ def _replaced(recording: Path) -> Iterator[None]:
         if aside.exists():
             aside.replace(recording)
         raise
-    aside.unlink(missing_ok=True)
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def _flown(scenario: Scenario, stack: Stack) -> FlightResult:

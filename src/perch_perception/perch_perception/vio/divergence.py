@@ -29,8 +29,8 @@ def divergence(state: at.State, used: int, refused: int, frames: int) -> str:
         return "state is not finite"
     if refused > max(used, _REFUSED):
         return f"{refused} observations refused and {used} used in {frames} frames"
-    if velocity_sigma(state) > _VELOCITY:
-        return f"velocity known only to {velocity_sigma(state):.1f} m/s"
+    if (sigma := velocity_sigma(state)) > _VELOCITY:
+        return f"velocity known only to {sigma:.1f} m/s"
     if speed > SPEED_MAX:
         return f"a speed of {speed:.1f} m/s"
     if gyro > 2.0 * MOST_GYRO_BIAS or accel > 2.0 * MOST_ACCEL_BIAS:
