@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import exact_sturm
 from perch_core import bernstein
 from perch_core.flatness import flat_to_state
 from perch_core.vehicle import GRAVITY
@@ -17,9 +16,6 @@ from perch_planner import bounds, plan_checks
 from perch_planner.body_rate_bound import rate_coarse_bound, rate_maximum, rate_parts
 from perch_planner.paper import sturm
 from perch_planner.plan_checks import specific_force
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "oracles"))
-import exact_sturm  # noqa: E402
 
 seeds = st.integers(0, 2**31 - 1)
 

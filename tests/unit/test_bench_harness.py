@@ -9,11 +9,9 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import harness
+import machine
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
-import harness  # noqa: E402
-import machine  # noqa: E402
 
 
 def test_bars_are_judged_by_their_statistic():

@@ -1,13 +1,11 @@
 """What the how-to guides show is valid: files load, commands are accepted, the Python examples fly."""
 
-import importlib
 import re
 import shlex
-import sys
 from pathlib import Path
 
 import pytest
-
+import start_stack
 from perch_core.tag_board import load_board
 from perch_eval import comparison, demo, soak
 from perch_eval.campaign import command as campaign
@@ -19,27 +17,10 @@ from perch_eval.recordings import sensors_command
 from perch_eval.replay import command as replay
 from perch_sim.scenario import load_scenario
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
-
-def start_stack():
-    """start_stack.py, which is a script and not in a package."""
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        return importlib.import_module("start_stack")
-    finally:
-        sys.path.remove(str(SCRIPTS))
-
-
-def start_stack_parser():
-    """Its command line."""
-    return start_stack().command_line()
-
-
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
 PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
-           "start_stack.py": start_stack_parser, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser,
+           "start_stack.py": start_stack.command_line, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser,
            "soak.py": soak.parser, "compare.py": comparison.parser}
 
 
@@ -92,10 +73,9 @@ def test_links_lead_somewhere():
 
 
 def test_stacks_that_start_in_the_same_second_have_logs_of_their_own(monkeypatch):
-    script = start_stack()
-    monkeypatch.setattr(script.time, "strftime", lambda _: "20260101-120000")
+    monkeypatch.setattr(start_stack.time, "strftime", lambda _: "20260101-120000")
     folders = []
     for process in (1, 2):
-        monkeypatch.setattr(script.os, "getpid", lambda: process)  # noqa: B023 (called in this turn)
-        folders.append(script.own_folder())
+        monkeypatch.setattr(start_stack.os, "getpid", lambda: process)  # noqa: B023 (called in this turn)
+        folders.append(start_stack.own_folder())
     assert folders[0] != folders[1]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +14,7 @@ from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
 from perch_planner.refusals import PerchRefusal
 from perch_planner.verifier import verify
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
-from random_perches import random_problem, requirements, shipped_settings  # noqa: E402
+from random_perches import random_problem, requirements, shipped_settings
 
 VEHICLE = load_vehicle("snapdragon")
 HOVER = StartState((0.0, 0.0, 1.5))

@@ -16,10 +16,9 @@ from perch_core.vehicle import load_vehicle
 from perch_planner.planner import plan
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.verifier import verify
+from random_perches import requirements
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "bench"))
-from random_perches import requirements  # noqa: E402
 
 VEHICLE = load_vehicle("snapdragon")
 PROBLEM = PerchProblem(StartState((0.0, 0.0, 1.5)), PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), np.radians(70.0)),

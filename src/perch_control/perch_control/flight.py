@@ -95,7 +95,7 @@ class FlightController:
     @property
     def thrust_ratio(self) -> float:
         """Thrust / mass that a perch would be flown with, over the vehicle file's."""
-        return self.health.believed if self.compensator is None else self.health.adoptable
+        return self._thrust.ratio(self.compensator)
 
     @property
     def blind(self) -> bool:
@@ -175,7 +175,7 @@ class FlightController:
         check_joints(order.source.trajectory)
         check_start(order, x.now, x.expected(max(order.start, x.now)))
         if order.at_end is AtEnd.CONTACT:
-            if x.mode is State.HOVERING and self.compensator is not None:
+            if x.mode is State.HOVERING:
                 x = self.flown = self._thrust.adopted(x, self.law, self.compensator)
             self.law.check_contact(order.source)
         self._schedule.put(order)

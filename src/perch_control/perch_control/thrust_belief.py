@@ -43,13 +43,17 @@ class ThrustBelief:
             return self._believed(x, law, compensator)
         return x
 
+    def ratio(self, compensator: L1Augmentation | None) -> float:
+        """Thrust / mass that a contact would be flown with, over the vehicle file's: what `adopted` would believe."""
+        return self.health.believed if compensator is None else self.health.adoptable
+
     def adopted(self, x: FlightState, law: Law, compensator: L1Augmentation | None) -> FlightState:
         """Before a contact: what L1 makes up for in hover because thrust / mass is not the file's belongs to the thrust.
 
         As an acceleration it would be wrong as soon as the vehicle tilts and the thrust changes, and too fast for any filter.
         """
         before = self.health.believed
-        if not self.health.adopt():
+        if compensator is None or not self.health.adopt():
             return x
         explained = (self.health.believed - before) * self._promised(x)
         x = self._believed(x, law, compensator, scale(explained, axes_of(x.belief[6:10])[2]))

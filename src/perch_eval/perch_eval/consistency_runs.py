@@ -23,7 +23,7 @@ from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
 from perch_eval.evaluation.document import machine
-from perch_eval.revision import commit, digest
+from perch_eval.revision import made_of
 from perch_eval.target_sightings import Sightings, see_target
 from perch_sim.scenario import load_scenario
 
@@ -114,7 +114,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _judge(arguments: argparse.Namespace) -> int:
-    out, code = output_folder(arguments.out), {"commit": commit(), "digest": digest(), "machine": machine(), "first_seed": arguments.first_seed}
+    out, code = output_folder(arguments.out), {**made_of(), "machine": machine(), "first_seed": arguments.first_seed}
     results, summary = run(arguments.scenario, arguments.runs, arguments.first_seed)
     summary = code | summary
     (out / "consistency.json").write_text(json.dumps(summary, indent=2))

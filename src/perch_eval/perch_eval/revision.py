@@ -44,6 +44,11 @@ def digest() -> str:
     return total.hexdigest()[:12] if names else ""
 
 
+def made_of() -> dict[str, str]:
+    """The first entries of a file of results: which code they are of."""
+    return {"commit": commit(), "digest": digest()}
+
+
 def banner(commits: str) -> str:
     """First lines of a page of results: its commits, whether they are older than the code, and how to see the changes.
 

@@ -243,16 +243,13 @@ def prove_rate(forces: Array, squares: Array, jerks: Array, yaw: Array, duration
         forces, squares, jerks, yaw, durations: of all segments, as for `rate_parts`.
         coarse: of `rate_coarse_bound`, shape (f,) [rad/s].
         limit: of the rate [rad/s].
-        sampled: a rate that the plan is known to attain [rad/s].
+        sampled: a rate below the limit that the plan is known to attain [rad/s].
 
     Returns:
         (proved, doubt, doubt_at, found, found_at): the proved bound, or infinity and segment and place where the limit is in
-        doubt (segment -1: none, or `sampled` breaks it); segment and place of a rate above the sampled one, segment -1
-        where there is none.
+        doubt; segment and place of a rate above the sampled one; segments are -1 where there is none.
     """
     found, found_at = -1, 0.0
-    if sampled >= limit:
-        return np.inf, -1, 0.0, found, found_at
     attained, most = sampled, sampled
     for i in range(len(durations)):
         proved = coarse[i]

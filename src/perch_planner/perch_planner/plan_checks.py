@@ -237,12 +237,14 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
     out[CLEARANCE, MINIMUM], i, place = prove_clearance(distances, forces, squares, s3, extension, clearance, gap_wanted)
     if i >= 0:
         _doubt(where, CLEARANCE, i, place)
-    out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,
-                                                                    rate_wanted)
-    if out[BODY_RATE, MAXIMUM] > rate:
-        _doubt(where, BODY_RATE, max(i, 0), place)
-    if found >= 0:
-        out[BODY_RATE, MAXIMUM_AT] = begins[found] + found_at * durations[found]
+    out[BODY_RATE, MAXIMUM] = np.inf
+    if rate_wanted < rate:  # else a sample is too fast
+        out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,
+                                                                        rate_wanted)
+        if i >= 0:
+            _doubt(where, BODY_RATE, i, place)
+        if found >= 0:
+            out[BODY_RATE, MAXIMUM_AT] = begins[found] + found_at * durations[found]
     holds = True
     for k in range(5):
         if where[k, 0] >= 0.0:

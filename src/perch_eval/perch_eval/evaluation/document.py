@@ -10,14 +10,14 @@ from typing import Any
 
 from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, VACUOUS, Effort, Section
 from perch_eval.page import finite
-from perch_eval.revision import banner, commit, digest
+from perch_eval.revision import banner, commit, made_of
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}
 
 
 def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
     """Write `README.md` and `results.json` into the folder of the figures."""
-    content = {"commit": commit(), "digest": digest(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
+    content = {**made_of(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
     write_page(effort, "README", _page(sections, duration), content, "results")
