@@ -16,6 +16,8 @@ from perch_core.components import (
 )
 from perch_core.errors import PerchError
 
+_E3 = np.array([0.0, 0.0, 1.0])
+_LEVEL_LEAST = 0.1      # sine of a line's angle from the vertical, below which a tilt about it means nothing
 ACTIVATION_RAMP = 0.02  # length over which the end of a segment fades in [m]
 _STEEPNESS = float(np.arctanh(0.98))  # tanh reaches 1 % and 99 % at the ends of the ramp
 
@@ -83,6 +85,32 @@ def segment_distance(a: Segment, b: Segment) -> float:
         if abs(s) <= a.half_length and abs(t) <= b.half_length:
             return float(np.linalg.norm(a.centre + s * a.direction - b.centre - t * b.direction))
     return float(min([a.distance(end) for end in candidates] + [b.distance(end) for end in a.ends]))
+
+
+def perch_normal(line: Segment, point: Array, pitch: float, side_W: Array) -> Array:
+    """Direction of b3 at a perch on a line, unit, shape (3,).
+
+    It starts from the direction that is nearest to the vertical and square to the line, and leans by `pitch` towards the side of
+    `side_W`: 0 hangs the line under a level vehicle, pi under one that is upside down.
+
+    Args:
+        line: the line to grip.
+        point: of the line in W [m], shape (3,).
+        pitch: tilt about the line, in [0, pi] [rad].
+        side_W: a point in W on the side that the vehicle comes from [m], shape (3,).
+
+    Raises:
+        PerchError: a vertical line.
+    """
+    up = _E3 - (_E3 @ line.direction) * line.direction
+    if np.linalg.norm(up) < _LEVEL_LEAST:
+        raise PerchError(f"line {line.id} is vertical: a pitch about it means nothing")
+    up = up / np.linalg.norm(up)
+    side = np.cross(line.direction, up)
+    if (np.asarray(side_W, float) - point) @ side < 0:
+        side = -side
+    normal: Array = np.cos(pitch) * up + np.sin(pitch) * side
+    return normal
 
 
 def scaled_line(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, radii: Vector) -> tuple[Vector, Vector]:

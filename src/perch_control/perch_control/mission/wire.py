@@ -19,7 +19,7 @@ MAPPING_LEGS = 3     # moves of the pattern before a plan: up, nearer, down; per
 class LineMission(MissionMachine):
     """What is done at a mapped powerline: the lines are looked at from several places first."""
 
-    unseen = "no lines mapped"
+    unseen = "no line mapped near the goal's point, or a vertical one"
 
     def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
         """The place on the mapped line that the goal means."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perch_core import so3
-from perch_core.errors import PlanningRefusal
-from perch_core.lines import Segment
+from perch_core.errors import PerchError, PlanningRefusal
+from perch_core.lines import Segment, perch_normal
 
 E3 = np.array([0.0, 0.0, 1.0])
 
@@ -48,10 +48,7 @@ class PerchPose:
     @classmethod
     def on_line(cls, line: Segment, point: np.ndarray, pitch: float, offset: float, side_W: np.ndarray,
                 v_W: np.ndarray | None = None) -> PerchPose:
-        """From a point of a line and a pitch about it.
-
-        b3 starts from the direction that is nearest to the vertical and square to the line, and leans by `pitch` towards
-        the side of `side_W`: 0 hangs the line under a level vehicle, pi under one that is upside down.
+        """From a point of a line and a pitch about it, see `perch_core.lines.perch_normal`.
 
         Args:
             line: the line to grip.
@@ -67,15 +64,10 @@ class PerchPose:
         if not 0.0 <= pitch <= np.pi + 1e-9:
             raise PlanningRefusal("bad_input", "perch pitch", -1.0, f"perch pitch {pitch:g} rad is outside [0, pi]")
         grip = line.closest_point(np.array(point, float))
-        up = E3 - (E3 @ line.direction) * line.direction
-        if np.linalg.norm(up) < 0.1:
-            raise PlanningRefusal("bad_input", "perch pitch", -1.0,
-                                  f"line {line.id} is vertical: a pitch about it means nothing; give a pose")
-        up = up / np.linalg.norm(up)
-        side = np.cross(line.direction, up)
-        if (np.asarray(side_W, float) - grip) @ side < 0:
-            side = -side
-        s3_W = np.cos(pitch) * up + np.sin(pitch) * side
+        try:
+            s3_W = perch_normal(line, grip, pitch, side_W)
+        except PerchError as error:
+            raise PlanningRefusal("bad_input", "perch pitch", -1.0, f"{error}; give a pose") from error
         return cls(grip + offset * s3_W, s3_W, np.zeros(3) if v_W is None else np.array(v_W, float))
 
     def tilt(self) -> float:

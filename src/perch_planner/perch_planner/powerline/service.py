@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.errors import ConfigError, PerchError, PlanningRefusal
 from perch_core.lines import Segment
 from perch_core.rotor_model import P, THRUST, V, W, RotorModel, hover_state
-from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePlanRequest, limits, seconds
+from perch_core.values import AtEnd, PowerlinePlan, PowerlinePlanRequest, limits, seconds
 from perch_planner.powerline import plan
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 
@@ -62,7 +62,7 @@ def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offse
     start[V], start[W] = request.v, request.w
     if len(request.rotor_thrust):
         start[THRUST] = request.rotor_thrust
-    lines = tuple(_segment(line) for line in request.lines)
+    lines = tuple(line.segment for line in request.lines)
     wanted = PowerlineRequest(start, lines, int(request.target_line), None, bool(request.perception_aware), bool(request.with_recovery),
                               bool(request.recovery_only))
     if request.recovery_only:
@@ -74,10 +74,6 @@ def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offse
         _near(target, np.asarray(request.perch_point, float))
         perch = PerchPose.on_line(target, request.perch_point, float(request.perch_pitch), wire_offset, start[P], request.end_velocity)
     return replace(wanted, perch=perch)
-
-
-def _segment(line: MappedPowerline) -> Segment:
-    return Segment.between(np.array(line.start), np.array(line.end), float(line.radius), int(line.id))
 
 
 def _near(target: Segment, point: np.ndarray) -> None:
