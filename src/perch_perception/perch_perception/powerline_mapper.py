@@ -10,10 +10,10 @@ from perch_core import config
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Output
 from perch_core.covariance import largest_sigma
-from perch_core.values import CameraImage, MappedPowerline, PowerlineMap, nanoseconds
+from perch_core.values import CameraImage, PowerlineMap
 from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, mono_image, rgb_image
-from perch_perception.line_mapping import Backdrop, LineDetectionConfig, LineMap, LineMapper, MapperConfig, detect_lines, place
+from perch_perception.line_mapping import Backdrop, LineDetectionConfig, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.sensor_file import mount_rotation, sensors_parameter
 
@@ -74,20 +74,20 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
         if exposed - self._used < 1.0 / self.config.rate - 1e-3:
             return
         self._used = exposed
-        mount, problem = self.mounted.known, ""
+        mount = self.mounted.known
         try:
             body = mapping_pose(self.bodies, exposed, MOST_POSE_SIGMA)
             pixels = self._pixels(image, mount.camera)
             sightings = detect_lines(pixels, mount.camera, self.config.detection)
             if self._backdrop is not None:
                 self._backdrop.look(pixels, exposed, *mount.pose(body.p_WB - body.corrected, body.R_WB))
-            lines = self._mapper.update(exposed, body, [place(one, body, mount) for one in sightings],
-                                        self._backdrop.attached if self._backdrop is not None else None)
+            told = self._mapper.update(exposed, body, [place(one, body, mount) for one in sightings],
+                                       self._backdrop.attached if self._backdrop is not None else None)
             self._images += 1
         except (ImageError, StampError) as error:
-            lines, problem = self._mapper.map(exposed), str(error)
-            self.warn(f"{self._topic}: {problem}", 1.0)
-        told = map_value(lines, exposed, problem)
+            told = self._mapper.map(exposed)
+            told = told._replace(message=f"{error}; {told.message}" if told.message else str(error))
+            self.warn(f"{self._topic}: {error}", 1.0)
         self.powerlines(told)
         if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD or exposed < self._diagnosed:
             self._diagnosed = exposed
@@ -106,21 +106,3 @@ def mapping_pose(poses: PoseBuffer, exposed: float, max_sigma: float) -> BodySta
     if sigma > max_sigma:
         raise StampError(f"the odometry is known to {sigma:.2f} m only: nothing is mapped")
     return body
-
-
-def map_value(lines: LineMap, exposed: float, problem: str = "") -> PowerlineMap:
-    """The map as it is told.
-
-    Args:
-        lines: what is known.
-        exposed: middle of the last image's exposure [s].
-        problem: why that image was not used; empty when it was.
-    """
-    segments = []
-    for line in lines.lines:
-        start, end = line.segment.ends
-        segments.append(MappedPowerline(
-            int(line.segment.id), tuple(map(float, start)), tuple(map(float, end)), float(line.segment.radius),
-            line.covariance.astype(float), float(line.direction_sigma), int(line.observations)))
-    return PowerlineMap(nanoseconds(exposed), tuple(segments), bool(lines.degenerate),
-                        "; ".join(part for part in (problem, lines.message) if part))

@@ -3,11 +3,10 @@
 from perch_perception.line_mapping.backdrop import Backdrop
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.detection import LineDetectionConfig, LineSighting, detect_lines
-from perch_perception.line_mapping.mapper import LineMap, LineMapper, MappedLine, MapperConfig
+from perch_perception.line_mapping.mapper import LineMapper, MapperConfig
 from perch_perception.line_mapping.observation import LineObservation, place
 from perch_perception.line_mapping.triangulation import (
     DegenerateBaseline, TriangulationConfig, WireEstimate, triangulate)
 
-__all__ = ["Backdrop", "DegenerateBaseline", "LineDetectionConfig", "LineMap", "LineMapper", "LineObservation", "LineSighting",
-           "MappedLine", "MapperConfig", "TriangulationConfig", "WireCurve", "WireEstimate", "detect_lines", "place",
-           "triangulate"]
+__all__ = ["Backdrop", "DegenerateBaseline", "LineDetectionConfig", "LineMapper", "LineObservation", "LineSighting", "MapperConfig",
+           "TriangulationConfig", "WireCurve", "WireEstimate", "detect_lines", "place", "triangulate"]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from collections.abc import Sequence
 
 import numpy as np
 
 from perch_core import config, so3
 from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
+from perch_core.values import MappedPowerline, PowerlineMap, nanoseconds
 from perch_perception.line_mapping.association import associate
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
@@ -36,40 +36,6 @@ class MapperConfig:
 
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
-
-
-@dataclass(frozen=True)
-class MappedLine:
-    """One straight segment of the map.
-
-    Attributes:
-        segment: ends, radius and id.
-        covariance: of the segment's middle, across the wire [m^2], shape (3, 3).
-        direction_sigma: [rad].
-        observations: sightings that it rests on.
-    """
-
-    segment: Segment
-    covariance: np.ndarray
-    direction_sigma: float
-    observations: int
-
-
-@dataclass(frozen=True)
-class LineMap:
-    """What is known of the wires.
-
-    Attributes:
-        time: of the last image [s].
-        lines: segments, by id.
-        degenerate: some wire that is being followed is not determined by the motion so far.
-        message: what is missing, for people; empty when nothing is.
-    """
-
-    time: float
-    lines: tuple[MappedLine, ...]
-    degenerate: bool
-    message: str
 
 
 @dataclass
@@ -99,7 +65,7 @@ class LineMapper:
         self._corrected = np.zeros(3)
 
     def update(self, time: float, body: BodyState, seen: Sequence[LineObservation],
-               attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> LineMap:
+               attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> PowerlineMap:
         """Take the sightings of one image.
 
         Args:
@@ -142,9 +108,9 @@ class LineMapper:
                 verdict = attached(one, track.estimate.curve)
                 track.attached += 0 if verdict is None else 1 if verdict else -1
 
-    def map(self, time: float) -> LineMap:
-        """The present map."""
-        lines: list[MappedLine] = []
+    def map(self, time: float) -> PowerlineMap:
+        """The map at the time of the last image [s]: its lines by id."""
+        lines: list[MappedPowerline] = []
         missing: list[str] = []
         for track in self._tracks:
             if track.count < MIN_OBSERVATIONS or track.attached >= CERTAIN:
@@ -153,7 +119,7 @@ class LineMapper:
                 missing.append(f"line {track.id}: {track.refusal}")
             else:
                 lines += self._segments(track, track.estimate, missing)
-        return LineMap(time, tuple(sorted(lines, key=lambda line: line.segment.id)), bool(missing), "; ".join(missing))
+        return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing))
 
     def _extend(self, track: _Track, one: LineObservation) -> bool:
         """Add a sighting; False where it is from the same place as the last and adds nothing."""
@@ -217,7 +183,7 @@ class LineMapper:
         self._tracks = [t for t in self._tracks if time - t.last.time <= STALE_AFTER
                         or not any(_beside(t, other, SUPERSEDED) for other in fresh)]
 
-    def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedLine]:
+    def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedPowerline]:
         """The wire as chords that stay within `STRAIGHTNESS`; none where it is not known well enough."""
         if track.extent is None:
             missing.append(f"line {track.id}: its ends were not seen yet")
@@ -227,7 +193,7 @@ class LineMapper:
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
         # chords of a parabola leave it by their share of its sag; half of it once they are moved to its middle
         pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * STRAIGHTNESS)))))
-        radius = estimate.radius if np.isfinite(estimate.radius) else self.settings.triangulation.radius
+        radius = float(estimate.radius) if np.isfinite(estimate.radius) else self.settings.triangulation.radius
         lines = []
         for k in range(pieces):
             a, b = low + length * k / pieces, low + length * (k + 1) / pieces
@@ -236,8 +202,9 @@ class LineMapper:
             if sigma > self.settings.max_sigma:
                 missing.append(f"line {track.id}: known to {sigma:.2f} m only")
                 return []
-            lines.append(MappedLine(_chord(estimate.curve, a, b, radius, track.id + PIECE_IDS * k, self._corrected), covariance,
-                                    self._direction_sigma(estimate), track.count))
+            start, end = _chord(estimate.curve, a, b, radius, self._corrected).ends
+            lines.append(MappedPowerline(track.id + PIECE_IDS * k, tuple(start.tolist()), tuple(end.tolist()), radius, covariance,
+                                         self._direction_sigma(estimate), track.count))
         return lines
 
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
@@ -256,11 +223,11 @@ class LineMapper:
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
 
 
-def _chord(curve: WireCurve, a: float, b: float, radius: float, id: int, offset: np.ndarray) -> Segment:
+def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarray) -> Segment:
     """The straight piece nearest to the wire between a and b: the chord, moved by a third of the sag's two thirds, and by `offset` (3,) [m]."""
     lift = -curve.curvature * (b - a) ** 2 / 12.0  # mean of the parabola below its chord
     shift = lift * curve.axes[:, 1] + offset
-    return Segment.between(curve.at(a) + shift, curve.at(b) + shift, radius, id)
+    return Segment.between(curve.at(a) + shift, curve.at(b) + shift, radius)
 
 
 def _thinned(observations: list[LineObservation]) -> list[LineObservation]:
