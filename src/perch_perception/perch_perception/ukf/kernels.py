@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from perch_core.jit import compiled
+from perch_core.vector3 import quaternion_product
 
 _GRAVITY = 9.81  # numba freezes globals: equal to perch_core.vehicle.GRAVITY, which a test asserts
 
@@ -44,12 +45,9 @@ def advance(x, w0, w1, w2, a0, a1, a2, dt):
     else:
         s = math.sin(0.25 * angle) / angle * dt
     c = math.cos(0.25 * angle)
-    e0, e1, e2 = s * w0, s * w1, s * w2
-    q0, q1, q2, q3 = x[6], x[7], x[8], x[9]
-    m0 = q3 * e0 + c * q0 + q1 * e2 - q2 * e1
-    m1 = q3 * e1 + c * q1 + q2 * e0 - q0 * e2
-    m2 = q3 * e2 + c * q2 + q0 * e1 - q1 * e0
-    m3 = q3 * c - q0 * e0 - q1 * e1 - q2 * e2
+    half = (s * w0, s * w1, s * w2, c)
+    middle = quaternion_product((x[6], x[7], x[8], x[9]), half)
+    m0, m1, m2, m3 = middle
     t0 = 2.0 * (m1 * a2 - m2 * a1)
     t1 = 2.0 * (m2 * a0 - m0 * a2)
     t2 = 2.0 * (m0 * a1 - m1 * a0)
@@ -62,10 +60,7 @@ def advance(x, w0, w1, w2, a0, a1, a2, dt):
     x[3] += f0 * dt
     x[4] += f1 * dt
     x[5] += f2 * dt
-    n0 = m3 * e0 + c * m0 + m1 * e2 - m2 * e1
-    n1 = m3 * e1 + c * m1 + m2 * e0 - m0 * e2
-    n2 = m3 * e2 + c * m2 + m0 * e1 - m1 * e0
-    n3 = m3 * c - m0 * e0 - m1 * e1 - m2 * e2
+    n0, n1, n2, n3 = quaternion_product(middle, half)
     norm = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2 + n3 * n3)
     x[6] = n0 * norm
     x[7] = n1 * norm
@@ -100,12 +95,16 @@ def moved(x, sign, e, y):
     r0, r1, r2 = sign * e[6], sign * e[7], sign * e[8]
     angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
     f = 0.5 - angle * angle / 48.0 if angle < 1e-5 else math.sin(0.5 * angle) / angle
-    c = math.cos(0.5 * angle)
-    e0, e1, e2 = f * r0, f * r1, f * r2
-    y[6] = x[9] * e0 + c * x[6] + x[7] * e2 - x[8] * e1
-    y[7] = x[9] * e1 + c * x[7] + x[8] * e0 - x[6] * e2
-    y[8] = x[9] * e2 + c * x[8] + x[6] * e1 - x[7] * e0
-    y[9] = x[9] * c - x[6] * e0 - x[7] * e1 - x[8] * e2
+    y[6], y[7], y[8], y[9] = quaternion_product((x[6], x[7], x[8], x[9]), (f * r0, f * r1, f * r2, math.cos(0.5 * angle)))
+
+
+@compiled
+def rotation_vector(q):
+    """Logarithm of a unit quaternion xyzw, of the shorter rotation."""
+    sign = -1.0 if q[3] < 0.0 else 1.0
+    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    f = sign * (2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, sign * q[3]) / sine)
+    return (f * q[0], f * q[1], f * q[2])
 
 
 @compiled
@@ -136,23 +135,12 @@ def unscented_run(x, P, imu, scale, wm0, wc0, wi, x_out, P_out):
     # errors about the centre point's result; the centre's own error is zero
     D = np.zeros((points, n))
     mean = np.zeros(n)
+    back = (-Y[0, 6], -Y[0, 7], -Y[0, 8], Y[0, 9])
     for s in range(1, points):
         for i in range(6):
             D[s, i] = Y[s, i] - Y[0, i]
             D[s, 9 + i] = Y[s, 10 + i] - Y[0, 10 + i]
-        a0, a1, a2, a3 = -Y[0, 6], -Y[0, 7], -Y[0, 8], Y[0, 9]
-        b0, b1, b2, b3 = Y[s, 6], Y[s, 7], Y[s, 8], Y[s, 9]
-        d0 = a3 * b0 + b3 * a0 + a1 * b2 - a2 * b1
-        d1 = a3 * b1 + b3 * a1 + a2 * b0 - a0 * b2
-        d2 = a3 * b2 + b3 * a2 + a0 * b1 - a1 * b0
-        d3 = a3 * b3 - a0 * b0 - a1 * b1 - a2 * b2
-        if d3 < 0.0:
-            d0, d1, d2, d3 = -d0, -d1, -d2, -d3
-        sine = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        f = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, d3) / sine
-        D[s, 6] = f * d0
-        D[s, 7] = f * d1
-        D[s, 8] = f * d2
+        D[s, 6], D[s, 7], D[s, 8] = rotation_vector(quaternion_product(back, (Y[s, 6], Y[s, 7], Y[s, 8], Y[s, 9])))
         for i in range(n):
             mean[i] += wi * D[s, i]
     for i in range(n):

@@ -99,7 +99,8 @@ class UnscentedTransform:
                 raise CovarianceError(f"covariance at {belief.stamp} ns is not positive definite")
         else:
             x, P = self.predict_vectorised(belief.x, belief.P, run)
-        self._add_process_noise(run, P)
+        imu = self.config.imu
+        update_kernels.add_process_noise(run, imu.gyro_bias_walk**2, imu.accel_bias_walk**2, P)
         return Belief(stamp, x, P)
 
     def predict_vectorised(self, x: np.ndarray, P: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,20 +121,6 @@ class UnscentedTransform:
         mean = self.Wm @ deviations
         centred = deviations - mean
         return at.plus(points[0], mean), (centred * self.Wc[:, None]).T @ centred
-
-    def process_noise(self, run: np.ndarray) -> np.ndarray:
-        """Covariance that a run's IMU noise and bias walks add, shape (15, 15).
-
-        White noise of each sample: attitude sum(s_g^2 dt^2), velocity sum(s_a^2 dt^2) =: q, which the double
-        integral carries into the position as q T^2/3 and q T/2. Couplings of higher order in T (40 ms) are left out.
-        """
-        Q = np.zeros((at.ERROR_SIZE, at.ERROR_SIZE))
-        self._add_process_noise(run, Q)
-        return Q
-
-    def _add_process_noise(self, run: np.ndarray, P: np.ndarray) -> None:
-        imu = self.config.imu
-        update_kernels.add_process_noise(run, imu.gyro_bias_walk**2, imu.accel_bias_walk**2, P)
 
     def innovate(self, belief: Belief, pose: VioPose, R: np.ndarray) -> Innovation:
         """Innovation and gain for a pose, and with it a velocity, at the belief's time.

@@ -11,23 +11,14 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, norm, quaternion_product
-from perch_perception.ukf.kernels import cholesky, moved
-
-
-@compiled
-def _rotation_vector(q):
-    """Logarithm of a unit quaternion xyzw, of the shorter rotation."""
-    sign = -1.0 if q[3] < 0.0 else 1.0
-    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    f = sign * (2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, sign * q[3]) / sine)
-    return (f * q[0], f * q[1], f * q[2])
+from perch_perception.ukf.kernels import cholesky, moved, rotation_vector
 
 
 @compiled
 def _seen(x, back, z):
     """What a measurement of the nominal state x (16,) would be, z (6,) or (9,), with the attitude about the inverse of `back`."""
     q = (x[6], x[7], x[8], x[9])
-    turn = _rotation_vector(quaternion_product(q, back))
+    turn = rotation_vector(quaternion_product(q, back))
     for i in range(3):
         z[i] = x[i]
         z[3 + i] = turn[i]
@@ -70,7 +61,7 @@ def innovate(x, P, measured, R, scale, wm0, wc0, wi, residual, S, gain):
     for s in range(2 * n + 1):
         moved(x, 0.0 if s == 0 else (1.0 if s <= n else -1.0), columns[(s - 1) % n], y)
         _seen(y, back, Z[s])
-    turn = _rotation_vector(quaternion_product((measured[3], measured[4], measured[5], measured[6]), back))
+    turn = rotation_vector(quaternion_product((measured[3], measured[4], measured[5], measured[6]), back))
     for i in range(m):
         mean = wm0 * Z[0, i]
         for s in range(1, 2 * n + 1):
@@ -155,7 +146,11 @@ def _solve(L, y):
 
 @compiled
 def add_process_noise(run, gyro_walk2, accel_walk2, P):
-    """Add to P (15, 15) what a run's IMU noise and bias walks do, see `UnscentedTransform.process_noise`."""
+    """Add to P (15, 15) what the noise and the bias walks of a run of IMU steps (m, 9) do.
+
+    White noise of each sample: attitude sum(s_g^2 dt^2), velocity sum(s_a^2 dt^2) =: q, which the double integral carries into the
+    position as q T^2/3 and q T/2. Couplings of higher order in T (40 ms) are left out.
+    """
     T, q, turn = 0.0, 0.0, 0.0
     for k in range(run.shape[0]):
         dt = run[k, 0]
