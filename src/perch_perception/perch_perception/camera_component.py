@@ -160,7 +160,7 @@ class LocatedCameraComponent(CameraComponent[C]):
         self._begin()
 
     def _begin(self) -> None:
-        self.bodies = PoseBuffer(reach=0.0)
+        self.bodies = PoseBuffer()
         self._last = -math.inf  # exposure of the last image used
 
     @abstractmethod

@@ -19,6 +19,7 @@ from perch_core.values import limits
 
 SLOW = 1.0  # speed up to which the odometry's position is smoother than the integral of its velocity [m/s]
 _COVARIANCE = limits.Covariance(6)  # at 500 Hz its variances alone are looked at
+SPAN = 1.0  # how much history is kept [s]
 MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
 
 
@@ -56,15 +57,9 @@ class BodyState:
 
 
 class PoseBuffer:
-    """The last states, by time.
+    """The states of the last `SPAN` seconds, by time."""
 
-    Args:
-        span: how much history is kept [s].
-        reach: a stamp this much newer than the newest state is answered by moving on at constant velocity [s].
-    """
-
-    def __init__(self, span: float = 1.0, reach: float = 0.004) -> None:
-        self._span, self._reach = span, reach
+    def __init__(self) -> None:
         self._states: deque[BodyState] = deque()
         self._times: deque[float] = deque()
         self._corrected: deque[np.ndarray] = deque()
@@ -87,7 +82,7 @@ class PoseBuffer:
         self._corrected.append(self._correction(state))
         self._states.append(state)
         self._times.append(state.time)
-        while self._times[-1] - self._times[0] > self._span:
+        while self._times[-1] - self._times[0] > SPAN:
             self._times.popleft()
             self._states.popleft()
             self._corrected.popleft()
@@ -108,12 +103,10 @@ class PoseBuffer:
         if not self._times:
             raise StampError("no odometry yet")
         newest, oldest = self._times[-1], self._times[0]
-        if time > newest + self._reach:
+        if time > newest:
             raise StampError(f"stamp {time:.4f} s is {1e3 * (time - newest):.1f} ms ahead of the odometry")
         if time < oldest:
             raise StampError(f"stamp {time:.4f} s is {1e3 * (oldest - time):.1f} ms older than the odometry kept")
-        if time >= newest:
-            return replace(_moved(self._states[-1], time), corrected=self._corrected[-1])
         right = bisect_left(self._times, time)
         if self._times[right] == time:
             return replace(self._states[right], corrected=self._corrected[right])
@@ -138,19 +131,11 @@ class PoseBuffer:
 
 
 def _between(a: BodyState, b: BodyState, share: float) -> BodyState:
-    turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(a.q_WB), b.q_WB))
     return BodyState(
         time=a.time + share * (b.time - a.time),
         p_WB=a.p_WB + share * (b.p_WB - a.p_WB),
-        q_WB=so3.quat_multiply(a.q_WB, so3.quat_exp(share * turn)),
+        q_WB=so3.quat_slerp(a.q_WB, b.q_WB, share),
         v_WB=a.v_WB + share * (b.v_WB - a.v_WB),
         w_WB_B=a.w_WB_B + share * (b.w_WB_B - a.w_WB_B),
         covariance=a.covariance + share * (b.covariance - a.covariance),
     )
-
-
-def _moved(state: BodyState, time: float) -> BodyState:
-    dt = time - state.time
-    return BodyState(time, state.p_WB + dt * state.v_WB,
-                     so3.quat_multiply(state.q_WB, so3.quat_exp(dt * state.w_WB_B)),
-                     state.v_WB, state.w_WB_B, state.covariance)

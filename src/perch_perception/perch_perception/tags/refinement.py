@@ -39,27 +39,21 @@ class RefinedCorners:
         rays_C: unit rays in C, shape (n, 4, 3).
         sigma: 1-sigma of each corner along each image axis [px], shape (n, 4).
         measured: corners both of whose edges were measured, shape (n, 4); the others are where the detector saw them.
-        valid: tags whose four corners were measured, shape (n,).
     """
 
     rays_C: np.ndarray
     sigma: np.ndarray
     measured: np.ndarray
 
-    @property
-    def valid(self) -> np.ndarray:
-        return np.asarray(self.measured.all(axis=1))
 
-
-def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, rounds: int = 2,
-                   origin: tuple[int, int] = (0, 0), modules: int = 8) -> RefinedCorners:
+def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, origin: tuple[int, int] = (0, 0),
+                   modules: int = 8) -> RefinedCorners:
     """Measure the corners of tags.
 
     Args:
         image: mono8, shape (height, width), or a part of it.
         camera: its lens.
         corners: pixels of the corners (TL, TR, BR, BL) to about 2 px, shape (n, 4, 2).
-        rounds: how often profiles are laid through the improved corners; the first round is the coarse one.
         origin: column and row of the part's first pixel.
         modules: width of a tag between the outer edges of its border.
 
@@ -75,9 +69,9 @@ def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, round
     given = np.where(seen[:, None, None], given, _PLACEHOLDER)
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     measured = np.broadcast_to((seen & (sides.min(axis=1) > MIN_EDGE))[:, None], sides.shape)
-    rays, sigma = given, np.full(sides.shape, DETECTED)
-    for round_ in range(rounds):
-        found, sigma, good = _refine_once(image, origin, camera, rays, modules, coarse=round_ == 0)
+    rays = given
+    for coarse in (True, False):  # then profiles are laid through the improved corners
+        found, sigma, good = _refine_once(image, origin, camera, rays, modules, coarse)
         pixels, inside = camera.project(found)
         moved = np.linalg.norm(np.where(inside[..., None], pixels, np.inf) - corners, axis=2)
         measured = measured & good & (moved < 2.5 + 0.1 * sides.mean(axis=1, keepdims=True))

@@ -248,18 +248,3 @@ class State:
     def window(self) -> tuple[np.ndarray, np.ndarray]:
         """Present estimates of the clones: R_WB (n, 3, 3), p_WB (n, 3)."""
         return np.array([c.R_WB for c in self.clones]), np.array([c.p_WB for c in self.clones])
-
-    def null_space(self) -> np.ndarray:
-        """Directions that no camera or IMU can see: position in W and yaw, shape (size, 4)."""
-        e3, N = np.array([0.0, 0.0, 1.0]), np.zeros((self.size, 4))
-        N[POSITION, :3] = np.eye(3)
-        N[THETA, 3], N[POSITION, 3] = self.R_WB.T @ e3, np.cross(e3, self.p_WB)
-        N[VELOCITY, 3] = np.cross(e3, self.v_WB)
-        for j, c in enumerate(self.clones):
-            k = self.clone_at(j)
-            N[k : k + 3, 3], N[k + 3 : k + 6, 3] = c.R_WB.T @ e3, np.cross(e3, c.p_WB)
-            N[k + 3 : k + 6, :3] = np.eye(3)
-        for i, m in enumerate(self.landmarks.values()):
-            k = self.landmark_start + 3 * i
-            N[k : k + 3, :3], N[k : k + 3, 3] = np.eye(3), np.cross(e3, m.X_W)
-        return N
