@@ -192,7 +192,7 @@ def frames(name: str, seed: int, setting: Setting) -> Iterator[End]:
     truth = Truth(name, rng, setting.imu_rate, setting.duration)
     imu, gyro_bias, accel_bias = _readings(truth, setting, rng)
     c, camera = config.calibration, mount.camera
-    sigma = np.concatenate([_START, np.repeat([c.rotation / np.sqrt(3.0), c.translation], 3),
+    sigma = np.concatenate([_START, np.repeat([c.rotation, c.translation], 3),
                             [c.time_offset, c.focal, c.focal, c.centre / camera.fx, c.centre / camera.fy]])
     e = rng.normal(size=at.CORE_SIZE) * sigma
     e[at.INERTIAL_SIZE:] *= setting.calibrated

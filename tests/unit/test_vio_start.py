@@ -35,7 +35,7 @@ def begin(name, seed, give_up=3.5):
     buffer = ImuBuffer(imu, 8.0)
     for k in range(-1, n):
         buffer.add(ImuSample(round((k + 1) * h * 1e9), tuple(w[max(k, 0)]), tuple(f[max(k, 0)])))
-    turn, shift, offset = rng.normal(0.0, c.rotation / np.sqrt(3.0), 3), rng.normal(0.0, c.translation, 3), rng.normal(0.0, c.time_offset)
+    turn, shift, offset = rng.normal(0.0, c.rotation, 3), rng.normal(0.0, c.translation, 3), rng.normal(0.0, c.time_offset)
     camera, lens = MOUNT.camera, rng.normal(0.0, 1.0, 4) * [c.focal, c.focal, c.centre, c.centre]
     real = dataclasses.replace(MOUNT, R_BC=MOUNT.R_BC @ so3.exp(turn), p_BC=MOUNT.p_BC + shift, camera=dataclasses.replace(
         camera, fx=camera.fx * (1.0 + lens[0]), fy=camera.fy * (1.0 + lens[1]), cx=camera.cx + lens[2], cy=camera.cy + lens[3]))

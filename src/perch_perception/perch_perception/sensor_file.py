@@ -12,7 +12,6 @@ from perch_core.errors import ConfigError
 from perch_core.sensors import CalibrationSigmas, load_sensors
 from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.ukf.config import ImuNoise
-from perch_perception.vio.config import CalibrationPriors
 
 
 def sensors_parameter() -> str:
@@ -52,10 +51,9 @@ def imu_axes(sensors: str) -> np.ndarray | None:
     return None if imu is None or np.array_equal(imu.R_BI, np.eye(3)) else imu.R_BI
 
 
-def vio_priors(sensors: str, camera: str, given: CalibrationPriors) -> CalibrationPriors:
-    """How well a camera is calibrated, as VIO takes it; what was given where no file is named."""
-    s = _sigmas(sensors, camera)
-    return given if s is None else CalibrationPriors(math.sqrt(3.0) * s.rotation, s.translation, s.time_offset, s.focal, s.centre)
+def vio_priors(sensors: str, camera: str, given: CalibrationSigmas) -> CalibrationSigmas:
+    """How well a camera is calibrated; what was given where no file is named."""
+    return _sigmas(sensors, camera) or given
 
 
 def tag_sigmas(sensors: str, camera: str, given: CalibrationSigma) -> CalibrationSigma:

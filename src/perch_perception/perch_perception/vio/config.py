@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from perch_core.config import derived, part, quantity
+from perch_core.sensors import CalibrationSigmas
 
 from perch_perception.ukf.config import ImuNoise
 
@@ -27,23 +28,8 @@ class FilterConfig:
     slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
 
 
-@dataclass(frozen=True)
-class CalibrationPriors:
-    """1 sigma of what a careful calibration leaves open, where no sensor file says it; zero fixes a quantity.
-
-    Attributes:
-        rotation: camera against IMU, all axes together: 0.5 deg [rad].
-        translation: camera against IMU [m].
-        time_offset: camera against the IMU's clock [s].
-        focal: relative error of each focal length.
-        centre: principal point, per axis [px].
-    """
-
-    rotation: float = 0.0087
-    translation: float = 0.002
-    time_offset: float = 0.002
-    focal: float = 0.003
-    centre: float = 0.5
+# 1 sigma of what a careful calibration leaves open, where no sensor file says it: of the camera's attitude 0.5 deg for all axes together
+CAREFUL = CalibrationSigmas(rotation=0.0087 / 3.0**0.5, translation=0.002, time_offset=0.002, focal=0.003, centre=0.5)
 
 
 @dataclass(frozen=True)
@@ -51,6 +37,6 @@ class VioConfig:
     """Visual-inertial odometry."""
 
     imu: ImuNoise = derived(ImuNoise())
-    calibration: CalibrationPriors = derived(CalibrationPriors())
+    calibration: CalibrationSigmas = derived(CAREFUL)
     tracker: TrackerConfig = part(TrackerConfig)
     filter: FilterConfig = part(FilterConfig)

@@ -64,8 +64,7 @@ def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, p
     W[2, 2], W[3:, 3:] = pose.covariance[3, 3], pose.covariance[:3, :3]
     W[2, 3:] = W[3:, 2] = pose.covariance[3, :3]
     P[:6, :6] = J @ W @ J.T
-    sigma = np.concatenate([np.repeat([velocity_sigma, gyro_sigma, config.imu.accel_bias_init, c.rotation / np.sqrt(3),
-                                       c.translation], 3),
+    sigma = np.concatenate([np.repeat([velocity_sigma, gyro_sigma, config.imu.accel_bias_init, c.rotation, c.translation], 3),
                             [c.time_offset, c.focal, c.focal, c.centre / mount.camera.fx, c.centre / mount.camera.fy]])
     P[6:, 6:] = np.diag(sigma**2)
     return State(stamp, R_WB, pose.p_WB.copy(), v_WB, gyro_bias, np.zeros(3), mount.R_BC.copy(), mount.p_BC.copy(),

@@ -186,7 +186,7 @@ def _prior(config: VioConfig, mount: CameraMount) -> np.ndarray:
     """1 sigma of biases and calibration before, shape (17,)."""
     c, imu = config.calibration, config.imu
     return np.concatenate([
-        np.repeat([imu.gyro_bias_init, imu.accel_bias_init, c.rotation / np.sqrt(3.0), c.translation], 3),
+        np.repeat([imu.gyro_bias_init, imu.accel_bias_init, c.rotation, c.translation], 3),
         [c.time_offset, c.focal, c.focal, c.centre / mount.camera.fx, c.centre / mount.camera.fy]])
 
 
