@@ -20,7 +20,7 @@ from perch_core.errors import PerchError
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.domain import own_domain
-from perch_eval.evaluation.document import machine
+from perch_eval.evaluation.document import machine, table
 from perch_eval.modelled_sight_node import blind_launches, blind_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
 from perch_eval.revision import banner, commit
@@ -210,11 +210,11 @@ def page(folder: Path) -> str:
         text += ["", f"## {file.stem}", "", f"`{run['scenario']}`, seed {run['seed']}, {sight}; {run['commit']}, {run['machine']}.",
                  f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in "
                  f"{run['wall_s'] / 60.0:.1f} min.",
-                 "", "| process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads |", "| --- " * 6 + "|"]
-        for name, of in run["growth"].items():
-            rate = "too few flights" if of["slope_MB_per_100"] is None else f"{of['slope_MB_per_100']:+.2f}"
-            text.append(f"| {name} | {of['rss_first_MB']:.1f} | {of['rss_last_MB']:.1f} | {rate} | " + " | ".join(
-                f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])) + " |")
+                 "", *table("process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads", (
+                     (name, f"{of['rss_first_MB']:.1f}", f"{of['rss_last_MB']:.1f}",
+                      "too few flights" if of["slope_MB_per_100"] is None else f"{of['slope_MB_per_100']:+.2f}",
+                      *(f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])))
+                     for name, of in run["growth"].items()))]
         shared = [flight["shared"] for flight in run["flights"]]
         bad = [f"* {problem}" for problem in run["problems"]]
         verdict = ["Not as it should be:", "", *bad] if bad else ["All as it should be."]

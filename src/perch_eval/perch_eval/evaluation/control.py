@@ -11,7 +11,7 @@ import numpy as np
 
 from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, Fault, fly_fault
-from perch_eval.evaluation.document import write_page
+from perch_eval.evaluation.document import table, write_page
 from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
 
@@ -32,21 +32,21 @@ def fault_sections(effort: Effort) -> list[Section]:
                   f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
                   "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth. "
                   "Every flight: faults.md.")
-    table = ["| fault | " + " | ".join(ENDINGS) + f" | of these {NO_WAY} | touched the wall |", "| --- " * (len(ENDINGS) + 3) + "|"]
-    bad = []
+    rows, bad = [], []
     for fault in FAULTS:
         own = [r for r in flown if r["fault"] == fault.name]
         ends, touched = Counter(r["end"] for r in own), sum(bool(r["touched"]) and r["end"] in END_STATES for r in own)
-        table.append(f"| {fault.name}: {fault.about} | " + " | ".join(str(ends[e]) for e in ENDINGS) + f" | {sum(map(_no_way_out, own))} | {touched} |")
         safe = sum(ends[e] for e in END_STATES)
         without = sum(_no_way_out(r) for r in own)
+        rows.append((f"{fault.name}: {fault.about}", *(ends[e] for e in ENDINGS), without, touched))
         out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY}" * bool(without),
                   "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
         bad += [r for r in own if r["end"] not in END_STATES]
     text = ["# Faults in flight", "", out.about, "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
             f"it on the way, and nothing broke; *{NO_WAY}*: from the true state in which the fault left the vehicle, without any delay, rotors at their "
-            "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "", *table, "",
+            "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "",
+            *table(" | ".join(("fault", *ENDINGS, f"of these {NO_WAY}", "touched the wall")), rows), "",
             "## Flights without a good end", ""]
     for r in bad or ():
         height, gap, speed, tilt = r["before"]
@@ -74,10 +74,9 @@ def comparison_sections(effort: Effort) -> list[Section]:
     text = ["# Controllers compared", "", out.about]
     for maneuver in MANEUVERS:
         text += ["", f"## {maneuver.capitalize()}", "", "RMSE x, y, z [cm]; outcome, per seed where they differ.", "",
-                 "| | " + " | ".join(CONTROLLERS) + " |", "| --- " * (len(CONTROLLERS) + 1) + "|"]
-        for condition in CONDITIONS:
-            cells = [_cell([r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == (c, condition, maneuver)]) for c in CONTROLLERS]
-            text.append(f"| {condition} | " + " | ".join(cells) + " |")
+                 *table("| " + " | ".join(CONTROLLERS), (
+                     (k, *(_cell([r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == (c, k, maneuver)]) for c in CONTROLLERS))
+                     for k in CONDITIONS))]
 
     def mean(c: str, condition: str, maneuver: str) -> np.ndarray:
         return _rms([r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == (c, condition, maneuver)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, VACUOUS, Effort, Section
@@ -39,6 +39,15 @@ def counts(sections: Sequence[Section]) -> dict[str, int]:
     return out
 
 
+def table(head: str, rows: Iterable[Sequence[object]]) -> list[str]:
+    """Lines of a table in Markdown: titles of the columns with a bar between each two, and rows of cells, in which bars are escaped."""
+    return [f"| {head} |", "| --- " * (head.count("|") + 1) + "|", *(f"| {' | '.join(map(_cell, row))} |" for row in rows)]
+
+
+def _cell(value: object) -> str:
+    return " ".join(str(value).replace("|", "\\|").split())
+
+
 def machine() -> str:
     """What this runs on."""
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
@@ -58,13 +67,7 @@ def _page(sections: Sequence[Section], duration: float) -> list[str]:
     for section in sections:
         lines += ["", f"## {section.title}", "", section.about, ""]
         if section.rows:
-            lines += ["| | ours | paper | verdict | |", "| --- | --- | --- | --- | --- |"]
-            lines += [f"| {_cell(r.name)} | {_cell(r.ours)} | {_cell(r.paper)} | {_MARK.get(r.verdict, r.verdict)} | {_cell(r.note)} |"
-                      for r in section.rows]
+            lines += table("| ours | paper | verdict |", ((r.name, r.ours, r.paper, _MARK.get(r.verdict, r.verdict), r.note) for r in section.rows))
         for name, caption in section.figures:
             lines += ["", f"![{caption}]({name})", "", f"*{caption}*"]
     return lines
-
-
-def _cell(text: str) -> str:
-    return " ".join(text.replace("|", "\\|").split())

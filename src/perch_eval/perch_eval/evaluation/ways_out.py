@@ -15,7 +15,7 @@ from perch_core.errors import PlanningRefusal
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.aborted import fly_aborted
-from perch_eval.evaluation.document import write_page
+from perch_eval.evaluation.document import table, write_page
 from perch_eval.evaluation.kept import computed
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters
@@ -52,11 +52,11 @@ def sections(effort: Effort) -> list[Section]:
                   f"Each plan is asked {RATE:g} times a second for a way out: a trajectory from its state at that time to a hover, with all limits "
                   f"proved (surfaces) or checked at 1 ms (powerlines). Surfaces: {PLANS} plans each, 1.2 to 3 m away, by the planner as shipped; "
                   f"powerlines: {LINE_PLANS} starts each.")
-    table = ["| plans | " + " | ".join(_span(k) for k in range(len(EDGES))) + " | all |", "| --- " * (len(EDGES) + 2) + "|"]
     jobs = [(name, seed) for name in map(str, INCLINATIONS) for seed in range(1, PLANS + 1)]
     jobs += [(name, seed) for name in LINES for seed in range(1, LINE_PLANS + 1)]
     made = computed(effort, "ways_out", jobs, _planned, lambda r: not r["refused"])
     reasons: Counter[str] = Counter()
+    rows: list[tuple[object, ...]] = []
     for name in (*map(str, INCLINATIONS), *LINES):
         plans = [r for r in made if r["name"] == name]
         instants = [Instant(*pair) for r in plans for pair in r["instants"]]
@@ -66,31 +66,30 @@ def sections(effort: Effort) -> list[Section]:
             cells.append(f"{sum(within)} of {len(within)}" if within else "")
         kept = [not x.refusal for x in instants]
         title = f"{name} deg" if name.isdigit() else name
-        table.append(f"| {title} | " + " | ".join(cells) + f" | {sum(kept)} of {len(kept)} |")
+        rows.append((title, *cells, f"{sum(kept)} of {len(kept)}"))
         reasons.update(f"{title}: {x.refusal}" for x in instants if x.refusal)
         early = [not x.refusal for x in instants if x.left >= SURE]
         out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{sum(early)} of {len(early)}", "",
                   sum(early) >= BAR * len(early) if early else None, f"at least {100 * BAR:g} %")
     flown = computed(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
-    text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "", *table, "", "## Refused", ""]
+    text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
+            *table(" | ".join(("plans", *map(_span, range(len(EDGES))), "all")), rows), "", "## Refused", ""]
     text += [f"* {n}x {reason}" for reason, n in reasons.most_common()] or ["None."]
     text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
-             "plan by a planned way out; *attached*: cancelled too late, the perch went on.", "",
-             "| scenario | n | hovering | of these by a way out | attached | other | least thrust margin | largest body rate [rad/s] |",
-             "| --- " * 8 + "|"]
+             "plan by a planned way out; *attached*: cancelled too late, the perch went on.", ""]
+    rows = []
     for name, n in FLOWN.items():
         own = [r for r in flown if r["scenario"] == name]
         ends = Counter(r["end"] for r in own)
         left = [r for r in own if r["planned"]]
-        text.append(f"| {name} | {n} | {ends['hovering']} | {sum(r['planned'] for r in own if r['end'] == 'hovering')} | {ends['attached']} | "
-                    f"{n - ends['hovering'] - ends['attached']} | {min((r['margin'] for r in left), default=math.nan):.2f} | "
-                    f"{max((r['rate'] for r in left), default=math.nan):.1f} |")
+        rows.append((name, n, ends["hovering"], sum(r["planned"] for r in own if r["end"] == "hovering"), ends["attached"],
+                     n - ends["hovering"] - ends["attached"], f"{min((r['margin'] for r in left), default=math.nan):.2f}",
+                     f"{max((r['rate'] for r in left), default=math.nan):.1f}"))
         out.claim(f"{name}: cancelled on the way", f"{ends['hovering']} hovering, {ends['attached']} attached of {n}", "",
                   ends["hovering"] + ends["attached"] == n, "all")
-    text += ["", "| scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | the mission's words |",
-             "| --- " * 7 + "|"]
-    text += [f"| {r['scenario']} | {r['seed']} | {r['before']:.2f} | {r['end']} | {'yes' if r['planned'] else 'no'} | {r['settled']:.2f} | {r['message']} |"
-             for r in flown]
+    text += table("scenario | n | hovering | of these by a way out | attached | other | least thrust margin | largest body rate [rad/s]", rows)
+    text += ["", *table("scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | the mission's words", (
+        (r["scenario"], r["seed"], f"{r['before']:.2f}", r["end"], "yes" if r["planned"] else "no", f"{r['settled']:.2f}", r["message"]) for r in flown))]
     write_page(effort, "way_out", text, {"plans": made, "flights": flown})
     out.data = {"plans": made, "flights": flown}
     return [out]

@@ -17,7 +17,7 @@ from perch_core.errors import PerchError
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
-from perch_eval.evaluation.document import machine
+from perch_eval.evaluation.document import machine, table
 from perch_eval.fork_server import ForkServer
 from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
@@ -166,18 +166,15 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             "In lockstep a node that hangs is waited for 8 s instead of 60; a plan begins 1.5 s after its request instead of 0.1. The end",
             "is judged by the truth, for a hover by the controller's state, too, when it has lasted for 4 s. *motors off*: on the ground",
             "after a fall, or lying tilted; without a controller nobody else can hold the vehicle.", "",
-            "| fault | what happens |", "| --- | --- |", *(f"| {name} | {about} |" for name, about in FAULTS.items()), "",
+            *table("fault | what happens", FAULTS.items()), "",
             "Messages are disturbed by a relay between publisher and subscribers, which lockstep does not have (its batches go over",
             f"sockets of their own): in real time only. Phases: {', '.join(PHASES)}; messages are disturbed in search and approach, from",
             "then on.", ""]
     for mode in MODES:
         nodes = list(dict.fromkeys(case.node for case in cases() if case.mode == mode))
-        text += [f"## Ends, {mode}", "", "| fault | " + " | ".join(nodes) + " |", "| --- " * (len(nodes) + 1) + "|"]
-        for fault in FAULTS:
-            own = {node: [row for row in rows if (row["fault"], row["node"], row["mode"]) == (fault, node, mode)] for node in nodes}
-            if any(own.values()):
-                text.append(f"| {fault} | " + " | ".join(_ends(own[node]) for node in nodes) + " |")
-        text.append("")
+        ends = [(fault, *(_ends([row for row in rows if (row["fault"], row["node"], row["mode"]) == (fault, node, mode)]) for node in nodes))
+                for fault in FAULTS]
+        text += [f"## Ends, {mode}", "", *table(" | ".join(("fault", *nodes)), (row for row in ends if any(row[1:]))), ""]
     times = sorted(row["named"] for row in struck if row["named"] is not None)
     if times:
         text += [f"Named after: median {times[len(times) // 2]:.1f} s, worst {times[-1]:.1f} s.", ""]
