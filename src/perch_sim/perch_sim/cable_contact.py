@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core import so3
-from perch_core.catenary import Catenary
 from perch_sim.attachment import FREE, Attachment
 from perch_sim.contact_event import ContactEvent, ContactState
 from perch_sim.dynamics import Hold
@@ -37,10 +36,9 @@ class CableLine:
     """A cable as straight pieces."""
 
     def __init__(self, cable: Cable) -> None:
-        hanging = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag)
         # the sagitta of an arc: pieces so short that none is further than MAX_ERROR from the cable
         pieces = math.ceil(math.sqrt(max(1.0, cable.sag / MAX_ERROR)))
-        points = hanging.sample(pieces + 1)
+        points = cable.hanging().sample(pieces + 1)
         self._start, chord = points[:-1], np.diff(points, axis=0)
         self._length = np.linalg.norm(chord, axis=1)
         self._direction = chord / self._length[:, None]

@@ -70,6 +70,10 @@ class Cable:
     radius: float = quantity(0.03, unit="m", low=1e-4, high=1.0)
     colour: str = choice("red", options=("red", "grey"))
 
+    def hanging(self) -> Catenary:
+        """How it truly hangs; a PerchError where it cannot."""
+        return Catenary.from_sag(np.array(self.start), np.array(self.end), self.sag)
+
 
 @dataclass(frozen=True, kw_only=True)
 class World:
@@ -215,7 +219,7 @@ class Scenario:
             if cable.sag > chord:
                 raise ConfigError("", f"world.cables[{k}].sag", f"{cable.sag:g} m is outside [0, {chord:g}] m, the distance of the ends")
             try:
-                Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag)
+                cable.hanging()
             except PerchError as error:
                 raise ConfigError("", f"world.cables[{k}]", str(error)) from None
 

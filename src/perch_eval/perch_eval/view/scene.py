@@ -7,8 +7,8 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from perch_core import so3
-from perch_core.catenary import Catenary
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.urdf import ROTOR_RADIUS
 from perch_core.values import Marker, OdometryState, PowerlineMap, Shape
 from perch_core.vehicle import Vehicle
 from perch_sim.scenario import Scenario
@@ -25,7 +25,6 @@ WORD = (1.0, 1.0, 1.0, 1.0)
 PLAN_STEP = 0.02     # between drawn points of a plan [s]
 PATH_STEP = 0.02     # least distance between drawn points of a flown path [m]
 PATH_POINTS = 3000   # of a flown path; then every other one is dropped
-_ROTOR = 0.1         # where the vehicle's file does not tell [m]
 SIGHT = 0.4          # length of the camera's axis [m]
 
 
@@ -96,8 +95,7 @@ def world_markers(scenario: Scenario) -> list[Marker]:
         out.append(marker(Shape.CUBE, "surface", 0, SURFACE, (*scenario.target.panel_size, 0.02), surface.p_WS - 0.02 * surface.normal, q))
         out.append(marker(Shape.CUBE, "pad", 0, PAD, (*surface.size, 0.01), surface.p_WS - 0.005 * surface.normal, q))
     for k, cable in enumerate(world.cables):
-        hanging = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag).sample(2 if cable.sag == 0.0 else 40)
-        out.append(polyline("cables", k, CABLES[cable.colour], 2 * cable.radius, hanging))
+        out.append(polyline("cables", k, CABLES[cable.colour], 2 * cable.radius, cable.hanging().sample(2 if cable.sag == 0.0 else 40)))
     if scenario.mode == "inspection":
         points = [w.position for w in scenario.inspection.waypoints]
         out.append(polyline("waypoints", 0, PLANNED, 0.01, points))
@@ -112,7 +110,7 @@ def vehicle_markers(vehicle: Vehicle, state: OdometryState, words: str) -> list[
     p, R = np.array(state.p_WB), so3.quat_to_matrix(np.array(state.q_WB))
     hubs = [p + R @ np.array([x, y, 0.0]) for x, y in vehicle.rotor_xy]
     out = [polyline("vehicle", 0, ESTIMATE, 0.02, [hubs[0], hubs[2], hubs[1], hubs[3]], pieces=True)]
-    size = 2 * vehicle.propeller_radius or _ROTOR
+    size = 2 * (vehicle.propeller_radius or ROTOR_RADIUS)
     out += [marker(Shape.CYLINDER, "vehicle", 1 + k, ROTORS[k], (size, size, 0.01), hub, state.q_WB)
             for k, hub in enumerate(hubs)]
     out.append(arrow("vehicle", 5, ESTIMATE, p, p + 0.3 * R[:, 2]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_core.catenary import Catenary
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
 from perch_sim.rendering.scene import CableCurve, Scene
@@ -38,6 +37,6 @@ def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
 
 
 def _curve(cable: Cable) -> CableCurve:
-    hanging = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag)
+    hanging = cable.hanging()
     count = max(2, int(np.ceil(hanging.length / CABLE_SPACING)) + 1)
     return CableCurve(hanging.sample(count), cable.radius, CABLE_COLOURS[cable.colour])
