@@ -38,12 +38,10 @@ def perch_window(flight: Flight) -> tuple[float, float] | None:
     start: float | None = None
     end = math.nan
     for _, order in flight.values("trajectory"):
-        if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER):
-            begin, length = order.trajectory.start_time, order.trajectory.duration
-            if order.at_end == AtEnd.RECOVER and order.recovery_start > 0:
-                length = order.recovery_start
+        if order.contact_after is not None:
+            begin = order.trajectory.start_time
             start = begin if start is None else start
-            end = begin + length
+            end = begin + order.contact_after
     if start is None:
         return None
     touch = touch_of(flight)

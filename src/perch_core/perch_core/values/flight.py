@@ -47,6 +47,13 @@ class TrajectoryOrder(NamedTuple):
             trajectory = replace(trajectory, start_time=start)
         return cls(id, trajectory, at_end, contact_time, recovery_start)
 
+    @property
+    def contact_after(self) -> float | None:
+        """From its start to the planned contact [s]; None: it plans none."""
+        if self.at_end not in (AtEnd.CONTACT, AtEnd.RECOVER):
+            return None
+        return self.recovery_start if self.recovery_start > 0.0 else self.trajectory.duration
+
 
 class ControllerCommand(NamedTuple):
     """What the controller shall do apart from trajectories; `command` and fields as in perch_msgs/ControllerCommand."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core.values import NANOSECONDS, AtEnd, ControllerStatus, seconds
+from perch_core.values import NANOSECONDS, ControllerStatus, seconds
 from perch_control.modes import State
 from perch_eval.goal import goal_of
 from perch_eval.in_process import Sensing, arrange
@@ -58,10 +58,8 @@ def fly_aborted(scenario: str, seed: int, before: float) -> Aborted:
     while stamp < LIMIT and not (ended and stamp - ended > LINGER):
         stamp = loop.step()
         if not cancelled:
-            orders = [order for order in loop.trace.values("trajectory")[-1:] if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER)]
-            for order in orders:
-                length = order.recovery_start if order.at_end == AtEnd.RECOVER else order.trajectory.duration
-                if order.trajectory.start_time + length - seconds(stamp) <= before:
+            for order in loop.trace.values("trajectory")[-1:]:
+                if order.contact_after is not None and order.trajectory.start_time + order.contact_after - seconds(stamp) <= before:
                     cancelled, goal.cancel_requested = stamp, True
         else:
             x, pad = loop.vehicle.simulation.state, loop.vehicle.simulation.pad

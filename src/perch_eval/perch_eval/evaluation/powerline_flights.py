@@ -10,7 +10,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.lines import Segment
 from perch_core.trajectory import SampledTrajectory
-from perch_core.values import AtEnd, TrajectoryOrder, seconds
+from perch_core.values import TrajectoryOrder, seconds
 from perch_core.vehicle import Vehicle
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, fly_in_process
@@ -57,7 +57,7 @@ def _others_touched(flight: Flight, scenario: Scenario) -> int:
 def _perches(flight: Flight) -> list[tuple[float, TrajectoryOrder]]:
     """The planned perches, in order."""
     return [(t, order) for t, order in flight.values("trajectory")
-            if order.at_end in (AtEnd.CONTACT, AtEnd.RECOVER) and isinstance(order.trajectory, SampledTrajectory)]
+            if order.contact_after is not None and isinstance(order.trajectory, SampledTrajectory)]
 
 
 def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> dict[str, float | None]:
@@ -78,9 +78,8 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
     if not plans or truth is None:
         return none
     order = plans[-1][1]
-    plan = order.trajectory
-    assert isinstance(plan, SampledTrajectory)
-    perch_time = order.recovery_start if order.recovery_start > 0 else plan.duration
+    plan, perch_time = order.trajectory, order.contact_after
+    assert isinstance(plan, SampledTrajectory) and perch_time is not None
     end = plan.start_time + perch_time
     touch = touch_of(flight)
     if touch is not None and touch[1].state == 3 and touch[0] < end:
@@ -113,7 +112,7 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
     if not maps or truth is None or estimate is None:
         return none
     point, cable = np.array(scenario.mission.perch_point), CableLine(scenario.world.cables[_target(scenario)])
-    lines = [Segment.between(np.array(line.start), np.array(line.end), line.radius) for line in maps[-1].lines]
+    lines: list[Segment] = [line.segment for line in maps[-1].lines]
     samples = np.linspace(*min(lines, key=lambda line: float(line.distance(point))).ends, 400)
     samples = samples[np.linalg.norm(samples - point, axis=1) < AROUND]
     if not len(samples):
