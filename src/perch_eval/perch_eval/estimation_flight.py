@@ -69,9 +69,8 @@ class Flight:
 
 def motion_of(scenario: Scenario, seed: int) -> PerchMotion:
     """A motion that ends on the scenario's pad."""
-    vehicle, target = load_vehicle(scenario.vehicle), scenario.target
-    angle = np.radians(target.inclination_deg)
-    end = np.array([target.distance, 0.0, target.height]) + vehicle.perch_offset * np.array([-np.sin(angle), 0.0, np.cos(angle)])
+    vehicle, target, surface = load_vehicle(scenario.vehicle), scenario.target, scenario.surface
+    end = surface.p_WS + vehicle.perch_offset * surface.normal
     settings = PerchMotionConfig(
         ground_height=vehicle.perch_offset, height=scenario.mission.takeoff_height, distance=float(end[0]),
         rise=float(end[2] - scenario.mission.takeoff_height), inclination_deg=target.inclination_deg,

@@ -29,12 +29,12 @@ class States:
     w: np.ndarray
 
     def at(self, times: np.ndarray) -> States:
-        """The states at given times; vectors are interpolated, the attitude is that of the nearest sample."""
+        """The states at given times; vectors are interpolated, the attitude is that of the next sample."""
         def between(values: np.ndarray) -> np.ndarray:
             return interpolated(times, self.t, values)
 
-        nearest = np.clip(np.searchsorted(self.t, times), 0, len(self.t) - 1)
-        return States(np.asarray(times), between(self.p), self.q[nearest], between(self.v), between(self.w))
+        following = np.clip(np.searchsorted(self.t, times), 0, len(self.t) - 1)
+        return States(np.asarray(times), between(self.p), self.q[following], between(self.v), between(self.w))
 
 
 def interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:

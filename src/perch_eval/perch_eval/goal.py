@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
+from perch_control.mission.values import Mode, Result
 from perch_core.values import PerchGoal
 from perch_sim.scenario import Scenario
 
-MODES = {"surface": 0, "powerline": 1, "inspection": 2}
-OUTCOMES = dict(enumerate(
-    ("perched", "not_found", "refused", "missed", "tracking_lost", "cancelled", "timeout", "bad_goal", "crashed", "perched_already")))
+OUTCOMES = {int(result): result.name.lower() for result in Result}
 """Error code of the Perch action's result -> outcome."""
 SUCCESSES = ("perched", "inspected")
 """Outcomes of a flight that did what was asked."""
@@ -20,7 +19,7 @@ def goal_of(scenario: Scenario) -> PerchGoal:
     mission = scenario.mission
     points = {"powerline": mission.perch_point, "inspection": scenario.inspection.watched}
     return PerchGoal(
-        mode=MODES[scenario.mode], takeoff_height=mission.takeoff_height, search_timeout=mission.search_timeout,
+        mode=int(Mode[scenario.mode.upper()]), takeoff_height=mission.takeoff_height, search_timeout=mission.search_timeout,
         perch_point=tuple(points.get(scenario.mode, (0.0, 0.0, 0.0))), perch_pitch=math.radians(mission.perch_pitch_deg),
         perception_aware=mission.perception_aware, replan=mission.replan, attempts=mission.attempts)
 

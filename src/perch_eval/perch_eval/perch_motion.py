@@ -12,6 +12,7 @@ from math import factorial
 import numpy as np
 from perch_core import config, so3
 from perch_core.flatness import flat_to_state
+from perch_core.surface import PerchSurface
 from perch_core.vehicle import GRAVITY, ImuConfig
 from scipy.interpolate import BSpline, make_interp_spline
 
@@ -115,10 +116,9 @@ class PerchMotion:
         phase, rate = rng.uniform(0, 2 * np.pi, 3), rng.uniform(1.5, 4.0, 3)
         p = s.sway * sway[:, None] * np.sin(rate * t[:, None] + phase)
         p[:, 2] += s.ground_height + (s.height - s.ground_height) * up
-        angle = np.radians(s.inclination_deg)
-        s3 = np.array([-np.sin(angle), 0.0, np.cos(angle)])
-        end_a = s.alpha * s3 - np.array([0, 0, GRAVITY])
         goal = np.array([s.distance, 0.0, s.height + s.rise])
+        s3 = PerchSurface.from_inclination(goal, np.radians(s.inclination_deg)).normal
+        end_a = s.alpha * s3 - np.array([0, 0, GRAVITY])
         flying = t > begin
         u = np.minimum(t[flying] - begin, s.perch + 0.03)
         for axis, start in enumerate((0.0, 0.0, s.height)):
