@@ -65,7 +65,7 @@ def refused(command: list[str], capsys) -> str:
 
 
 def numbers(folder: Path) -> list[int]:
-    return [r.number for r in read_results(folder / "out" / "results.jsonl")]
+    return [r.number for r in read_results(folder / "out" / "results.jsonl")[1]]
 
 
 def wait_for_results(folder: Path, count: int) -> None:
@@ -95,7 +95,7 @@ def test_a_killed_campaign_resumes_to_the_200_results_of_an_undisturbed_one(camp
     assert code == 0, words
     assert numbers(tmp_path) == list(range(200))
     assert f"{200 - len(kept)} of 200 runs to fly" in again
-    found = read_results(tmp_path / "out" / "results.jsonl")
+    found = read_results(tmp_path / "out" / "results.jsonl")[1]
     assert len({r.values["wind.gust_sigma"] for r in found}) == 200 and len({r.seed for r in found}) == 200
     assert all((r.cause == "perched") == (r.values["wind.gust_sigma"] < 0.5) for r in found)
     page = (tmp_path / "out" / "report.html").read_text()
@@ -143,13 +143,13 @@ def test_a_killed_worker_of_a_cluster_loses_no_result_and_all_add_on_one_thread(
     finished = run(campaign("mortal", 40, "--cluster", cluster))
     assert finished.returncode == 0, finished.stderr
     lost_none(tmp_path)
-    assert {r.message for r in read_results(tmp_path / "out" / "results.jsonl")} == {"1"}
+    assert {r.message for r in read_results(tmp_path / "out" / "results.jsonl")[1]} == {"1"}
 
 
 def lost_none(tmp_path) -> None:
     assert (tmp_path / "killed").exists()
     assert numbers(tmp_path) == list(range(40))
-    assert not [r for r in read_results(tmp_path / "out" / "results.jsonl") if r.cause == "error"]
+    assert not [r for r in read_results(tmp_path / "out" / "results.jsonl")[1] if r.cause == "error"]
 
 
 def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_path):
@@ -169,7 +169,7 @@ def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_pa
 
 def test_runs_that_break_are_results_and_do_not_mix_with_those_of_other_settings(campaign, tmp_path, capsys):
     assert call(campaign("broken", 12, "--jobs", "1"), capsys)[0] == 1
-    found = read_results(tmp_path / "out" / "results.jsonl")
+    found = read_results(tmp_path / "out" / "results.jsonl")[1]
     assert [r.number for r in found if r.cause == "error"] == [0, 4, 8]
     assert "the simulator is out of fuel" in found[0].message
     assert "other settings" in refused(campaign("broken", 13, "--resume"), capsys)

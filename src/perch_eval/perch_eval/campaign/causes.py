@@ -10,8 +10,6 @@ from perch_sim.contact_event import ContactState
 from perch_sim.scenario import Adhesion
 
 SUCCESS = "perched"
-CAUSES = ("not_found", "refused", "lost_track", "missed_pad", "too_fast", "too_slow", "tilt", "came_off", "crash", "timeout",
-          "error")
 MEANING = {
     "not_found": "the target was not seen well enough in time", "refused": "the planner refused to plan",
     "lost_track": "the controller or the estimator gave up before the contact", "missed_pad": "touched beside the pad, or nothing",
@@ -25,7 +23,7 @@ _BY_OUTCOME = {"not_found": "not_found", "refused": "refused", "timeout": "timeo
 
 
 def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> str:
-    """`perched`, or one of `CAUSES`. A perch counts only where the truth shows the vehicle attached at the end; an inspection that
+    """`perched`, or one of `MEANING`. A perch counts only where the truth shows the vehicle attached at the end; an inspection that
     came to its end is a success too, where the truth shows no collision.
 
     Args:

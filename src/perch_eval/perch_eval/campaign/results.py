@@ -43,7 +43,7 @@ class Results:
         Raises:
             ResultsError: it holds another campaign's results, or results and `resume` is not asked for, or it is damaged.
         """
-        whose, found = _read(path)
+        whose, found = read_results(path)
         if whose and whose.get("digest") != digest:
             raise ResultsError(f"{path} holds results of campaign {whose.get('name')!r} with other settings: "
                                "choose another --out, or the settings of then")
@@ -70,17 +70,12 @@ class Results:
         self._rows.close()
 
 
-def read_results(path: Path) -> list[RunResult]:
-    """Every result in a file, by number, also while a campaign is writing it.
+def read_results(path: Path) -> tuple[dict[str, Any], list[RunResult]]:
+    """Whose results a file holds, and the results by number, also while a campaign is writing it; nothing where there is no file.
 
     Raises:
         ResultsError: it cannot be read.
     """
-    return _read(path)[1]
-
-
-def _read(path: Path) -> tuple[dict[str, Any], list[RunResult]]:
-    """Whose results a file holds, and the results by number; nothing where there is no file."""
     try:
         whose, *rows = [*rows_of(path)] or [{}]
         return dict(whose), sorted((_result(**row) for row in rows), key=lambda result: result.number)
