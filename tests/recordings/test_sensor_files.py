@@ -119,10 +119,10 @@ def test_components_take_everything_from_the_file(files):
     assert vio.config.calibration.time_offset == sensors.cameras["cam0"].sigma.time_offset
     target = TargetLocalizer(TargetLocalizerConfig(sensors=name, camera="cam0"))
     assert target.mounted.nominal.camera == sensors.mounts["cam0"].camera
-    assert np.radians(target.config.calibration.rotation) == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
+    assert target.config.calibration.rotation == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
     config = PowerlineMapperConfig(sensors=name, camera="cam0")
     wires = PowerlineMapper(replace(config, detection=replace(config.detection, appearance="plain")))
-    assert np.radians(wires.config.mapper.triangulation.mount_rotation) == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
+    assert wires.config.mapper.triangulation.mount_rotation == pytest.approx(sensors.cameras["cam0"].sigma.rotation)
     with pytest.raises(ConfigError, match="'down' of .* is not there; usable: cam0"):
         VioComponent(VioComponentConfig(sensors=name))
     with pytest.raises(ConfigError, match="no such file"):

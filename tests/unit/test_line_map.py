@@ -174,6 +174,39 @@ def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
     assert np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - jump)[[0, 2]]) < 0.03
 
 
+def test_a_wire_out_of_view_stays_beside_its_neighbour_that_is_seen():
+    """Bundles hang 25 cm apart; seen together before, they are two wires."""
+    rng, mapper = np.random.default_rng(14), LineMapper(MapperConfig())
+    upper, lower = (WireCurve(np.array([3.0, 0.0, z]), np.array([0.0, 1.0, 0.0])) for z in (2.5, 2.25))
+    for k in range(60):
+        time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
+        body = BodyState(time, true, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        seen = [observe(rng, wire, true, 2e-4, time=time) for wire in ((upper, lower) if k < 40 else (upper,))]
+        lines = mapper.update(time, body, seen).lines
+        assert k < 35 or len(lines) == 2, (k, lines)
+
+
+def test_pieces_of_a_wire_keep_numbers_of_their_own_after_many_wires():
+    rng, mapper = np.random.default_rng(15), LineMapper(MapperConfig())
+    sagging, straight = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0]), 0.05), WireCurve(np.array([3.0, 0.0, 4.5]), np.array([0.0, 1.0, 0.0]))
+    for k in range(60):
+        if k == 20:
+            mapper._next_id = 100  # what false sightings use up in a minute
+        time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
+        body = BodyState(time, true, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time) for wire in ((sagging,) if k < 20 else (sagging, straight))]).lines
+    assert len(lines) >= 3 and len({line.id for line in lines}) == len(lines), [line.id for line in lines]
+
+
+def test_between_two_states_the_correction_is_between_theirs():
+    poses, level = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0])
+    for time, x in ((0.0, 0.0), (0.002, 0.006), (0.004, 0.062)):  # 5 cm of the last step are no motion
+        poses.add(BodyState(time, np.array([x, 0.0, 2.0]), level, np.array([3.0, 0.0, 0.0]), np.zeros(3), np.eye(6) * 1e-6))
+    for time in np.linspace(0.0, 0.004, 9):
+        state = poses.at(float(time))
+        assert state.p_WB[0] - state.corrected[0] == pytest.approx(3.0 * time, abs=1e-9)
+
+
 def test_nothing_is_mapped_from_a_pose_that_is_hardly_known():
     poses, level = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0])
     for time, sigma in ((1.0, 0.1), (1.02, 0.1), (1.04, 3.0), (1.06, 3.0)):

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.camera import RadialTangentialCamera
+from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_perception.pose_buffer import BodyState
-from perch_perception.tags import BoardLocalizer, CalibrationSigma
+from perch_perception.tags import BoardLocalizer
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import load_scenario
 
@@ -159,7 +160,7 @@ def test_uses_what_is_left_of_the_board(places):
         if result.board is None:
             continue
         sizes.append(len(result.board.ids))
-        by_lens = result.board.by_intrinsics * CalibrationSigma().lens
+        by_lens = result.board.by_intrinsics * CalibrationSigmas().lens
         sigmas.append(np.sqrt(np.trace((result.board.covariance + by_lens @ by_lens.T)[3:, 3:])))
         assert place.errors(p, R, result.board)[0] < 0.02
     assert sizes[0] == 4 and min(sizes) in (1, 2)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.camera import Camera, camera_of
+from perch_core.camera import IMAGE_LEAST, Camera, camera_of
 from perch_core.camera_mount import CameraMount
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
@@ -27,10 +27,15 @@ class CalibrationSigmas:
     """1 sigma of what a camera's calibration leaves open; zero: known exactly. The defaults are those of a careful Kalibr calibration."""
 
     rotation: float = quantity(0.005, unit="rad", low=0.0, high=0.2, doc="camera against IMU, per axis")
-    translation: float = quantity(0.005, unit="m", low=0.0, high=0.2, doc="camera against IMU, per axis")
+    translation: float = quantity(0.002, unit="m", low=0.0, high=0.2, doc="camera against IMU, per axis")
     time_offset: float = quantity(0.002, unit="s", low=0.0, high=0.1, doc="camera against the IMU's clock")
     focal: float = quantity(0.003, unit="-", low=0.0, high=0.05, doc="relative error of each focal length")
     centre: float = quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
+
+    @property
+    def lens(self) -> np.ndarray:
+        """Of fx, fy (relative), cx, cy [px], shape (4,)."""
+        return np.array([self.focal, self.focal, self.centre, self.centre])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +43,8 @@ class CameraSensor:
     """A camera as its calibration has it."""
 
     model: str = choice(options=("radtan", "equidistant", "pinhole"), doc="projection, in Kalibr's words")
-    width: int = quantity(unit="px", low=16, high=1 << 14)
-    height: int = quantity(unit="px", low=16, high=1 << 14)
+    width: int = quantity(unit="px", low=IMAGE_LEAST, high=1 << 14)
+    height: int = quantity(unit="px", low=IMAGE_LEAST, high=1 << 14)
     focal: tuple[float, float] = quantity(unit="px", above=0.0, high=1e5, doc="fx, fy")
     centre: tuple[float, float] = quantity(unit="px", low=-1e4, high=2e4, doc="cx, cy")
     distortion: tuple[float, ...] = quantity((), low=-100.0, high=100.0, doc=(

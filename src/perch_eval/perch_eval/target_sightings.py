@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from perch_core import so3
+from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import load_board
 from perch_core.vehicle import load_vehicle
 from perch_eval.estimation_flight import EstimatorTrack, Flight
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import BoardLocalizer, to_map
-from perch_perception.tags.map_pose import CalibrationSigma
 from perch_sim.calibration import true_mount
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import Scenario
@@ -72,7 +72,7 @@ def see_target(scenario: Scenario, flight: Flight, track: EstimatorTrack, seed: 
         body = estimated_body(flight, track, exposed)
         found = localizer.process(image, exposed, body).board
         if found is not None:
-            pose = to_map(found, body, mount, CalibrationSigma())
+            pose = to_map(found, body, mount, CalibrationSigmas())
             true = flight.motion.sample(np.array([exposed]))
             turn = body.R_WB @ true.R_WB[0].T  # where the true vehicle is put where the estimated one is, the true pad is there
             p_WS, R_WS = body.p_WB + turn @ (surface.p_WS - true.p_WB[0]), turn @ surface.R_WS

@@ -113,7 +113,8 @@ class PoseBuffer:
         a, b = self._states[right - 1], self._states[right]
         if b.time - a.time > MAX_GAP:
             raise StampError(f"stamp {time:.4f} s lies in a gap of {1e3 * (b.time - a.time):.0f} ms of the odometry")
-        return replace(_between(a, b, (time - a.time) / (b.time - a.time)), corrected=self._corrected[right])
+        share, before = (time - a.time) / (b.time - a.time), self._corrected[right - 1]
+        return replace(_between(a, b, share), corrected=before + share * (self._corrected[right] - before))
 
     def _correction(self, state: BodyState) -> np.ndarray:
         """`corrected` of a state that comes after the newest; a gap tells nothing of it.

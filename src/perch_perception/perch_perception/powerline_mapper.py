@@ -10,12 +10,13 @@ from perch_core import config
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Output
 from perch_core.covariance import largest_sigma
+from perch_core.sensors import CalibrationSigmas
 from perch_core.values import CameraImage, PowerlineMap
 from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, mono_image, rgb_image
 from perch_perception.line_mapping import Backdrop, LineDetectionConfig, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
-from perch_perception.sensor_file import mount_rotation, sensors_parameter
+from perch_perception.sensor_file import calibration_sigmas, sensors_parameter
 
 MOST_POSE_SIGMA = 2.0  # of odometry that maps [m]
 DIAGNOSTICS_PERIOD = 1.0  # [s]
@@ -44,7 +45,7 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
 
     def __init__(self, config: PowerlineMapperConfig) -> None:
         m = config.mapper
-        rotation = mount_rotation(config.sensors, config.camera, m.triangulation.mount_rotation)
+        rotation = calibration_sigmas(config.sensors, config.camera, CalibrationSigmas()).rotation
         super().__init__(replace(config, mapper=replace(m, triangulation=replace(m.triangulation, mount_rotation=rotation))))
         self._pixels = rgb_image if config.detection.appearance == "red" else mono_image
         self._images, self._diagnosed = 0, -np.inf

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from perch_core import config
 from perch_core.camera_mount import CameraMount
 from perch_core.errors import ConfigError
 from perch_core.sensors import CalibrationSigmas, load_sensors
-from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.ukf.config import ImuNoise
 
 
@@ -51,24 +48,10 @@ def imu_axes(sensors: str) -> np.ndarray | None:
     return None if imu is None or np.array_equal(imu.R_BI, np.eye(3)) else imu.R_BI
 
 
-def vio_priors(sensors: str, camera: str, given: CalibrationSigmas) -> CalibrationSigmas:
-    """How well a camera is calibrated; what was given where no file is named."""
-    return _sigmas(sensors, camera) or given
+def calibration_sigmas(sensors: str, camera: str, given: CalibrationSigmas) -> CalibrationSigmas:
+    """How well a camera of the file is calibrated; what was given where no file is named.
 
-
-def tag_sigmas(sensors: str, camera: str, given: CalibrationSigma) -> CalibrationSigma:
-    """The same as the target localiser takes it."""
-    s = _sigmas(sensors, camera)
-    return given if s is None else CalibrationSigma(s.focal, s.centre, math.degrees(s.rotation), s.time_offset)
-
-
-def mount_rotation(sensors: str, camera: str, given: float) -> float:
-    """1 sigma of a camera's attitude on the body, per axis [deg], as the powerline mapper takes it."""
-    s = _sigmas(sensors, camera)
-    return given if s is None else math.degrees(s.rotation)
-
-
-def _sigmas(sensors: str, camera: str) -> CalibrationSigmas | None:
-    """Of a camera of the file; None: no file is named. Which cameras there are is checked by whoever looks through them."""
+    Which cameras there are is checked by whoever looks through them.
+    """
     cameras = load_sensors(sensors).cameras if sensors else {}
-    return cameras[camera].sigma if camera in cameras else None
+    return cameras[camera].sigma if camera in cameras else given

@@ -13,14 +13,15 @@ from perch_core.camera import Region
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Output
 from perch_core.covariance import largest_sigma
+from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage, TargetPose, TargetSighting, nanoseconds
 from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, check_image, mono_image
 from perch_perception.pose_buffer import BodyState, StampError
-from perch_perception.sensor_file import sensors_parameter, tag_sigmas
+from perch_perception.sensor_file import calibration_sigmas, sensors_parameter
 from perch_perception.tags import (
-    BoardLocalizer, BoardPose, CalibrationSigma, FusedTarget, Localization, MapPose, fuse, start_fusion, to_map)
+    BoardLocalizer, BoardPose, FusedTarget, Localization, MapPose, fuse, start_fusion, to_map)
 
 DIAGNOSTICS_PERIOD = 1.0  # [s]
 
@@ -43,7 +44,7 @@ class TargetLocalizerConfig:
     max_attitude_sigma: float = config.quantity(5.0, unit="deg", above=0.0, high=180.0, doc="the same for the attitude")
     max_range: float = config.quantity(6.0, unit="m", above=0.0, high=100.0,
                                        doc="a board further away than this is taken for one of another size")
-    calibration: CalibrationSigma = config.derived(CalibrationSigma())
+    calibration: CalibrationSigmas = config.derived(CalibrationSigmas())
 
 
 class Localizer(Protocol):
@@ -76,7 +77,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         Raises:
             ConfigError: no such vehicle, camera or board.
         """
-        super().__init__(replace(config, calibration=tag_sigmas(config.sensors, config.camera, config.calibration)))
+        super().__init__(replace(config, calibration=calibration_sigmas(config.sensors, config.camera, config.calibration)))
         self._board = load_board(config.board)
         self._given, self._localizer = localizer, localizer
         self._averaged: MapPose | None = None  # by the first complete image

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from perch_core.camera import EquidistantCamera, PinholeCamera, RadialTangentialCamera
+from perch_core.camera import IMAGE_LEAST, EquidistantCamera, PinholeCamera, RadialTangentialCamera
 from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values.flight import AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, MotorCommand, RatesThrust, TrajectoryOrder
@@ -190,7 +190,7 @@ FRAME = Text(256)
 ID = Limit(0, 2**32 - 1)
 _PIXELS = Limit(1, 1e4, "px")
 _FOCAL, _CENTRE = Limit(1.0, 1e5, "px"), Limit(-1e5, 1e5, "px")
-_CAMERA = {"width": _PIXELS, "height": _PIXELS, "fx": _FOCAL, "fy": _FOCAL, "cx": _CENTRE, "cy": _CENTRE}
+_CAMERA = {"width": Limit(IMAGE_LEAST, 1e4, "px"), "height": Limit(IMAGE_LEAST, 1e4, "px"), "fx": _FOCAL, "fy": _FOCAL, "cx": _CENTRE, "cy": _CENTRE}
 _DISTORTED = {**_CAMERA, "coefficients": Limit(-1e3, 1e3, "", (-1,), 8)}
 
 LIMITS: dict[type, dict[str, Any]] = {

@@ -76,8 +76,9 @@ class WireCurve:
     def offsets(self, centres: np.ndarray, rays: np.ndarray) -> Offsets:
         """How far rays pass by the wire, and what that depends on.
 
-        The plane through a ray's origin c and the tangent T at the nearest point P has the normal (P - c) x T; the
-        offset is the ray's angle to it. Near zero offset neither s nor the normal's length matters to first order.
+        The plane through a ray's origin c and the tangent T at the nearest point P has the normal N = (P - c) x T; the offset
+        is the ray's angle to it, r . N / |N|, whose derivative is r' . dN / |N| with r' the ray's part in the plane. s does not
+        matter to first order.
 
         Args:
             centres: origins of the rays [m], shape (n, 3).
@@ -87,14 +88,16 @@ class WireCurve:
         to_point, tangent = self.at(s) - centres, self.tangent(s)
         normals = np.cross(to_point, tangent)
         size = np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
-        by_point = np.cross(tangent, rays) / size[:, None]     # r . (dP x T) = dP . (T x r)
-        by_tangent = np.cross(rays, to_point) / size[:, None]
+        normals = normals / size[:, None]
+        angles = np.sum(normals * rays, axis=1)
+        in_plane = rays - angles[:, None] * normals
+        by_point = np.cross(tangent, in_plane) / size[:, None]     # r' . (dP x T) = dP . (T x r')
+        by_tangent = np.cross(in_plane, to_point) / size[:, None]
         e1, e2, _ = self.axes.T
         jacobian = np.stack([by_point @ e1, by_point @ e2, s * (by_point @ e1) + by_tangent @ e1,
                              s * (by_point @ e2) + by_tangent @ e2,
                              0.5 * s * s * (by_point @ e2) + s * (by_tangent @ e2)], axis=1)
-        return Offsets(np.sum(normals * rays, axis=1) / size, normals / size[:, None], jacobian,
-                       np.sum(to_point * rays, axis=1), s)
+        return Offsets(angles, normals, jacobian, np.sum(to_point * rays, axis=1), s)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ FORGET_AFTER = 2.0  # a wire that was never triangulated and is not seen is drop
 STALE_AFTER, SUPERSEDED = 0.4, 0.3  # a wire not seen for so long gives way to one that is seen so close to it [s, m]
 MAX_RANGE = 8.0  # ends of wires further away are not believed [m]
 STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [m]
-PIECE_IDS = 100       # ids of the pieces of wire k: k, k + 100, k + 200, ...
+PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...
 CERTAIN = 3           # so many more images that show a line to be attached to what is beside it than apart: no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 
@@ -177,11 +177,14 @@ class LineMapper:
         self._tracks = kept
 
     def _supersede(self, time: float) -> None:
-        """Drop wires that are no longer where they were: the odometry was corrected, and they are seen again beside there."""
+        """Drop wires that are no longer where they were: the odometry was corrected, and they are seen anew beside there.
+
+        What was seen before a wire went out of view is another wire beside it.
+        """
         fresh = [t for t in self._tracks if t.estimate is not None and t.extent is not None and t.count >= MIN_OBSERVATIONS
                  and time - t.last.time <= STALE_AFTER]
         self._tracks = [t for t in self._tracks if time - t.last.time <= STALE_AFTER
-                        or not any(_beside(t, other, SUPERSEDED) for other in fresh)]
+                        or not any(other.observations[0].time > t.last.time and _beside(t, other, SUPERSEDED) for other in fresh)]
 
     def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedPowerline]:
         """The wire as chords that stay within `STRAIGHTNESS`; none where it is not known well enough."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.errors import PerchError
+from perch_core.sensors import CalibrationSigmas
 from perch_perception.line_mapping.curve import PARAMETERS, WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 
@@ -43,15 +44,9 @@ class TriangulationConfig:
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="random walk of the odometry; the wire is where the newest sightings see it")
     pose_drift_moved: float = config.quantity(0.01, unit="m/sqrt(m)", low=0.0, high=1.0, doc="the same over the distance moved")
-    mount_rotation: float = config.derived(0.3)  # 1 sigma of the camera's attitude on the body, per axis: the same in all sightings [deg]
+    mount_rotation: float = config.derived(CalibrationSigmas().rotation)  # 1 sigma of the camera's attitude on the body, per axis [rad]
     radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5,
-                                    doc="radius of the wires, where it is known; else of one too thin to be measured")
-    radius_sigma: float = config.quantity(0.0, low=0.0, high=1.0, doc="how well it is known, 1 sigma, as a share of it; 0: not at all")
-
-    @property
-    def radius_known(self) -> bool:
-        """Whether the radius is told; else it is estimated from the widths alone."""
-        return self.radius_sigma > 0.0
+                                    doc="radius of a wire that is too thin to be measured")
 
 
 class DegenerateBaseline(PerchError):
@@ -141,7 +136,7 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
     # the median of all widths anew: those of crossing wires may have come first
-    size = np.log(settings.radius) if settings.radius_known else _log_radius(curve, observations)
+    size = _log_radius(curve, observations)
     used = np.ones(len(observations), bool)
     drifted = _drifted(observations, settings)
     rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
@@ -159,7 +154,7 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         by_rays = _normal_equations(_whitened(curve, mount, observations, centres, rays, rigid), weight)
         apart = apart if known > 0.0 else apart + WIDTH_GATE**2
         by_widths = _normal_equations(_widths(curve, size, observations, apart), weight)
-        information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount, size)
+        information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount)
         try:
             step = -np.linalg.solve(information, gradient)
         except np.linalg.LinAlgError:  # the sightings that are left say nothing of one direction
@@ -194,7 +189,7 @@ def _normal_equations(linear: tuple[np.ndarray, np.ndarray], weight: np.ndarray)
     return np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian), np.einsum("n,nki,nk->ni", weight, jacobian, residual)
 
 
-def _wandering(by_rays, by_widths, walk, settings, curvature, mount, size):
+def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
     """Information (9, 9) and gradient (9,) of the wire where it is after the last sighting, of the camera's mount and the radius.
 
     A filter in information form from the oldest sighting to the newest: before each, the wire's two offsets lose what the
@@ -202,9 +197,8 @@ def _wandering(by_rays, by_widths, walk, settings, curvature, mount, size):
     together they know the wire's place no better than that, however many they are.
     """
     parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
-    by_radius, misfit = (settings.radius_sigma**-2, size - np.log(settings.radius)) if settings.radius_known else (1e-6, 0.0)
-    tight = np.concatenate([np.zeros(4), [1.0 / SAG**2], np.full(3, 1.0 / np.radians(settings.mount_rotation) ** 2), [by_radius]])
-    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [misfit]])
+    tight = np.concatenate([np.zeros(4), [1.0 / SAG**2], np.full(3, settings.mount_rotation**-2), [1e-6]])  # of the radius nothing is known
+    information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [0.0]])
     for part, slope, variance in zip(parts, slopes, walk):
         if variance > 0.0:
             a, b, c = information[0, 0] + 1.0 / variance, information[1, 1] + 1.0 / variance, information[0, 1]

@@ -26,7 +26,7 @@ class FusedTarget:
     Attributes:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
-        joint: covariance of (dp, dtheta, c), shape (14, 14), c being the shared errors of `map_pose`.
+        joint: covariance of (dp, dtheta, c), shape (17, 17), c being the shared errors of `map_pose`.
         odometry: covariance of the vehicle's pose at the last image, shape (6, 6).
         frames: images in it.
         refused: images in a row that contradicted it.

@@ -14,12 +14,12 @@ import numpy as np
 
 from perch_core.camera import Region
 from perch_core.camera_mount import CameraMount
+from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import TagBoard
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.average import average_board
 from perch_perception.tags.consensus import consistent
 from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
-from perch_perception.tags.map_pose import CalibrationSigma
 from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
 from perch_perception.tags.refinement import refine_corners
 from perch_perception.tags.view import VirtualView
@@ -81,7 +81,7 @@ class BoardLocalizer:
     """
 
     def __init__(self, board: TagBoard, mount: CameraMount, max_range: float = 6.0,
-                 averaging: bool = False, calibration: CalibrationSigma = CalibrationSigma()) -> None:
+                 averaging: bool = False, calibration: CalibrationSigmas = CalibrationSigmas()) -> None:
         self.board, self.mount = board, mount
         self._max_range, self._averaging = max_range, averaging
         self._lens_sigma = calibration.lens

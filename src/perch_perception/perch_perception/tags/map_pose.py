@@ -15,36 +15,13 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.camera_mount import CameraMount
+from perch_core.sensors import CalibrationSigmas
 from perch_perception.pose_buffer import BodyState
 from perch_perception.tags.pose import BoardPose
 
 # The shared errors c, in this order
-ROTATION, INTRINSICS, TIME = slice(0, 3), slice(3, 7), 7
-SHARED = 8
-
-
-@dataclass(frozen=True)
-class CalibrationSigma:
-    """How well the camera is calibrated: 1 sigma of what stays the same from image to image.
-
-    The defaults are those of config/sensors/snapdragon.yaml, what a careful calibration leaves.
-
-    Attributes:
-        focal: each focal length, relative.
-        centre: principal point, per axis [px].
-        rotation: extrinsic rotation, per axis of B: 0.005 rad [deg].
-        time: camera-IMU time offset [s].
-    """
-
-    focal: float = 0.003
-    centre: float = 0.5
-    rotation: float = 0.286
-    time: float = 0.002
-
-    @property
-    def lens(self) -> np.ndarray:
-        """1-sigma of fx, fy (relative), cx, cy [px], shape (4,)."""
-        return np.array([self.focal, self.focal, self.centre, self.centre])
+ROTATION, TRANSLATION, INTRINSICS, TIME = slice(0, 3), slice(3, 6), slice(6, 10), 10
+SHARED = 11
 
 
 @dataclass(frozen=True)
@@ -55,8 +32,8 @@ class MapPose:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
         noise: covariance of (dp, dtheta), T_BS turned into the axes of W, from this image alone [m, rad], shape (6, 6).
-        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 8).
-        shared: covariance of c, shape (8, 8).
+        by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 11).
+        shared: covariance of c, shape (11, 11).
         p_BS_W: from the vehicle to S, in W [m], shape (3,).
         odometry: covariance of the vehicle's pose at the exposure, shape (6, 6); with a later one it says how far the odometry has drifted.
     """
@@ -75,7 +52,7 @@ class MapPose:
         return self.noise + self.by_shared @ self.shared @ self.by_shared.T
 
 
-def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: CalibrationSigma) -> MapPose:
+def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: CalibrationSigmas) -> MapPose:
     """T_WS = T_WB T_BC T_CS with the errors of T_BS, to first order.
 
     Args:
@@ -92,9 +69,10 @@ def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: C
     by_shared = np.zeros((6, SHARED))
     # the camera turned on the vehicle by a rotation in axes of B, where it is constant
     by_shared[:, ROTATION] = np.concatenate([-so3.hat(v_CS_W), np.eye(3)]) @ R_WB
+    by_shared[:3, TRANSLATION] = R_WB
     by_shared[:, INTRINSICS] = turned @ board.by_intrinsics
     w_W = R_WB @ body.w_WB_B
     by_shared[:, TIME] = np.concatenate([body.v_WB + np.cross(w_W, p_BS_W), w_W])
-    sigma = [*[np.radians(calibration.rotation)] * 3, *calibration.lens, calibration.time]
+    sigma = [*[calibration.rotation] * 3, *[calibration.translation] * 3, *calibration.lens, calibration.time_offset]
     return MapPose(body.p_WB + p_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, np.diag(np.square(sigma)),
                    p_BS_W, body.covariance)

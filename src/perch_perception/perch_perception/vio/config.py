@@ -28,15 +28,11 @@ class FilterConfig:
     slide_zoom: float = quantity(2.0, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
 
 
-# 1 sigma of what a careful calibration leaves open, where no sensor file says it: of the camera's attitude 0.5 deg for all axes together
-CAREFUL = CalibrationSigmas(rotation=0.0087 / 3.0**0.5, translation=0.002, time_offset=0.002, focal=0.003, centre=0.5)
-
-
 @dataclass(frozen=True)
 class VioConfig:
     """Visual-inertial odometry."""
 
     imu: ImuNoise = derived(ImuNoise())
-    calibration: CalibrationSigmas = derived(CAREFUL)
+    calibration: CalibrationSigmas = derived(CalibrationSigmas())
     tracker: TrackerConfig = part(TrackerConfig)
     filter: FilterConfig = part(FilterConfig)
