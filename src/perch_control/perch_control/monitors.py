@@ -23,8 +23,10 @@ _QUIET = 0.5       # rates of what is carried [rad/s]
 
 
 def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:
-    """Angle between b3 and the thrust direction of the reference [deg]; 0 where the reference is in free fall."""
-    fx, fy, fz = setpoint.a[0], setpoint.a[1], setpoint.a[2] + GRAVITY
+    """Angle between b3 and the reference's [deg], which is the direction of its thrust where it carries none; 0 in free fall then."""
+    fx, fy, fz = setpoint.b3
+    if hypot(fx, fy, fz) < 0.5:
+        fx, fy, fz = setpoint.a[0], setpoint.a[1], setpoint.a[2] + GRAVITY
     n = hypot(fx, fy, fz)
     if n < 0.5:
         return 0.0

@@ -174,6 +174,8 @@ class NmpcController(Law):
         s, X, U, n = self.settings, self.X, self.U, self._layout.states
         if not self._warm:
             X[:, :13] = self._R[:, :13]
+            turned = np.cumprod(np.where((X[1:, 3:7] * X[:-1, 3:7]).sum(axis=1) < 0.0, -1.0, 1.0))
+            X[1:, 3:7] *= turned[:, None]  # one sign from node to node: q and -q are the same attitude, and far apart in a linear model
             if self.thrust_states:
                 X[:, 13:], U[:] = self._R[:, 13:], 0.0
             else:

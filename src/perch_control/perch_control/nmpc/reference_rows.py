@@ -1,7 +1,7 @@
 """References of the shooting nodes: full states and rotor thrusts by flatness, each computed once.
 
 The nodes are a whole number of control periods apart, so what is the last node now will be every other node later: in
-steady flight one new row per period is enough.
+steady flight one new row per period is enough. Rows are taken at the phase of the first call, and all anew where that is off.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, times
 from perch_core.vehicle import GRAVITY
 
 _NEVER = -(1 << 62)
+_OFF = 0.25  # of a period, beyond which the phase of the rows is another one
 
 
 @compiled
@@ -110,6 +111,7 @@ class ReferenceRows:
         """
         self._vehicle, self._floor, self._period = vehicle, floor, period
         self._source: Any = None
+        self._phase = 0.0  # of the rows, after whole periods [s]
         self._rows, self._stamps = np.zeros((periods + 1, 17)), np.full(periods + 1, _NEVER)
 
     def fill(self, source: Any, elapsed: float, spacing: int, out: np.ndarray) -> None:
@@ -121,11 +123,13 @@ class ReferenceRows:
             spacing: control periods between nodes.
             out: shape (nodes, 17).
         """
-        if source is not self._source:
+        first = round((elapsed - self._phase) / self._period)
+        if source is not self._source or abs(elapsed - self._phase - first * self._period) > _OFF * self._period:
             self._source = source
             self._stamps[:] = _NEVER
-        first = round(elapsed / self._period)
+            first = round(elapsed / self._period)
+            self._phase = elapsed - first * self._period
         periods = missing(self._stamps, first, spacing, len(out))
         if len(periods):
-            keep(packed_many(source, periods * self._period), periods, self._floor, self._vehicle, self._rows, self._stamps)
+            keep(packed_many(source, periods * self._period + self._phase), periods, self._floor, self._vehicle, self._rows, self._stamps)
         take(self._rows, self._stamps, first, spacing, out)
