@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perch_core import rigid_body, so3
+from oracles import rigid_body
+from perch_core import so3
 from perch_core.lines import scaled_clearance
 from perch_core.rotor_model import P, Q, THRUST, V, W
 from perch_core.vehicle import load_vehicle

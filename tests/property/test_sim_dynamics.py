@@ -1,4 +1,4 @@
-"""The plant's kernels against perch_core's model, conservation laws and closed forms."""
+"""The plant's kernels against plain numpy, conservation laws and closed forms."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles.rigid_body import accelerations
 from perch_core import so3
-from perch_core.rigid_body import accelerations
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim.body import make_body
 from perch_sim.contact import FREE

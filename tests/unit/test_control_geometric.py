@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from oracles import rigid_body
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.geometric.controller import CONE_DEG
 from perch_control.geometric.law import attitude_error, geometric_step
 from perch_control.geometric.step import predicted
 from perch_control.reference import FlatReference, SampledReference, Setpoint, packed_many
 from perch_control.rotor_lag import RotorEstimate, leading_command, reachable, thrusts
-from perch_core import rigid_body
 from perch_core.flatness import flat_to_state, heading_derivatives
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import ControlGains, load_vehicle
@@ -139,7 +139,7 @@ def test_feedback_never_turns_the_thrust_out_of_its_cone():
 
 
 def test_prediction_agrees_with_the_rigid_body_model():
-    """Second implementation: perch_core.rigid_body, integrated in small steps."""
+    """Second implementation: oracles.rigid_body, integrated in small steps."""
     rng = np.random.default_rng(3)
     R = Rotation.random(random_state=1)
     p, v, w, f = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3) * 3, np.array([0.5, 0.7, 0.6, 0.65])

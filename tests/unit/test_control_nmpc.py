@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import Disturbances
+from oracles import rigid_body
 from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.l1 import L1Augmentation
@@ -21,7 +22,7 @@ from perch_control.nmpc.model import StageLayout, stage
 from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
 from perch_control.reference import FlatReference, SampledReference
 from perch_control.rotor_lag import approached, lag_behind, leading_command
-from perch_core import rigid_body, so3
+from perch_core import so3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
 from perch_core.timing import CONTROL_PERIOD
@@ -53,7 +54,7 @@ def argument(layout, rng):
 
 @pytest.mark.parametrize("states", [13, 17])
 def test_dynamics_of_a_stage_are_the_rigid_bodys(states):
-    """Independent integration of perch_core.rigid_body with drag, in small steps. [P:eq1]"""
+    """Independent integration of oracles.rigid_body with drag, in small steps. [P:eq1]"""
     layout, step, rng = StageLayout(states, False), 0.05, np.random.default_rng(1)
     z = argument(layout, rng)
     z[states + 4 + 17:states + 4 + 23] = rng.normal(size=6) * 0.5

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from oracles.rigid_body import accelerations
 from perch_core import config
 from perch_core.errors import ConfigError
-from perch_core.rigid_body import accelerations
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim.scenario import Scenario, load_scenario
 from perch_sim.scenario_files import scenario_mapping

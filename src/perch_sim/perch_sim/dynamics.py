@@ -1,7 +1,7 @@
 """Compiled kernels of the plant: rigid body, rotors, contact forces, one Runge-Kutta step.
 
-These equations are the simulator's own, apart from perch_core.rigid_body which planners and controllers use; a test
-shows that both agree. Written out in scalars: numba needs about 1 us for a step, numpy 200 us.
+These equations are the simulator's own; a test holds them against plain numpy (tests/oracles/rigid_body.py). Written out
+in scalars: numba needs about 1 us for a step, numpy 200 us.
 
 State `x` (13): p_WB (3) [m], q_WB (4, xyzw), v_WB (3) [m/s], w_WB_B (3) [rad/s]. Rotor speeds (4) [rad/s] are apart,
 as their lag has an exact solution.

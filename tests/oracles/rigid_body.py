@@ -1,4 +1,4 @@
-"""Rigid-body dynamics in plain numpy: tests hold the compiled models of controllers, planner and simulator against it."""
+"""Rigid-body dynamics in plain numpy, against which the compiled models of controllers, planner and simulator are held."""
 
 from __future__ import annotations
 
