@@ -13,6 +13,7 @@ import pytest
 from scipy.stats import kstest
 
 from perch_core.errors import ConfigError
+from perch_core.values import Contact
 from perch_eval import demo
 from perch_eval.campaign import command as campaign
 from perch_eval.campaign import workers
@@ -24,7 +25,7 @@ from perch_eval.campaign.results import Results, ResultsError, RunResult, read_r
 from perch_eval.campaign.specification import Run, load_campaign, scenario_of
 from perch_eval.evaluation import command as evaluation
 from perch_eval.statistics import Rate, Spread
-from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.contact_event import ContactState
 from perch_sim.scenario import Adhesion
 
 
@@ -110,7 +111,7 @@ def test_what_no_scenario_accepts_is_refused_before_the_first_flight(tmp_path, v
 
 
 def touch(state, body="pad", normal=0.5, tangential=0.1, tilt=3.0, reason=""):
-    return ContactEvent(5.0, state, body, normal, tangential, math.radians(tilt), 0.02, reason)
+    return Contact(5_000_000_000, state, body, normal, tangential, math.radians(tilt), 0.02, reason)
 
 
 GROUND, NONE = touch(ContactState.GROUND, "floor"), touch(ContactState.NONE, "floor")

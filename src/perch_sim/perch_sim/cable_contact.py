@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core import so3
+from perch_core.values import Contact, nanoseconds
 from perch_sim.attachment import FREE, Attachment
-from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.contact_event import ContactState
 from perch_sim.dynamics import Hold
 from perch_sim.scenario import Cable, Grip
 
@@ -87,7 +88,7 @@ class CableMonitor:
         self._grip, self._offset, self._radii = grip, gripper_offset, np.array(radii, float)
         self._reach = float(self._radii.max())
         self._before = [math.inf] * len(cables)   # distance one update ago
-        self._nearest: list[ContactEvent | None] = [None] * len(cables)  # of this pass
+        self._nearest: list[Contact | None] = [None] * len(cables)  # of this pass
         self._attachment: Attachment | None = None
         self._open = False  # let go, and not yet out of reach of what was held
         self.hold: Hold = FREE
@@ -98,7 +99,7 @@ class CableMonitor:
         self._open = self._open or self._attachment is not None
         self._attachment, self.hold = None, FREE
 
-    def update(self, time: float, x: np.ndarray) -> list[ContactEvent]:
+    def update(self, time: float, x: np.ndarray) -> list[Contact]:
         """What changed since the last call, one control period ago.
 
         Args:
@@ -131,13 +132,13 @@ class CableMonitor:
                 events.append(self._event(time, ContactState.COLLISION, k, x, R_WB, near, "crashed: a cable in the rotors"))
         return events
 
-    def _missed(self, k: int) -> list[ContactEvent]:
+    def _missed(self, k: int) -> list[Contact]:
         """The pass of a cable is over."""
         event, self._nearest[k] = self._nearest[k], None
         return [] if event is None else [event]
 
     def _within_reach(self, time: float, k: int, x: np.ndarray, R_WB: np.ndarray, gripper_W: np.ndarray,
-                      near: Nearest) -> list[ContactEvent]:
+                      near: Nearest) -> list[Contact]:
         """Grip the cable, or remember how near it came."""
         event = self._event(time, ContactState.BOUNCED, k, x, R_WB, near, "")
         speed = math.hypot(event.normal_speed, event.tangential_speed)
@@ -153,9 +154,9 @@ class CableMonitor:
         return []
 
     def _event(self, time: float, state: ContactState, k: int, x: np.ndarray, R_WB: np.ndarray, near: Nearest,
-               reason: str) -> ContactEvent:
+               reason: str) -> Contact:
         velocity = x[7:10] + R_WB @ np.cross(x[10:13], [0.0, 0.0, -self._offset])
         into = float(-velocity @ R_WB[:, 2])  # the gripper meets the cable along -b3
         across = float(np.linalg.norm(velocity + into * R_WB[:, 2]))
         tilt = abs(float(so3.angle_between(R_WB[:, 2], near.direction)) - math.pi / 2)
-        return ContactEvent(time, state, f"cable {k}", into, across, tilt, near.distance, reason)
+        return Contact(nanoseconds(time), state, f"cable {k}", into, across, tilt, near.distance, reason)

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core import so3
+from perch_core.values import Contact, nanoseconds
 from perch_sim.attachment import FREE, Attachment
-from perch_sim.contact_event import ContactEvent, ContactState
+from perch_sim.contact_event import ContactState
 from perch_sim.dynamics import Hold
 from perch_sim.obstacles import Obstacles
 from perch_sim.scenario import Adhesion
@@ -88,7 +89,7 @@ class ContactMonitor:
         """Let go; what is touched still is not held again before it was left."""
         self._attachment, self.hold = None, FREE
 
-    def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[ContactEvent]:
+    def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[Contact]:
         """What changed at this instant.
 
         Args:
@@ -110,7 +111,7 @@ class ContactMonitor:
             self.hold = self._attachment.hold(time)
         return events
 
-    def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool) -> ContactEvent | None:
+    def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool) -> Contact | None:
         known = self._touched.get(s)
         if known is not None and (known[1] is ContactState.COLLISION or not rest):
             self._touched[s] = (time, known[1])
@@ -123,8 +124,8 @@ class ContactMonitor:
         if state is ContactState.ATTACHED:
             self._attach(time, s, x, p_WS)
         offset = float(np.hypot(impact.offset_S[0], impact.offset_S[1])) if s == self._obstacles.pad else 0.0
-        return ContactEvent(time, state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
-                            impact.tilt_error, offset, reason)
+        return Contact(nanoseconds(time), state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
+                       impact.tilt_error, offset, reason)
 
     def _judge(self, s: int, impact: Impact, rest: bool) -> tuple[ContactState, str]:
         name = self._obstacles.names[s]
@@ -145,14 +146,14 @@ class ContactMonitor:
         refusal = adhesion_refusal(impact, self._adhesion, self._obstacles.pad_half)
         return (ContactState.BOUNCED, refusal) if refusal else (ContactState.ATTACHED, "")
 
-    def _separations(self, time: float) -> list[ContactEvent]:
+    def _separations(self, time: float) -> list[Contact]:
         over = [s for s, (last, _) in self._touched.items()
                 if time - last > SEPARATION and not (self._attachment is not None and s == self._attachment.surface)]
         for s in over:
             del self._touched[s]
         if not over or self._touched:
             return []
-        return [ContactEvent(time, ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
+        return [Contact(nanoseconds(time), ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
 
     def _attach(self, time: float, s: int, x: np.ndarray, p_WS: np.ndarray) -> None:
         """Hold the plate where it touched; it is then drawn flat on the surface."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
 
 
 class ContactState(IntEnum):
@@ -14,16 +13,3 @@ class ContactState(IntEnum):
     BOUNCED = 2
     COLLISION = 3
     GROUND = 4
-
-
-class ContactEvent(NamedTuple):
-    """A change of what the vehicle touches; fields as in perch_msgs/Contact."""
-
-    time: float              # [s]
-    state: ContactState
-    body: str
-    normal_speed: float      # into the surface [m/s]
-    tangential_speed: float  # [m/s]
-    tilt_error: float        # between b3 and s3 [rad]
-    offset: float            # from the pad's centre, in the surface [m]
-    reason: str

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
+from perch_core.values import Contact
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding
 from perch_sim.attachment import FREE
 from perch_sim.body import PLATE_POINTS, Body, make_body
 from perch_sim.cable_contact import CableMonitor
 from perch_sim.contact import ContactMonitor
-from perch_sim.contact_event import ContactEvent
 from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch
 from perch_sim.obstacles import make_obstacles
 from perch_sim.scenario import Scenario
@@ -27,9 +27,9 @@ STEP = CONTROL_PERIOD / SUBSTEPS
 class PlantOutput(NamedTuple):
     """What happened in one period."""
 
-    states: list[TrueState]             # at the end of each Runge-Kutta step, the last at the period's end
-    inertial: np.ndarray                # mean specific force and angular velocity at the IMU in B, (6,)
-    contacts: tuple[ContactEvent, ...]  # in order
+    states: list[TrueState]        # at the end of each Runge-Kutta step, the last at the period's end
+    inertial: np.ndarray           # mean specific force and angular velocity at the IMU in B, (6,)
+    contacts: tuple[Contact, ...]  # in order
 
 
 def resting_state(scenario: Scenario, body: Body) -> np.ndarray:
@@ -118,7 +118,7 @@ class Plant:
         states = [TrueState(self.time + (k + 1) * CONTROL_PERIOD_NS // SUBSTEPS, x) for k, x in enumerate(path)]
         self.time += CONTROL_PERIOD_NS
         elapsed = (self.time - self._start) * 1e-9
-        contacts += [e._replace(time=self.time * 1e-9) for e in self.cables.update(elapsed, self._x)]
+        contacts += [e._replace(stamp=self.time) for e in self.cables.update(elapsed, self._x)]
         return PlantOutput(states, total / SUBSTEPS, tuple(contacts))
 
     def _warm_up(self) -> None:
@@ -126,8 +126,8 @@ class Plant:
         advance_to_touch(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces, FREE,
                          0.0, STEP, np.empty((1, STATES)), np.zeros(6), self._distances)
 
-    def _touches(self, time: int, before: np.ndarray) -> list[ContactEvent]:
+    def _touches(self, time: int, before: np.ndarray) -> list[Contact]:
         """Judge what is touched at a time [ns]; `before` is the state one step earlier."""
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
         events = self.contact.update(elapsed, before, self._x, self._distances)
-        return [event._replace(time=time * 1e-9) for event in events]
+        return [event._replace(stamp=time) for event in events]

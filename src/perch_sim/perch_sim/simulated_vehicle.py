@@ -16,9 +16,9 @@ from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
-    Transform, limits, nanoseconds, rotated, seconds)
+    Transform, limits, rotated, seconds)
 from perch_sim.camera_stream import Delivery
-from perch_sim.contact_event import ContactEvent
+from perch_sim.contact_event import ContactState
 from perch_sim.drawing import Drawing, DrawnInProcesses
 from perch_sim.lockstep.batches import Arrival
 from perch_sim.motors import MotorCommandError
@@ -203,10 +203,10 @@ class SimulatedVehicle(Component[VehicleParameters]):
             pad = self.simulation.pad
             self.target(PoseStamped(self.time, tuple(pad.p_WS.tolist()), tuple(so3.quat_from_matrix(pad.R_WS).tolist())))
 
-    def _touch(self, event: ContactEvent) -> None:
-        self.contact(Contact(nanoseconds(event.time), int(event.state), event.body, float(event.normal_speed),
-                             float(event.tangential_speed), float(event.tilt_error), float(event.offset), event.reason))
-        self.info(f"t = {event.time:.3f} s: {event.body}: {event.state.name.lower()}" + (f" ({event.reason})" if event.reason else ""))
+    def _touch(self, event: Contact) -> None:
+        self.contact(event)
+        state = ContactState(event.state).name.lower()
+        self.info(f"t = {event.stamp * 1e-9:.3f} s: {event.body}: {state}" + (f" ({event.reason})" if event.reason else ""))
 
     # -- cameras -----------------------------------------------------------------------------------------------------
 

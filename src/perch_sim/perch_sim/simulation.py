@@ -19,12 +19,12 @@ import numpy as np
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.timing import CONTROL_PERIOD_NS
+from perch_core.values import Contact
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim import seeding
 from perch_sim.calibration import true_mounts
 from perch_sim.camera_stream import CameraStream
 from perch_sim.camera_timing import CameraTiming
-from perch_sim.contact_event import ContactEvent
 from perch_sim.drawing import Drawing
 from perch_sim.imu import Imu, ImuSample
 from perch_sim.inner_loop import inner_loop
@@ -47,20 +47,18 @@ class Output(NamedTuple):
     time: int                           # end of the period [ns]
     imu: ImuSample
     state: TrueState
-    contacts: tuple[ContactEvent, ...]
+    contacts: tuple[Contact, ...]
 
 
 class Simulation:
     """A vehicle in flight. `time` [ns] is the IMU's clock."""
 
-    def __init__(self, scenario: Scenario, seed: int, drawing: Drawing | None = None,
-                 motor_timeout: int = MOTOR_TIMEOUT) -> None:
+    def __init__(self, scenario: Scenario, seed: int, drawing: Drawing | None = None) -> None:
         """
         Args:
             scenario: what is flown.
             seed: of everything that is random.
             drawing: of the cameras that take images; the others keep only their times.
-            motor_timeout: armed motors stop without a command for so long [ns].
 
         Raises:
             ConfigError: the scenario's vehicle or board does not exist, or its IMU does not run at the control rate.
@@ -71,7 +69,7 @@ class Simulation:
             raise ConfigError(f"vehicles/{scenario.vehicle}", "imu.rate",
                               f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
-        self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, motor_timeout), 0
+        self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, MOTOR_TIMEOUT), 0
         self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor, scenario.disturbance.voltage_factor)
         self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
         self._sample = ImuSample(np.array([0.0, 0.0, GRAVITY]), np.zeros(3))

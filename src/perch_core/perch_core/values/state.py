@@ -103,15 +103,15 @@ class RotorState(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """A change of what the vehicle touches; fields as in perch_msgs/Contact, speeds [m/s], angle [rad], offset [m]."""
+    """A change of what the vehicle touches; fields as in perch_msgs/Contact."""
 
     stamp: int
     state: int
     body: str
-    normal_speed: float
-    tangential_speed: float
-    tilt_error: float
-    offset: float
+    normal_speed: float      # into the surface [m/s]
+    tangential_speed: float  # [m/s]
+    tilt_error: float        # between b3 and s3 [rad]
+    offset: float            # from the pad's centre, in the surface [m]
     reason: str
 
 
