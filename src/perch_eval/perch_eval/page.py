@@ -1,12 +1,11 @@
-"""HTML of every report: one file, offline, with the same style, tables and pictures; and JSON without nan."""
+"""HTML of every report: one file, offline, with the same style, tables and pictures."""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -98,12 +97,3 @@ def jpeg(pixels: np.ndarray, width: int) -> bytes:
     if scale < 1.0:
         pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
-
-
-def finite(value: Any) -> Any:
-    """JSON has no nan: null means that a figure is not available."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

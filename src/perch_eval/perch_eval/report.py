@@ -12,6 +12,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from perch_control.modes import Command
 from perch_core.errors import PerchError
+from perch_core.json_values import finite
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
@@ -23,7 +24,7 @@ from perch_eval.inspection.measures import Inspected, recorded
 from perch_eval.margins import limits, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
-from perch_eval.page import Html, finite, image, page, section, table, text
+from perch_eval.page import Html, image, page, section, table, text
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
 from perch_sim.scenario import Scenario

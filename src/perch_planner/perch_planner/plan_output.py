@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perch_core.flatness import FlatState, flat_to_state
+from perch_core.json_values import finite
 from perch_core.vehicle import Vehicle
 from perch_planner.planner import PerchPlan
 from perch_planner.problem import Limits, PerchProblem
@@ -19,9 +19,9 @@ COLUMNS = ("time", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "qx
            "thrust")
 
 
-def states(plan: PerchPlan, mass: float, step: float = 0.002) -> tuple[np.ndarray, list[FlatState]]:
-    """Times and full states of a plan, every `step` seconds and at contact."""
-    times = np.append(np.arange(0.0, plan.duration, step), plan.duration)
+def states(plan: PerchPlan, mass: float) -> tuple[np.ndarray, list[FlatState]]:
+    """Times and full states of a plan, every 2 ms and at contact."""
+    times = np.append(np.arange(0.0, plan.duration, 0.002), plan.duration)
     at = plan.trajectory.sample_many(times)
     rows = zip(at.p, at.v, at.a, at.j, at.s, *(np.asarray(values).tolist() for values in (at.yaw, at.yaw_rate, at.yaw_acc)))
     return times, [flat_to_state(p, v, a, j, s, yaw, rate, acceleration, mass) for p, v, a, j, s, yaw, rate, acceleration in rows]
@@ -43,11 +43,6 @@ def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
             writer.writerow([f"{float(v):.9g}" for v in row])
 
 
-def _finite(value: float) -> float | None:
-    """JSON has no infinity: null stands for "none"."""
-    return float(value) if math.isfinite(value) else None
-
-
 def as_json(plan: PerchPlan) -> dict[str, Any]:
     """Segments in Bernstein form, certificates, and what the planning took."""
     fields = ("lower_limit", "upper_limit", "minimum", "maximum", "time_of_minimum", "time_of_maximum")
@@ -55,7 +50,7 @@ def as_json(plan: PerchPlan) -> dict[str, Any]:
         "duration": plan.duration, "iterations": plan.iterations, "solve_time": plan.solve_time,
         "segments": [{"duration": float(d), **{k: row.tolist() for k, row in zip(("x", "y", "z", "yaw"), c)}}
                      for d, c in zip(plan.trajectory.durations, plan.trajectory.coefficients)],
-        "certificates": [{"quantity": c.quantity, "unit": c.unit, **{f: _finite(getattr(c, f)) for f in fields},
+        "certificates": [{"quantity": c.quantity, "unit": c.unit, **{f: finite(getattr(c, f)) for f in fields},
                           "method": c.method, "holds": c.holds} for c in plan.certificates],
     }
 

@@ -8,8 +8,8 @@ import platform
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from perch_core.json_values import finite
 from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, VACUOUS, Effort, Section
-from perch_eval.page import finite
 from perch_eval.revision import banner, commit, made_of
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}

@@ -7,13 +7,13 @@ from contextlib import closing
 from dataclasses import asdict
 from typing import Any, TypeVar
 
+from perch_core.json_values import finite
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.progress import counted
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.workers import dead, in_processes
 from perch_eval.evaluation.sections import Effort
-from perch_eval.page import finite
 from perch_eval.revision import digest
 from perch_eval.rows import Rows, rows_of
 

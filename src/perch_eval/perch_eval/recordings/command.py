@@ -14,13 +14,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from perch_core.errors import ConfigError, PerchError
+from perch_core.json_values import finite
 from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage, InertialState, OdometryState
 from perch_eval.arguments import command, command_parser, output_folder
 from perch_eval.node_launch import parse_overrides
-from perch_eval.page import finite
 from perch_eval.recordings import report
 from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check

@@ -11,6 +11,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.errors import PlanningRefusal
+from perch_core.json_values import finite
 from perch_planner.powerline.plan import Manoeuvre
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.visibility import visibility
@@ -40,7 +41,7 @@ def summary(planned: PlannedProblem) -> dict[str, Any]:
                            "solver": part.solver, "intervals": part.intervals, "cost": part.cost,
                            "peak_rotor_thrust_N": float(part.states[:, 13:17].max()), "least_height_m": float(part.states[:, 2].min())}
     certificates = [{"quantity": b.quantity, "unit": b.unit, "minimum": b.minimum, "maximum": b.maximum,
-                     "lower_limit": _finite(b.lower_limit), "upper_limit": _finite(b.upper_limit), "margin": b.margin,
+                     "lower_limit": finite(b.lower_limit), "upper_limit": finite(b.upper_limit), "margin": b.margin,
                      "holds": b.holds} for b in planned.plan.bounds]
     out = {"problem": planned.problem.name, "vehicle": planned.vehicle.name, "compiled": planned.planner.solver.compiled,
            **parts, "without_recovery": planned.plan.without_recovery, "certificates": certificates}
@@ -48,10 +49,6 @@ def summary(planned: PlannedProblem) -> dict[str, Any]:
         mount = planned.vehicle.mounts[planned.problem.settings.camera]
         out["visibility"] = visibility(planned.plan.perch.states, planned.request.target(), mount).summary()
     return out
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _without_awareness(planned: PlannedProblem) -> Manoeuvre | None:
