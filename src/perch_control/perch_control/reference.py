@@ -5,12 +5,13 @@ A source is anything with `duration` and `setpoint(t)`, t in seconds since its s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from perch_core import bernstein, so3
+from perch_core.arrays import vector3
 from perch_core.flatness import heading_derivatives
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
@@ -58,10 +59,6 @@ def fields(row):
         (row[12], row[13], row[14]), (row[15], row[16], row[17]), (row[18], row[19], row[20]), (row[21], row[22], row[23]),
         (row[24], row[25], row[26]), (row[27], row[28], row[29]), (row[30], row[31], row[32]),
     )
-
-
-def _floats(v) -> Vector:
-    return (float(v[0]), float(v[1]), float(v[2]))
 
 
 class Source(Protocol):
@@ -170,15 +167,10 @@ class FlatReference:
         return Setpoint._make(_flat_setpoint(*self.trajectory.arrays, t))
 
 
-def normalised(trajectory: SampledTrajectory) -> SampledTrajectory:
-    """The same with unit quaternions: those of a plan's samples are off by their rounding."""
-    return replace(trajectory, q=trajectory.q / np.linalg.norm(trajectory.q, axis=1)[:, None])
-
-
 def with_unit_quaternions(trajectory: SampledTrajectory) -> SampledTrajectory:
-    """`normalised` where anybody's quaternions need it; what has been normalised stays as it is to the last bit."""
+    """The same with unit quaternions where anybody's quaternions need it; what has been normalised stays as it is to the last bit."""
     off = np.abs(np.linalg.norm(trajectory.q, axis=1) - 1.0).max()
-    return trajectory if off < 1e-9 else normalised(trajectory)
+    return trajectory if off < 1e-9 else trajectory.normalised()
 
 
 @dataclass(frozen=True)
@@ -217,8 +209,8 @@ class SampledReference:
         j = rate * b3 + specific * db3
         s = 2.0 * rate * db3 + specific * ddb3
         p, v = x.p + over * (x.v + 0.5 * over * a), x.v + over * a
-        return Setpoint(_floats(p), _floats(v), _floats(a), _floats(j), _floats(s), _floats(R[:, 1]),
-                        _floats(turn[:, 1]), _floats(turn2[:, 1]), _floats(b3), _floats(db3), _floats(ddb3))
+        return Setpoint(vector3(p), vector3(v), vector3(a), vector3(j), vector3(s), vector3(R[:, 1]),
+                        vector3(turn[:, 1]), vector3(turn2[:, 1]), vector3(b3), vector3(db3), vector3(ddb3))
 
 
 def peak_thrust(source, begin: float) -> float:

@@ -7,7 +7,7 @@ Times outside [0, duration] are clamped: the first or last sample holds, with al
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
 from math import inf
@@ -207,6 +207,10 @@ class SampledTrajectory:
         q = so3.quat_slerp(self.q[k], self.q[k + 1], u)
         return StateSample(between(self.p), q, between(self.v), between(self.w), between(self.a), between(self.dw),
                            between(self.rotor_thrust))
+
+    def normalised(self) -> SampledTrajectory:
+        """The same with unit quaternions: those of a plan's samples are off by their rounding."""
+        return replace(self, q=self.q / np.linalg.norm(self.q, axis=1)[:, None])
 
     def rest_of(self, since: float, offset: Array) -> SampledTrajectory:
         """What is left of it from a sample on, moved.

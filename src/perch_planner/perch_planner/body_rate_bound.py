@@ -21,6 +21,7 @@ from perch_core.jit import compiled
 from perch_planner.bounds import (
     cross,
     derivative,
+    elevated,
     largest,
     magnitude,
     smallest,
@@ -38,21 +39,6 @@ _PARTS = len(_SIZES)
 
 
 @compiled
-def _elevate(coefficients: Array, size: int) -> Array:
-    """The same polynomial with `size` coefficients."""
-    out = coefficients
-    while len(out) < size:
-        n = len(out)
-        raised = np.empty(n + 1)
-        raised[0] = out[0]
-        raised[n] = out[n - 1]
-        for i in range(1, n):
-            raised[i] = (i * out[i - 1] + (n - i) * out[i]) / n
-        out = raised
-    return out
-
-
-@compiled
 def rate_parts(force: Array, force2: Array, jerk: Array, yaw: Array, duration: float) -> Array:
     """Bernstein coefficients of what the body rate consists of.
 
@@ -67,7 +53,7 @@ def rate_parts(force: Array, force2: Array, jerk: Array, yaw: Array, duration: f
     """
     parts = np.zeros((_PARTS, _TILT))
     x = cross(force, jerk)
-    fourth, tilt, turn = squared(force2.reshape((1, 25))), _elevate(squared(x), _TILT), derivative(yaw, 1)
+    fourth, tilt, turn = squared(force2.reshape((1, 25))), elevated(squared(x), _TILT), derivative(yaw, 1)
     for k in range(_TILT):
         parts[0, k], parts[1, k] = fourth[k], tilt[k]
     for k in range(25):

@@ -229,6 +229,21 @@ def product(a: Array, b: Array) -> Array:
 
 
 @compiled
+def elevated(coefficients: Array, size: int) -> Array:
+    """The same polynomial with `size` coefficients."""
+    out = coefficients
+    while len(out) < size:
+        n = len(out)
+        raised = np.empty(n + 1)
+        raised[0] = out[0]
+        raised[n] = out[n - 1]
+        for i in range(1, n):
+            raised[i] = (i * out[i - 1] + (n - i) * out[i]) / n
+        out = raised
+    return out
+
+
+@compiled
 def derivative(coefficients: Array, order: int) -> Array:
     """Bernstein coefficients of the order-th derivative with respect to s, shape (n + 1,) -> (n + 1 - order,)."""
     out = coefficients.copy()

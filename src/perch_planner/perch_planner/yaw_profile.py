@@ -10,6 +10,7 @@ import numpy as np
 
 from perch_core.arrays import Array
 from perch_core.jit import compiled
+from perch_planner.bounds import elevated
 from perch_planner.reference_element import DEGREE
 
 
@@ -38,12 +39,7 @@ def _yaw(yaw: float, rate: float, acceleration: float, end: float, durations: Ar
     whole[2] = 2.0 * whole[1] - whole[0] + acceleration * duration**2 / (degree * (degree - 1))
     if degree == 7:
         whole[3] = 3.0 * whole[2] - 3.0 * whole[1] + whole[0]
-    for n in range(degree + 1, DEGREE + 1):
-        raised = np.empty(n + 1)
-        raised[0], raised[n] = whole[0], whole[n - 1]
-        for k in range(1, n):
-            raised[k] = (k * whole[k - 1] + (n - k) * whole[k]) / n
-        whole = raised
+    whole = elevated(whole, DEGREE + 1)
     out = np.empty((len(durations), DEGREE + 1))
     begin = 0.0
     for i in range(len(durations)):

@@ -42,8 +42,7 @@ def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal
         return Plan(trajectory, trajectory.duration)
     if plan.recovery_start < 0.0:  # a perch alone, which the planner offers where it finds no recovery
         return Refusal(plan.message)
-    at_end = AtEnd.RECOVER if plan.perch_time else AtEnd.HOLD  # a recovery alone ends in a hover
-    return Plan(trajectory, plan.perch_time or plan.recovery_time, at_end, plan.recovery_start)
+    return Plan(trajectory, plan.perch_time or plan.recovery_time, AtEnd(plan.at_end), plan.recovery_start)
 
 
 def flown_order(id: int, plan: Plan, contact_time: float) -> TrajectoryOrder:

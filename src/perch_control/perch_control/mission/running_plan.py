@@ -21,7 +21,6 @@ from perch_core.values import AtEnd
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import TICK, Goal, Plan, PlanQuery, Refusal, State, Target
 from perch_control.mission.ways_out import DECISION, WaysOut
-from perch_control.reference import normalised
 from perch_control.smooth_position import BEFORE
 
 AHEAD_LATENCY = 0.2  # what is asked while a plan is flown is used so long after its request [s]
@@ -54,7 +53,7 @@ class RunningPlan:
         """
         if isinstance(plan.trajectory, FlatTrajectory):
             raise TypeError("a powerline plan carries states, not polynomials")
-        return cls(plan, target, settings, normalised(plan.trajectory), replanned_at)
+        return cls(plan, target, settings, plan.trajectory.normalised(), replanned_at)
 
     def state(self, time: float) -> StateSample:
         """The plan's state at a time [s]."""

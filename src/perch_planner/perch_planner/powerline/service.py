@@ -92,8 +92,7 @@ def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> Powerlin
         model: of the vehicle, for the accelerations.
         start: stamp of the trajectory's start [ns].
     """
-    sampled = found.trajectory(model, step=SAMPLE_STEP)
-    trajectory = replace(sampled, q=sampled.q / np.linalg.norm(sampled.q, axis=1)[:, None], start_time=seconds(start))
+    trajectory = found.trajectory(model, seconds(start), SAMPLE_STEP).normalised()
     perch, recovery = found.perch, found.recovery
     at_end, recovery_start = AtEnd.CONTACT, -1.0
     if recovery is not None:
