@@ -192,8 +192,8 @@ def test_tube_bounds_are_sorted_and_leave_room_on_every_axis():
     assert (lower[2], upper[2]) == pytest.approx((-10.791, -8.829))
     assert (lower[1], upper[1]) == pytest.approx((-0.33, 0.33), abs=1e-9)
     assert (lower < end).all() and (end < upper).all()
-    times = tube_times(2.0, 0.15, 0.01)
-    assert len(times) == 15 and times[0] == pytest.approx(1.85) and times[-1] == pytest.approx(1.99)
+    times = tube_times(0.15, 0.01)
+    assert len(times) == 15 and times[0] == pytest.approx(-0.15) and times[-1] == pytest.approx(-0.01)
 
 
 def test_full_cost_is_the_papers_integral():

@@ -76,7 +76,7 @@ def test_detector_finds_all_tags_where_the_camera_model_puts_them(inclination, d
         corners, ids, _ = DETECTOR.detectMarkers(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC))
         seen.append(set(ids.ravel()))
         for tag_id, found in zip(ids.ravel(), corners):
-            tag_W = scene.target.to_world(BOARD.corners_S[BOARD.ids.index(tag_id)])
+            tag_W = scene.target.p_WS + BOARD.corners_S[BOARD.ids.index(tag_id)] @ scene.target.R_WS.T
             expected, _ = CAMERA.project((tag_W - p_WC) @ R_WC)
             np.testing.assert_allclose((found[0] + 0.5) / zoom - 0.5, expected, atol=2.0)  # unrefined corners
     assert set.union(*seen) == {0, 1, 2, 3}

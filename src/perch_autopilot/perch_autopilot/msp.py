@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from perch_core.errors import PerchError
 
-API_VERSION, FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, RC, ATTITUDE, STATUS, SET_RAW_RC, REBOOT = 1, 2, 3, 110, 102, 105, 108, 150, 200, 68
+FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, ATTITUDE, STATUS, SET_RAW_RC = 2, 3, 110, 102, 108, 150, 200
 LONGEST = 255
 GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000 deg/s
 VERSIONS = ((4, 3), (4, 6))

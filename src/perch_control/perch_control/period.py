@@ -15,8 +15,8 @@ class MeasuredPeriod:
         value: [s].
     """
 
-    def __init__(self, nominal: float = NOMINAL_PERIOD) -> None:
-        self.value = nominal
+    def __init__(self) -> None:
+        self.value = NOMINAL_PERIOD
         self._last: float | None = None
         self._differences: list[float] = []
 

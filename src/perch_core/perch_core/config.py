@@ -56,9 +56,9 @@ def text(default: Any = MISSING, *, doc: str = "") -> Any:
     return field(default=default, metadata={"doc": doc})
 
 
-def label(default: Any = MISSING, *, doc: str = "") -> Any:
+def label(default: Any = MISSING) -> Any:
     """What folders, files or topics are named after: no separators, no control characters."""
-    return field(default=default, metadata={"label": True, "doc": doc})
+    return field(default=default, metadata={"label": True})
 
 
 def part(cls: type, *, doc: str = "") -> Any:

@@ -32,7 +32,6 @@ class FlatState:
         w_WB_B: angular velocity in B [rad/s], shape (3,).
         dw_WB_B: angular acceleration in B [rad/s^2], shape (3,).
         thrust: collective thrust along b3 [N].
-        thrust_rate: its time derivative [N/s].
     """
 
     p_WB: Array
@@ -41,7 +40,6 @@ class FlatState:
     w_WB_B: Array
     dw_WB_B: Array
     thrust: float
-    thrust_rate: float
 
 
 @compiled(inline=True)
@@ -156,5 +154,4 @@ def flat_to_state(p: Numbers, v: Numbers, a: Numbers, j: Numbers, s: Numbers, ya
         w_WB_B=np.array(w),
         dw_WB_B=np.array(dw),
         thrust=mass * specific,
-        thrust_rate=mass * dot(b3, j),
     )

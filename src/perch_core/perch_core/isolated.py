@@ -85,13 +85,13 @@ class IsolatedRunner:
         self._thread = threading.Thread(target=self._serve, name="isolated jobs", daemon=True)
         self._thread.start()
 
-    def wait_ready(self, timeout: float = START_TIMEOUT) -> bool:
+    def wait_ready(self) -> bool:
         """Wait until the supervisor has loaded everything.
 
         Raises:
             JobFailed: it could not; the message says why.
         """
-        if not self._started.wait(timeout):
+        if not self._started.wait(START_TIMEOUT):
             return False
         if self._problem:
             raise JobFailed(self._problem)

@@ -65,12 +65,6 @@ class PerchSurface:
         return self.R_WS[:, 2]
 
     @property
-    def inclination(self) -> float:
-        """Angle between the surface and the ground [rad], in [0, pi]."""
-        s3 = self.normal
-        return float(np.arctan2(np.hypot(s3[0], s3[1]), s3[2]))
-
-    @property
     def heading(self) -> float:
         """Heading of the approach [rad], from s2."""
         s2 = self.R_WS[:, 1]
@@ -79,10 +73,6 @@ class PerchSurface:
     def to_surface(self, points_W: Array) -> Array:
         """Points of W in S: (..., 3) -> (..., 3) [m]; the third entry is the distance in front of the surface."""
         return (np.asarray(points_W, dtype=float) - self.p_WS) @ self.R_WS
-
-    def to_world(self, points_S: Array) -> Array:
-        """Points of S in W: (..., 3) -> (..., 3) [m]."""
-        return np.asarray(points_S, dtype=float) @ self.R_WS.T + self.p_WS
 
     def distance(self, points_W: Array) -> Array:
         """Signed distance of points (..., 3) from the plane [m], positive on the outer side; shape (...)."""
@@ -93,9 +83,3 @@ class PerchSurface:
         points_S = self.to_surface(points_W)
         inside: np.ndarray = np.all(np.abs(points_S[..., :2]) <= np.array(self.size) / 2, axis=-1)
         return inside
-
-    @property
-    def corners_W(self) -> Array:
-        """Corners in W [m], shape (4, 3): top left, top right, bottom right, bottom left, seen from outside, s1 up."""
-        a, b = np.array(self.size) / 2
-        return self.to_world(np.array([[a, b, 0.0], [a, -b, 0.0], [-a, -b, 0.0], [-a, b, 0.0]]))

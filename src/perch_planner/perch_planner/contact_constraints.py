@@ -131,12 +131,12 @@ def _bubbles(count: int, given: Flags, first_in_tube: int, everywhere: bool) -> 
 
 
 @compiled
-def tube_times(duration: float, tube_time: float, tube_step: float) -> Array:
-    """The instants t_f - t_k + j dt, 0 <= j < t_k / dt, of the tube [s]. [M:eq15]"""
+def tube_times(tube_time: float, tube_step: float) -> Array:
+    """The instants -t_k + j dt, 0 <= j < t_k / dt, of the tube, from the contact on [s]. [M:eq15]"""
     count = int(np.ceil(tube_time / tube_step - 1e-9))
     out = np.empty(count)
     for j in range(count):
-        out[j] = duration - tube_time + tube_step * j
+        out[j] = tube_step * j - tube_time
     return out
 
 
@@ -162,7 +162,7 @@ def _contact(points: Array, v: Array, a: Array, j: Array, places: Indices, order
         given[places[q], orders[q]], values[places[q], orders[q]] = True, fixed[q]
     lower, upper = tube_bounds(acceleration, share, floor)
     directions, window_lower, window_upper = _window(R_WS, velocity, delay * acceleration, least, most, tangential)
-    return given, values, (tube_times(0.0, tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
+    return given, values, (tube_times(tube_time, tube_step), lower + INSET, upper - INSET, directions, window_lower,
                            window_upper)
 
 

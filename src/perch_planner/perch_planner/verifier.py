@@ -20,6 +20,7 @@ from numpy.polynomial import polynomial as power
 from perch_core.arrays import Array, Numbers
 
 _G = 9.81
+_TOLERANCE = 1e-9  # of the end conditions, relative to 1 + their size
 _TURN = 1e-4  # [s] between the rotations from which rates and accelerations are taken
 
 
@@ -172,7 +173,7 @@ def _turn(before: Axes, after: Axes) -> Array:
     return 0.5 * np.stack([dot(2, 1) - dot(1, 2), dot(0, 2) - dot(2, 0), dot(1, 0) - dot(0, 1)], axis=1)
 
 
-def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 1e-4, tolerance: float = 1e-9) -> list[Finding]:
+def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 1e-4) -> list[Finding]:
     """Check a plan against everything that was asked.
 
     Args:
@@ -180,7 +181,6 @@ def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 
         segments: Bernstein coefficients of x, y, z, yaw of each segment, shape (f, 4, n + 1).
         need: the requirements.
         step: sampling of the dense check [s].
-        tolerance: of the end conditions, relative to 1 + their size.
 
     Returns:
         What is broken; empty for a good plan.
@@ -192,7 +192,7 @@ def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 
 
     def equal(name: str, value: Any, wanted: Array, t: float, slack: float = 1.0) -> None:
         excess = float(np.abs(np.asarray(value) - wanted).max())
-        if not excess <= tolerance * slack * (1.0 + float(np.abs(wanted).max())):
+        if not excess <= _TOLERANCE * slack * (1.0 + float(np.abs(wanted).max())):
             found.append(Finding(name, excess, t))
 
     def at_most(name: str, value: float, limit: float, t: float, slack: float) -> None:

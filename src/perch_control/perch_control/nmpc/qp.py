@@ -17,7 +17,7 @@ class QpFailure(RuntimeError):
 
 
 def solve(H: np.ndarray, h: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray, row_low: np.ndarray,
-          row_high: np.ndarray, soft: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+          row_high: np.ndarray, soft: np.ndarray) -> np.ndarray:
     """Minimise `x' H x / 2 + h' x` within a box and rows.
 
     Args:

@@ -70,10 +70,6 @@ class PerchPose:
             raise PlanningRefusal("bad_input", "perch pitch", -1.0, f"{error}; give a pose") from error
         return cls(grip + offset * s3_W, s3_W, np.zeros(3) if v_W is None else np.array(v_W, float))
 
-    def tilt(self) -> float:
-        """Angle of b3 from the vertical [rad]."""
-        return float(so3.angle_between(self.s3_W, E3))
-
 
 @dataclass(frozen=True)
 class PowerlineRequest:

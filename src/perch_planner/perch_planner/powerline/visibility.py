@@ -11,6 +11,8 @@ from perch_core.camera_mount import CameraMount
 from perch_core.components import components
 from perch_core.rotor_model import P, Q
 
+SAMPLES = 41  # points along the segment for `in_image`
+
 
 @dataclass(frozen=True)
 class Visibility:
@@ -39,14 +41,13 @@ class Visibility:
         }
 
 
-def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount, samples: int = 41) -> Visibility:
+def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount) -> Visibility:
     """Line metrics of the states of a trajectory.
 
     Args:
         states: shape (m, 17).
         line: the target.
         mount: camera and its place on the body.
-        samples: points along the segment for `in_image`.
     """
     fx, fy = float(mount.camera.K[0, 0]), float(mount.camera.K[1, 1])
     p_WB, q_WB = components(states[:, P]), components(states[:, Q])
@@ -54,7 +55,7 @@ def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount, samp
                                     components(mount.p_BC), components(so3.quat_from_matrix(mount.R_BC)))
     n_I, l_I = lines.image_line(o_C, l_C, fx, fy)
     place, depth = lines.segment_place(*lines.image_line(o_C, l_C), o_C, line.half_length)
-    points_W = line.centre + np.linspace(-line.half_length, line.half_length, samples)[:, None] * line.direction
+    points_W = line.centre + np.linspace(-line.half_length, line.half_length, SAMPLES)[:, None] * line.direction
     seen = np.empty(len(states))
     for k, state in enumerate(states):
         R_WC = so3.quat_to_matrix(state[Q]) @ mount.R_BC
