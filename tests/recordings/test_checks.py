@@ -161,7 +161,28 @@ def test_a_path_too_straight_to_align_attitudes_by_says_nothing_of_them():
     assert evaluate(Trajectory(truth.stamps, wide.p + 0.002 * rng.standard_normal((n, 3)), truth.q), wide).ate_deg < 0.5
 
 
+def test_truth_of_an_imu_that_is_turned_in_the_body_is_turned_with_it():
+    truth, q_BI = circle(), np.array([0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
+    told = truth.turned(q_BI)  # attitudes of the IMU
+    assert np.degrees(np.abs(evaluate(truth, told).turn).max()) > 80.0 or evaluate(truth, told).final > 0.5
+    e = evaluate(truth, told.turned(q_BI * [-1, -1, -1, 1]))
+    assert e.final < 1e-6 and np.degrees(np.abs(e.turn).max()) < 1e-5
+
+
+def test_poses_of_the_truth_count_however_rare_they_are():
+    truth = circle(41)  # 5 Hz
+    found, good = truth.at(truth.stamps)
+    assert good.all()
+    np.testing.assert_allclose(found.p, truth.p, atol=1e-12)
+    assert not truth.at(truth.stamps[:-1] + 10**8)[1].any()
+
+
 def test_trajectories_are_read_to_the_nanosecond(tmp_path):
+    lines = {"-1.25": -1_250_000_000, "-0.5": -500_000_000, ".5": 500_000_000, "1.403715529267142926e+18": 1_403_715_529_267_142_926,
+             "1403715529.267142926": 1_403_715_529_267_142_926}
+    for text, stamp in lines.items():
+        (tmp_path / "one.tum").write_text(f"{text} 0 0 0 0 0 0 1\n2e9 0 0 0 0 0 0 1\n")
+        assert stamp in read_trajectory(tmp_path / "one.tum").stamps
     truth = circle(20)
     write_tum(tmp_path / "a.tum", truth)
     again = read_trajectory(tmp_path / "a.tum")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -15,13 +16,14 @@ from oracles import rigid_body
 from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.l1 import L1Augmentation
+from perch_control.monitors import reference_tilt_deg
 from perch_control.nmpc import LineWeights
 from perch_control.nmpc.controller import LINE_RAMP
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import StageLayout, stage
 from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
 from perch_control.reference import FlatReference, SampledReference
-from perch_control.rotor_lag import approached, lag_behind, leading_command
+from perch_control.rotor_lag import RotorEstimate, approached, lag_behind, leading_command
 from perch_core import so3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
@@ -99,7 +101,7 @@ def test_compiled_linearisation_and_finite_differences_agree(states, with_lines)
 def test_reference_rows_are_those_of_their_times():
     source, vehicle, out = FlatReference(perch("surface_90_1.7m").trajectory), packed_vehicle(SNAPDRAGON), np.zeros((21, 17))
     rows = ReferenceRows(vehicle, 0.5, 500, 0.002)
-    for elapsed in (0.0, 0.002, 0.05, 0.052, 0.3, 1.9):
+    for elapsed in (0.0, 0.002, 0.05, 0.052, 0.3, 1.9, 0.3007, 0.3027):  # the last two between the periods of the others
         rows.fill(source, elapsed, 25, out)
         for k in range(21):
             expected = reference_row(source.setpoint(elapsed + 0.05 * k).packed, 0.5, vehicle)
@@ -111,6 +113,47 @@ def test_perch_in_closed_loop(thrust_states):
     arrival, _ = fly_to_contact(perch("surface_90_1.7m"), law=predictive(thrust_states=thrust_states))
     assert arrival.holds, arrival
     assert np.all(arrival.rmse < 0.02)
+
+
+@pytest.fixture(scope="module")
+def dive():
+    """The planned perch upside down, with the states of its way."""
+    return problem.plan(problem.load("powerline_line_180")).plan.trajectory(RotorModel.of(RPG))
+
+
+def turned(trajectory, yaw):
+    """A trajectory turned about the vertical."""
+    Z = Rotation.from_euler("z", yaw)
+    q = np.array([so3.quat_multiply(Z.as_quat(), q) for q in trajectory.q])
+    return replace(trajectory, p=Z.apply(trajectory.p), v=Z.apply(trajectory.v), a=Z.apply(trajectory.a), q=q)
+
+
+@pytest.mark.parametrize("yaw", [2.2, np.pi - 0.05, np.pi, np.pi + 0.02])
+def test_the_first_command_does_not_depend_on_the_heading(dive, yaw):
+    """Where quaternions of neighbouring nodes change their sign, too."""
+    law, k = predictive(vehicle=RPG), RPG.thrust_coefficient
+    for t in np.arange(dive.duration - 2.0, dive.duration - 0.6, 0.05):
+        found = []
+        for path in (dive, turned(dive, yaw)):
+            law.begin()
+            x = path.sample(float(t))
+            speeds = tuple(np.sqrt(np.clip(x.rotor_thrust, RPG.thrust_min, None) / k))
+            source = SampledReference(path, RPG.mass)
+            reference = SimpleNamespace(source=source, elapsed=float(t), setpoint=lambda ahead=0.0, at=source.setpoint, t=float(t): at(t + ahead))
+            found.append(law.control((*x.p, *x.v, *x.q, *x.w), reference, RotorEstimate(speeds, speeds)))
+        assert np.abs(np.subtract(found[0].rotor_thrust, found[1].rotor_thrust)).max() < 0.02
+
+
+def test_a_blend_is_no_tilt(dive):
+    """Near free fall the acceleration that a blend adds may point anywhere; what is flown is the attitude that the plan carries."""
+    source, least = SampledReference(dive, RPG.mass), 0.0
+    for t in np.linspace(0.0, dive.duration, 200):
+        x = source.setpoint(float(t))
+        pushed = x._replace(a=tuple(np.add(x.a, (0.0, 0.0, -4.0))))
+        state = (*x.p, *x.v, *dive.sample(float(t)).q, 0.0, 0.0, 0.0)
+        assert reference_tilt_deg(state, pushed) < 0.1
+        least = min(least, x.a[2] + 9.81 - 4.0)
+    assert least < 0.0  # along the acceleration it would be half a turn
 
 
 def test_a_reference_keeps_the_attitude_that_it_carries():

@@ -72,7 +72,10 @@ vary:
     assert scenario.target.distance == run.values["target.distance"]
     assert scenario.wind.steady == (0.0, run.values["wind.steady.1"], 0.0)
     assert scenario.parameters["controller"]["gains.lead"] == run.values["parameters.controller.gains.lead"]
-    assert len({r.seed for r in campaign.runs}) == 12
+    for k in range(3):  # each point is flown under the same draws
+        same = campaign.runs[4 * k:4 * k + 4]
+        assert len({(r.seed, r.values["wind.steady.1"], r.values["parameters.controller.gains.lead"]) for r in same}) == 1
+    assert len({r.seed for r in campaign.runs}) == 3
 
 
 def test_seeds_are_no_axis_of_a_map(tmp_path):
@@ -85,6 +88,25 @@ def test_seeds_are_no_axis_of_a_map(tmp_path):
         load_campaign(file)
 
 
+def test_flights_that_would_be_the_same_are_refused(tmp_path):
+    file = write(tmp_path, "name: g\nruns: 3\nvary: {seed: {grid: [1, 2]}}\n")
+    assert [run.seed for run in load_campaign(file, runs=1).runs] == [1, 2]
+    with pytest.raises(ConfigError, match="only 2 of 6 flights differ"):
+        load_campaign(file)
+
+
+def test_a_flight_keeps_its_seed_whatever_is_varied(tmp_path):
+    one = load_campaign(write(tmp_path, "name: g\nruns: 3\nvary: {target.distance: {uniform: [1.0, 3.0]}}\n"))
+    two = load_campaign(write(tmp_path, "name: g\nruns: 3\nvary: {wind.steady.0: {uniform: [0.0, 1.0]}, target.distance: {uniform: [1.0, 3.0]}}\n"))
+    assert [run.seed for run in one.runs] == [run.seed for run in two.runs]
+
+
+def test_an_entry_of_a_vector_leaves_the_others_as_they_are(tmp_path):
+    campaign = load_campaign(write(tmp_path, "name: g\nruns: 1\nvary: {disturbance.rotor_thrust_factor.1: {grid: [0.9]}, world.room.2: {grid: [5.0]}}\n"))
+    scenario = scenario_of(campaign.mapping(campaign.runs[0]), "c")
+    assert scenario.disturbance.rotor_thrust_factor == (1.0, 0.9, 1.0, 1.0) and scenario.world.room == (10.0, 5.0, 5.0)
+
+
 def test_more_runs_keep_the_first_ones(tmp_path):
     file = write(tmp_path, "name: g\nruns: 5\nvary: {target.distance: {uniform: [1.0, 3.0]}}\n")
     assert load_campaign(file, runs=20).runs[:5] == load_campaign(file).runs
@@ -94,7 +116,7 @@ def test_more_runs_keep_the_first_ones(tmp_path):
 @pytest.mark.parametrize("vary, words", [
     ("target.distanse: {uniform: [1.0, 2.0]}", "distanse"),
     ("target.distance: {uniform: [5.0, 6.0]}", "outside"),
-    ("wind.steady.7: {uniform: [0.0, 1.0]}", "3 entries"), ("wind.gust_sigma.0: {uniform: [0.0, 1.0]}", "gust_sigma: .* is not of type float"),
+    ("wind.steady.7: {uniform: [0.0, 1.0]}", "3 entries"), ("wind.gust_sigma.0: {uniform: [0.0, 1.0]}", "vary.wind.gust_sigma.0: gust_sigma is no vector"),
     ("seed: {grid: [.nan]}", "vary.seed.grid: .* are not all numbers"),
     ("seed: {grid: [1.5]}", "vary.seed: .* is not a grid or choice of whole numbers in .0, 2147483647."),
     ("seed: {grid: [one]}", "vary.seed"), ("seed: {uniform: [1, 2]}", "vary.seed"), ("seed: {choice: [-1]}", "vary.seed"),

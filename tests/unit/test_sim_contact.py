@@ -139,6 +139,29 @@ def test_a_fall_is_a_crash_and_stops_the_rotors():
     assert np.all(plant.rotor_speed < 1.0)
 
 
+def test_the_point_that_touches_decides_on_a_crash_not_the_middle_of_the_plate():
+    """A vehicle that tumbles slowly into the wall hits it with a fast rotor; one that flies the same way without the spin touches it softly."""
+    for spin, crashed in ((30.0, True), (0.0, False)):
+        plant = plant_of()
+        throw(plant, normal=0.3, tilt_deg=45.0, gap=0.0)
+        state = plant.state
+        plant.place(state.p_WB, state.q_WB, state.v_WB, np.array([0.0, spin, 0.0]), OFF)
+        events, _ = run(plant, 0.15)
+        assert first(events).state is ContactState.COLLISION and plant.contact.crashed is crashed, (spin, first(events))
+        assert not crashed or first(events).normal_speed < 2.0
+
+
+def test_a_second_hard_impact_is_a_crash():
+    plant = plant_of()
+    throw(plant, normal=0.1, gap=0.001)  # too soft for the velcro
+    events, _ = run(plant, 0.03)
+    assert first(events).state is ContactState.BOUNCED and not plant.contact.crashed
+    state = plant.state
+    plant.place(state.p_WB, state.q_WB, -4.0 * SCENARIO.surface.normal, np.zeros(3), OFF)
+    events, _ = run(plant, 0.03)
+    assert plant.contact.crashed and "above 2 m/s" in events[0].reason
+
+
 def test_tipping_over_on_the_floor_is_a_crash():
     plant = plant_of()
     plant.place(np.array([0, 0, 0.16]), so3.quat_exp(np.array([np.radians(80), 0, 0])), np.zeros(3), np.zeros(3), OFF)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
-from perch_core.values import AtEnd, Contact
+from perch_core.values import AtEnd, Contact, seconds
 from perch_core.vehicle import Vehicle
 from perch_eval.consistency import attitude_error
 from perch_eval.flight import Flight, States
@@ -123,7 +123,7 @@ def figures(report: dict[str, Any], end_time: float) -> dict[str, float | None]:
     out: dict[str, float | None] = {"simulated_time_s": end_time}
     for name in ("max_body_rate_deg_s", "max_acceleration_m_s2", "attitude_error_at_end_deg"):
         out[name] = report.get(name)
-    for name in ("tracking_rmse_m", "estimation_rmse_m"):
+    for name in ("tracking_rmse_m", "estimation_rmse_m") if report.get("perch_planned") else ():  # else of a hover
         for axis, value in zip("xyz", report.get(name) or ()):
             out[f"{name}_{axis}"] = value
     for part, names in (("contact", ("normal_speed_m_s", "tangential_speed_m_s", "tilt_error_deg", "offset_m", "time")),
@@ -142,7 +142,8 @@ def target_error(flight: Flight) -> dict[str, float] | None:
     if not true or not found or not plans:
         return None
     used = [pose for t, pose in found if t <= plans[0]] or [found[0][1]]
-    pad, pose = true[-1][1], used[-1]
+    pose = used[-1]
+    pad = min(true, key=lambda sent: abs(sent[0] - seconds(pose.stamp)))[1]  # it may move
     dp = np.array(pose.p_WS) - np.array(pad.p)
     turn = attitude_error(np.array(pad.q), np.array(pose.q_WS))
     return {"position_m": float(np.linalg.norm(dp)), "attitude_deg": math.degrees(float(np.linalg.norm(turn)))}

@@ -89,37 +89,37 @@ class ContactMonitor:
         """Let go; what is touched still is not held again before it was left."""
         self._attachment, self.hold = None, FREE
 
-    def update(self, time: float, before: np.ndarray, x: np.ndarray, distances: np.ndarray) -> list[Contact]:
+    def update(self, time: float, before: np.ndarray, x: np.ndarray, touched: np.ndarray) -> list[Contact]:
         """What changed at this instant.
 
         Args:
             time: [s].
             before: state one integration step ago (13,): an impact is judged before its forces have worked.
             x: state (13,).
-            distances: of the plate and of everything else to each surface (m, 2) [m]; negative touches.
+            touched: of each surface, as `dynamics.clearances` writes it (m, 3); negative distances touch.
         """
         events = []
-        for s in range(len(distances)):
-            plate, rest = distances[s, 0] < 0.0, distances[s, 1] < 0.0
+        for s in range(len(touched)):
+            plate, rest, speed = touched[s, 0] < 0.0, touched[s, 1] < 0.0, float(touched[s, 2])
             if self._attachment is not None and s == self._attachment.surface:
                 continue
             if plate or rest:
-                event = self._touch(time, s, before, x, rest)
+                event = self._touch(time, s, before, x, rest, speed)
                 events += [event] if event else []
         events += self._separations(time)
         if self._attachment is not None:
             self.hold = self._attachment.hold(time)
         return events
 
-    def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool) -> Contact | None:
-        known = self._touched.get(s)
-        if known is not None and (known[1] is ContactState.COLLISION or not rest):
+    def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool, speed: float) -> Contact | None:
+        known, breaks = self._touched.get(s), speed > CRASH_SPEED and not self.crashed
+        if known is not None and not breaks and (known[1] is ContactState.COLLISION or not rest):
             self._touched[s] = (time, known[1])
             return None
         surfaces = self._obstacles.surfaces
         p_WS = surfaces.origin[s] + surfaces.velocity[s] * time
         impact = impact_of(before, self._plate_offset, p_WS, surfaces.axes[s], surfaces.velocity[s])
-        state, reason = self._judge(s, impact, rest)
+        state, reason = self._judge(s, impact, rest, speed)
         self._touched[s] = (time, state)
         if state is ContactState.ATTACHED:
             self._attach(time, s, x, p_WS)
@@ -127,10 +127,10 @@ class ContactMonitor:
         return Contact(nanoseconds(time), state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
                        impact.tilt_error, offset, reason)
 
-    def _judge(self, s: int, impact: Impact, rest: bool) -> tuple[ContactState, str]:
-        name = self._obstacles.names[s]
-        fast = impact.normal_speed > CRASH_SPEED
-        too_fast = f"hit the {name} with {impact.normal_speed:.2f} m/s, above {CRASH_SPEED:g} m/s"
+    def _judge(self, s: int, impact: Impact, rest: bool, speed: float) -> tuple[ContactState, str]:
+        """What a touch is; `speed` is that of its fastest point into the surface [m/s]."""
+        name, fast = self._obstacles.names[s], speed > CRASH_SPEED
+        too_fast = f"hit the {name} with {speed:.2f} m/s, above {CRASH_SPEED:g} m/s"
         if self.crashed:
             return ContactState.COLLISION, f"the wreck touched the {name}"
         if name == "floor":
@@ -140,7 +140,7 @@ class ContactMonitor:
             tilt = f"touched the floor tilted by {math.degrees(impact.tilt_error):.0f} deg"
             return ContactState.COLLISION, f"crashed: {too_fast if fast else tilt}"
         self.crashed = fast
-        if rest or s != self._obstacles.pad:
+        if fast or rest or s != self._obstacles.pad:
             part = "a rotor" if rest else "the plate"
             return ContactState.COLLISION, f"crashed: {too_fast}" if fast else f"{part} touched the {name}"
         refusal = adhesion_refusal(impact, self._adhesion, self._obstacles.pad_half)

@@ -268,23 +268,37 @@ def advance(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.nda
 
 
 @compiled
-def clearances(x: np.ndarray, body: Body, surfaces: Surfaces, time: float, out: np.ndarray) -> float:
-    """Smallest distances to each surface: of the plate and of everything else, written to `out` (m, 2) [m].
+def clearances(x: np.ndarray, before: np.ndarray, body: Body, surfaces: Surfaces, time: float, out: np.ndarray) -> float:
+    """What each surface meets, written to `out` (m, 3).
+
+    Its columns are the smallest distances of the plate and of everything else [m], and the greatest speed into the surface of a
+    point that is inside [m/s], one step earlier: an impact is judged before its forces have worked.
+
+    Args:
+        x, before: state, and that one step earlier (13,).
 
     Returns:
-        The smallest of all [m]; NO_CONTACT where nothing is in reach.
+        The smallest distance of all [m]; NO_CONTACT where nothing is in reach.
     """
-    R, point, least = rotation(x[3:7]), np.empty(3), NO_CONTACT
+    R, point, velocity, least = rotation(x[3:7]), np.empty(3), np.empty(3), NO_CONTACT
+    R_before = rotation(before[3:7])
     for s in range(surfaces.origin.shape[0]):
         out[s, 0] = out[s, 1] = NO_CONTACT
+        out[s, 2] = 0.0
         if not _near(s, x, surfaces, time, body.reach):
             continue
         for k in range(body.points.shape[0]):
             r = body.points[k]
             for i in range(3):
                 point[i] = x[i] + R[i, 0] * r[0] + R[i, 1] * r[1] + R[i, 2] * r[2]
-            part = 0 if k < PLATE_POINTS else 1
-            out[s, part] = min(out[s, part], _depth(s, point, surfaces, time))
+            part, z = 0 if k < PLATE_POINTS else 1, _depth(s, point, surfaces, time)
+            out[s, part] = min(out[s, part], z)
+            if z < 0.0:
+                _point_velocity(before, R_before, r, velocity)
+                into = 0.0
+                for i in range(3):
+                    into += (surfaces.velocity[s, i] - velocity[i]) * surfaces.axes[s, i, 2]
+                out[s, 2] = max(out[s, 2], into)
         least = min(least, out[s, 0], out[s, 1])
     return least
 
@@ -292,23 +306,24 @@ def clearances(x: np.ndarray, body: Body, surfaces: Surfaces, time: float, out: 
 @compiled
 def advance_to_touch(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.ndarray, body: Body,
                      surfaces: Surfaces, hold: Hold, time: float, step: float, path: np.ndarray, inertial: np.ndarray,
-                     distances: np.ndarray) -> tuple[int, bool]:
+                     touched: np.ndarray) -> tuple[int, bool]:
     """Steps of `advance` until something is touched: one call per control period in free flight.
 
     Args:
         path: receives the state after each step (n, 13); n is the most steps that are made.
         inertial: gains what `advance` gives in each step, (6,).
-        distances: as in `clearances`, after the last step.
+        touched: as in `clearances`, after the last step.
 
     Returns:
         Steps made, and whether something is touched after the last one.
     """
-    sample = np.empty(6)
+    sample, before = np.empty(6), np.empty(13)
     for k in range(path.shape[0]):
+        before[:] = x
         advance(x, speeds, command, wind, body, surfaces, hold, time + k * step, step, sample)
         for i in range(6):
             inertial[i] += sample[i]
         path[k] = x
-        if clearances(x, body, surfaces, time + (k + 1) * step, distances) <= 0.0:
+        if clearances(x, before, body, surfaces, time + (k + 1) * step, touched) <= 0.0:
             return k + 1, True
     return path.shape[0], False

@@ -62,7 +62,7 @@ class Plant:
         self._start = start
         self._x = resting_state(scenario, self.body)
         self._wind = WindField(scenario.wind, CONTROL_PERIOD, seeding.stream(seed, "wind"))
-        self._distances = np.zeros((len(self.obstacles.names), 2))
+        self._touched = np.zeros((len(self.obstacles.names), 3))
         self._warm_up()
 
     @property
@@ -110,7 +110,7 @@ class Plant:
             begin = (self.time - self._start) * 1e-9 + done * STEP
             made, touched = advance_to_touch(
                 self._x, self.rotor_speed, np.zeros(4) if self.crashed else target, wind, self.body,
-                self.obstacles.surfaces, self.hold, begin, STEP, path[done:last], total, self._distances)
+                self.obstacles.surfaces, self.hold, begin, STEP, path[done:last], total, self._touched)
             before = path[done + made - 2] if made > 1 else before
             done += made
             if touched or not self.contact.free:
@@ -124,10 +124,10 @@ class Plant:
     def _warm_up(self) -> None:
         """Compile the kernels now, on a copy of the state, rather than in the first step of a flight in real time."""
         advance_to_touch(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces, FREE,
-                         0.0, STEP, np.empty((1, STATES)), np.zeros(6), self._distances)
+                         0.0, STEP, np.empty((1, STATES)), np.zeros(6), self._touched)
 
     def _touches(self, time: int, before: np.ndarray) -> list[Contact]:
         """Judge what is touched at a time [ns]; `before` is the state one step earlier."""
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
-        events = self.contact.update(elapsed, before, self._x, self._distances)
+        events = self.contact.update(elapsed, before, self._x, self._touched)
         return [event._replace(stamp=time) for event in events]

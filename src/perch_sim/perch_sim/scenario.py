@@ -200,6 +200,12 @@ class Scenario:
         for node in self.parameters or {}:
             if node not in NODES:
                 raise ConfigError("", f"parameters.{node}", f"is not one of {', '.join(NODES)}")
+        x, y, z = self.start.position
+        if self._outside(np.array(self.start.position)) or z != 0.0:
+            raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m is no place on the floor of the room")
+        low, high = self.adhesion.normal_speed
+        if not low < high:
+            raise ConfigError("", "adhesion.normal_speed", f"[{low:g}, {high:g}] m/s is empty")
         self._check_cables()
         if self.mode == "surface":
             self._check_target()

@@ -156,7 +156,7 @@ def _check(campaign: Campaign, file: str) -> None:
 
 
 def place(mapping: dict[str, Any], name: str, value: Any) -> None:
-    """Set a dotted name in a scenario's mapping; a number names an entry of a vector that is zero otherwise."""
+    """Set a dotted name in a scenario's mapping; a number names an entry of a vector."""
     *groups, leaf = name.split(".")
     value = list(value) if isinstance(value, tuple) else value
     if groups[:1] == ["parameters"] and len(groups) >= 2:
@@ -164,7 +164,7 @@ def place(mapping: dict[str, Any], name: str, value: Any) -> None:
     elif groups and leaf.isascii() and leaf.isdigit():
         *outer, vector = groups
         target = _group(mapping, outer)
-        entries = target.get(vector, [0.0, 0.0, 0.0])
+        entries = target.get(vector, _default(groups))
         if not isinstance(entries, list):
             raise ConfigError("campaign", f"vary.{name}", f"{vector} is no vector")
         if int(leaf) >= len(entries):
@@ -172,6 +172,14 @@ def place(mapping: dict[str, Any], name: str, value: Any) -> None:
         target[vector] = [*entries[:int(leaf)], value, *entries[int(leaf) + 1:]]
     else:
         _group(mapping, groups)[leaf] = value
+
+
+def _default(groups: list[str]) -> Any:
+    """What a scenario has where its mapping says nothing, vectors as lists."""
+    value: Any = Scenario(name="defaults")
+    for group in groups:
+        value = getattr(value, group, None)
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
@@ -185,16 +193,25 @@ def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
 
 
 def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, ...]:
-    """Grid points, each with `runs` draws of the rest. The k-th run is the same however many there are."""
+    """Grid points, each with the same `runs` draws of the rest: points are compared under equal conditions.
+
+    The k-th draw is the same however many there are, and its flight's seed whatever is varied.
+
+    Raises:
+        ConfigError: two flights would be the same.
+    """
     grids = {name: d.values for name, d in vary.items() if d.kind == "grid"}
     points = [dict(zip(grids, point)) for point in itertools.product(*grids.values())]
     out = []
     for number in range(runs * len(points)):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number // len(points),)))
+        drawn_seed = int(rng.integers(1, LARGEST_SEED))
         values = {name: d.draw(rng) for name, d in vary.items() if d.kind != "grid"}
         values |= points[number % len(points)]
-        flight_seed = int(values.pop("seed", int(rng.integers(1, 2**31 - 1))))
-        out.append(Run(number, flight_seed, values))
+        out.append(Run(number, int(values.pop("seed", drawn_seed)), values))
+    different = len({(run.seed, json.dumps(run.values)) for run in out})
+    if different < len(out):
+        raise ConfigError("campaign", "runs", f"only {different} of {len(out)} flights differ: ask for fewer, or do not vary `seed`")
     return tuple(out)
 
 

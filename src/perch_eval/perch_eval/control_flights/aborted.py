@@ -24,7 +24,7 @@ class Aborted:
     Attributes:
         scenario, seed, before: what was flown, and when the goal was cancelled: time before the planned contact [s].
         planned: the vehicle left the plan by a planned way out.
-        end: hovering, attached, or what the controller's state is called otherwise; broken where the vehicle has hit something.
+        end: by the truth: never cancelled, broken (the vehicle has hit something), attached, hovering; or else the controller's state.
         message: the mission's words.
         rate: largest body rate after the cancellation [rad/s].
         margin: least thrust margin of a rotor's command after it.
@@ -71,6 +71,8 @@ def fly_aborted(scenario: str, seed: int, before: float) -> Aborted:
     loop.close()
     state = State(statuses[-1].state)
     hovering = state is State.HOVERING and float(np.linalg.norm(simulation.state.v_WB)) < AT_REST
-    end = "broken" if simulation.plant.crashed else "hovering" if hovering else state.name.lower()
+    held = simulation.plant.contact.attached or simulation.plant.cables.hold.active
+    end = ("never cancelled" if not cancelled else "broken" if simulation.plant.crashed else "attached" if held else
+           "hovering" if hovering else state.name.lower())
     return Aborted(scenario, seed, before, any("as planned" in s.message for s in statuses), end, goal.result.message if goal.result else "no end",
                    rate, min(s.thrust_margin for s in statuses), distance, seconds(max(ended, cancelled) - cancelled))

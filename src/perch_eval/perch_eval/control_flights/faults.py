@@ -215,7 +215,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
     end = _end(flight)
     return Ending(fault.name, seed, moment - begin, phase, done, before, end, touched,
                   tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]),
-                  None if end in END_STATES else search(plant))
+                  None if end in END_STATES or not struck else search(plant))
 
 
 def _situation(flight: ScriptedFlight) -> tuple[float, float, float, float]:

@@ -59,7 +59,7 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
         out.compare(f"QP + global bound check as printed, {waypoints} waypoints", qp.words(1.0, 1, "ms"), f"{paper_qp:g} ms",
                     qp.median <= paper_qp)
         nonlinear = [solve(found.iterations[-1].program, vehicle.mass, SETTINGS.thrust_max) for found in printed[:20]]
-        times = Spread.of(1e3 * n.solve_time for n in nonlinear)
+        times = Spread.of(1e3 * n.solve_time for n in nonlinear if n.converged)
         out.data[f"nonlinear_{waypoints}"] = [n.solve_time for n in nonlinear]
         done = sum(n.converged for n in nonlinear)
         out.show(f"nonlinear program (NLopt SLSQP), {waypoints} waypoints", times.words(1.0, 0, "ms"), f"{paper_nlp:g} ms",

@@ -127,7 +127,7 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
 
 def recovered(run: RunResult) -> bool:
     """Whether a flight that did not grip came to a hover."""
-    return run.outcome == "missed" and run.message.endswith("hover")
+    return run.outcome == "missed" and run.cause != "crash" and run.message.endswith("hover")
 
 
 def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], list[RunResult]]:

@@ -69,8 +69,9 @@ def sections(effort: Effort) -> list[Section]:
         rows.append((title, *cells, f"{sum(kept)} of {len(kept)}"))
         reasons.update(f"{title}: {x.refusal}" for x in instants if x.refusal)
         early = [not x.refusal for x in instants if x.left >= SURE]
-        out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{sum(early)} of {len(early)}", "",
-                  sum(early) >= BAR * len(early) if early else None, f"at least {100 * BAR:g} %")
+        planned = sum(not r["refused"] for r in plans)
+        out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{sum(early)} of {len(early)}; {planned} of {len(plans)} planned", "",
+                  planned == len(plans) and sum(early) >= BAR * len(early) if early else None, f"at least {100 * BAR:g} %, all planned")
     flown = computed(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
             *table(" | ".join(("plans", *map(_span, range(len(EDGES))), "all")), rows), "", "## Refused", ""]

@@ -75,9 +75,9 @@ class Judgement:
 
     @property
     def reprojection(self) -> float:
-        """Mean distance of the watched line from the image centre [px]; a line beyond the image's corners counts as at them,
-        so that a way into the line does not count for more than one past it. [P:eq9]"""
-        return float(np.mean(np.minimum(self.seen.reprojection, self.corner)))
+        """Mean distance of the watched line from the image centre [px]; a line beyond the image's corners, or behind the camera, counts
+        as at them, so that a way into the line does not count for more than one past it. [P:eq9]"""
+        return float(np.mean(np.where(self.seen.cheirality, np.minimum(self.seen.reprojection, self.corner), self.corner)))
 
 
 def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: Vehicle) -> Judgement:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from perch_core import so3
 from perch_core.errors import ConfigError, PerchError
 from perch_core.json_values import finite
 from perch_core.processes import one_thread_for_sums
@@ -58,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--sensors",
                      metavar="FILE",
                      help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
-    out.add_argument("--truth", metavar="FILE", help="true motion: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
+    out.add_argument("--truth", metavar="FILE", help="true motion of the IMU's axes: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     out.add_argument("--camera", metavar="NAME", help="camera of VIO (default: down, or the first)")
     out.add_argument("--front", metavar="NAME", help="camera of target localiser and powerline mapper (default: front, or that of VIO)")
@@ -88,6 +89,8 @@ def _perceive(args: argparse.Namespace) -> int:
         if recording.samples and sensors is None:
             raise PerchError(f"{args.recording}: has an IMU and no calibration: give --sensors FILE, made by `scripts/sensors.py import`")
         return _look_at_pictures(args, recording)
+    if truth is not None:  # it is told of the IMU's axes, as EuRoC's is
+        truth = truth.turned(so3.quat_from_matrix(sensors.imu.R_BI.T))
     return _run(args, recording, sensors, truth, overrides)
 
 

@@ -32,7 +32,7 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
     elif abs(force - GRAVITY) > 1.0:
         report.say("imu units", f"the specific force is {force:.2f} m/s^2 in the median, far from {GRAVITY}", warning=True)
     if np.percentile(np.abs(gyro).max(axis=1), 90) > 35.0:
-        report.say("imu units", "90 % of the angular rates exceed 35 rad/s: they may be in deg/s", fails=True)
+        report.say("imu units", "a tenth of the angular rates exceed 35 rad/s: they may be in deg/s", fails=True)
     if sensor is not None:
         clipped = (np.abs(gyro) >= 0.99 * sensor.gyro_range).any(axis=1) | (np.abs(accel) >= 0.99 * sensor.accel_range).any(axis=1)
         if clipped.any():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from perch_eval.recordings.asl import table
 from perch_eval.recordings.bag import BagRecording
 from perch_eval.recordings.recording import Recording, RecordingError
 
-MAX_GAP = 0.1  # poses further apart than this are not interpolated [s]
+MAX_GAP = 0.15  # poses further apart than this are not interpolated [s]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,10 @@ class Trajectory:
         """Some of its poses, by index or mask."""
         return Trajectory(self.stamps[rows], self.p[rows], self.q[rows])
 
+    def turned(self, q: np.ndarray) -> Trajectory:
+        """Of other axes in the same body: each attitude times q, xyzw."""
+        return Trajectory(self.stamps, self.p, so3.quat_multiply(self.q, q))
+
     def at(self, stamps: np.ndarray) -> tuple[Trajectory, np.ndarray]:
         """Interpolated poses.
 
@@ -64,7 +69,8 @@ class Trajectory:
         right = np.clip(np.searchsorted(self.stamps, stamps), 1, len(self) - 1)
         left = right - 1
         span = self.stamps[right] - self.stamps[left]
-        good = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]) & (span <= MAX_GAP * 1e9)
+        known = (stamps == self.stamps[left]) | (stamps == self.stamps[right])
+        good = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1]) & ((span <= MAX_GAP * 1e9) | known)
         left, right, span, stamps = left[good], right[good], span[good], stamps[good]
         share = ((stamps - self.stamps[left]) / span)[:, None]
         q = so3.quat_slerp(self.q[left], self.q[right], share[:, 0])
@@ -120,18 +126,15 @@ def read_trajectory(path: Path) -> Trajectory:
             rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.lstrip().startswith("#")]
             stamps = np.array([_nanoseconds(row[0]) for row in rows], np.int64)
             values = np.array([row[1:8] for row in rows], float)
-        except (ValueError, IndexError, OverflowError):
+        except (ValueError, IndexError, ArithmeticError):
             raise RecordingError(f"{path}: is no trajectory: neither TUM's (stamp [s] x y z qx qy qz qw) nor EuRoC's format") from None
     return _checked(str(path), stamps, values)
 
 
 def _nanoseconds(text: str) -> int:
     """Seconds as they are written, in whole nanoseconds; OpenVINS writes 1.40e18 nanoseconds into some of its files."""
-    whole, _, part = text.partition(".")
-    if "e" in text.lower():
-        value = float(text)
-        return round(value if value > 1e14 else value * 1e9)
-    return int(whole) * 10**9 + int((part + "0" * 9)[:9])
+    value = Decimal(text)
+    return int(value if "e" in text.lower() and value > 1e14 else value * 10**9)
 
 
 def _checked(source: str, stamps: np.ndarray, values: np.ndarray) -> Trajectory:

@@ -102,6 +102,7 @@ class PowerlinePlanner:
             PlanningRefusal: bad request, or no trajectory within the limits was found.
         """
         pose = check_request(request, self.vehicle, self.settings)
+        request = replace(request, start=self._started(request.start))
         hover = request.start[P] if request.hover is None else np.asarray(request.hover, float)
         if pose is None:
             return PowerlinePlan(None, self._fly(self._recovery(request, request.start, hover)))
@@ -112,6 +113,13 @@ class PowerlinePlanner:
             return PowerlinePlan(perch, self._fly(self._recovery(request, perch.states[-1], hover)))
         except PlanningRefusal as refusal:
             return PowerlinePlan(perch, None, str(refusal))
+
+    def _started(self, start: np.ndarray) -> np.ndarray:
+        """A start with a unit quaternion, and thrusts that the rotors have: a state that was measured is off by a little."""
+        start = start.copy()
+        start[Q] /= np.linalg.norm(start[Q])
+        start[THRUST] = np.clip(start[THRUST], self.vehicle.thrust_min, self.vehicle.thrust_max)
+        return start
 
     def _perch(self, request: PowerlineRequest, pose: PerchPose) -> _Task:
         s, formulation, target = self.settings, self.formulation, request.target()

@@ -30,7 +30,7 @@ def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: Powerli
     """
     if np.shape(request.start) != (17,):
         _refuse("bad_input", "start state", -1.0, f"start state has shape {np.shape(request.start)}, needs (17,)")
-    _finite({"start state": request.start})
+    _finite({"start state": request.start, "hover": np.zeros(3) if request.hover is None else request.hover})
     norm = float(np.linalg.norm(request.start[Q]))
     if abs(norm - 1) > 1e-2:
         _refuse("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
