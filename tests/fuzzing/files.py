@@ -66,7 +66,7 @@ def load(kind: str, path: Path) -> Any:
     if kind == "board":
         return load_board(path)
     if kind == "campaign":
-        return load_campaign(path, runs=2)
+        return load_campaign(path, runs=1)
     if kind == "problem":
         mapping = config.read_yaml(path)
         if isinstance(mapping, dict) and mapping.get("kind") == "powerline":

@@ -112,13 +112,13 @@ def write(folder, **files):
 
 def test_a_scenario_takes_over_what_it_does_not_say_itself(tmp_path):
     write(tmp_path, mine="extends: line_80\nname: mine\nmission: {perch_pitch_deg: 60.0}\nworld: {cables: [{start: [4.0, -2.0, 4.0], end: [4.0, 2.0, 4.0]}]}\n"
-                         "parameters: {powerline_mapper: {rate: 12.0}, estimator: {vio.position: 0.001}}\n",
+                         "parameters: {powerline_planner: {deadline: 12.0}, estimator: {vio.position: 0.001}}\n",
           theirs="extends: mine.yaml\nname: theirs\nmission: {replan: false}\n")
     mine, base = load_scenario(tmp_path / "theirs.yaml"), load_scenario("line_80")
     assert (mine.name, mine.vehicle, mine.mode) == ("theirs", base.vehicle, "powerline")
     assert mine.mission.perch_pitch_deg == 60.0 and not mine.mission.replan and mine.mission.takeoff_height == base.mission.takeoff_height
     assert len(mine.world.cables) == 1 and mine.world.room == base.world.room  # lists are replaced, mappings merged
-    assert mine.parameters["powerline_mapper"] == {**base.parameters["powerline_mapper"], "rate": 12.0}
+    assert mine.parameters["powerline_planner"] == {**base.parameters["powerline_planner"], "deadline": 12.0}
     assert mine.parameters["controller"] == base.parameters["controller"]
     assert "extends" not in scenario_mapping(tmp_path / "theirs.yaml")
 

@@ -141,7 +141,8 @@ class MapParameters:
 
 
 class MappedWorld(Component[MapParameters]):
-    """A map with the mapper's error, ten times a second of the camera's frames, in the place of `powerline_mapper`."""
+    """A map with the mapper's error, ten times a second of the camera's frames, in the place of `powerline_mapper`: every cable at full
+    length from the first frame on, whether or not the camera sees it."""
 
     config_type = MapParameters
 

@@ -1,7 +1,7 @@
 """The multi-state constraint Kalman filter with landmarks in the state. Mourikis and Roumeliotis 2007; Li and Mourikis 2013.
 
-Per frame: propagate with the IMU, clone the pose, update with landmarks that are still seen, then with tracks that have
-ended (their point eliminated), then take new landmarks into the state from tracks that span the window.
+Per frame: propagate with the IMU, clone the pose, update with landmarks that are still seen, take new landmarks into the
+state from tracks that span the window, then update with tracks that have ended (their point eliminated).
 """
 
 from __future__ import annotations

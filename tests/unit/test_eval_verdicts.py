@@ -1,0 +1,63 @@
+"""Claims of the evaluation fail where flights do: rows that look good for the wrong reason do not hold."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from perch_core import so3
+from perch_core.vehicle import load_vehicle
+from perch_eval.evaluation import control, inspection, ways_out
+from perch_eval.evaluation.sections import Effort
+from perch_eval.inspection.measures import inspected, judge, reference_states, segments, watched
+from perch_sim.scenario import load_scenario
+
+
+@pytest.fixture
+def effort(tmp_path):
+    return Effort(True, 1, tmp_path, tmp_path / "state", "x", False, 5, 1, 3)
+
+
+def verdicts(section):
+    return {row.name: row.verdict.lower() for row in section.rows if row.verdict.lower() != "shown"}
+
+
+@pytest.mark.parametrize("outcome, verdict", [("good", "holds"), ("crashed", "fails")])
+def test_controllers_that_track_well_until_they_crash_fail(effort, monkeypatch, outcome, verdict):
+    def rows(effort, name, jobs, work, good):
+        return [{"controller": c, "condition": k, "maneuver": m, "seed": seed, "rmse": (0.01,) * 3 if "L1" in c else (0.04,) * 3,
+                 "outcome": control.GOOD_END[m] if outcome == "good" else outcome} for c, k, m, seed in jobs]
+
+    monkeypatch.setattr(control, "computed", rows)
+    assert set(verdicts(control.comparison_sections(effort)[0]).values()) == {verdict}
+
+
+def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch):
+    def rows(effort, name, jobs, work, good):
+        if name == "aborted":
+            return [{"scenario": s, "seed": n, "before": t, "planned": True, "end": "never cancelled", "message": "", "rate": 1.0, "margin": 0.1,
+                     "distance": 1.0, "settled": 0.1} for s, n, t in jobs]
+        return [{"name": name, "seed": seed, "refused": "" if seed == 1 else "thrust", "instants": [(1.0, "")] if seed == 1 else []} for name, seed in jobs]
+
+    monkeypatch.setattr(ways_out, "computed", rows)
+    assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
+
+
+def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, monkeypatch):
+    scenario = load_scenario("inspection")
+    times, states = reference_states(scenario)
+    still = inspected(scenario, times[:50], np.repeat(states[:1], 50, axis=0), 0, "the controller has landed")
+    monkeypatch.setattr(inspection, "fly", lambda *_: still)
+    assert still.collisions == 0 and verdicts(inspection._figures(effort))["collisions"] == "fails"
+    monkeypatch.setattr(inspection, "fly", lambda *_: dataclasses.replace(still, message=""))
+    assert verdicts(inspection._figures(effort))["collisions"] == "holds"
+
+
+def test_a_line_behind_the_camera_is_not_in_its_middle():
+    scenario = load_scenario("inspection")
+    _, states = reference_states(scenario)
+    lines, vehicle = segments(scenario), load_vehicle(scenario.vehicle)
+    away = states.copy()
+    away[:, 3:7] = [so3.quat_multiply(q, np.array([0.0, 0.0, 1.0, 0.0])) for q in states[:, 3:7]]
+    ahead, behind = (judge(way, lines, watched(scenario, lines), vehicle) for way in (states, away))
+    assert ahead.reprojection < 0.8 * ahead.corner and behind.reprojection == pytest.approx(behind.corner)
