@@ -63,6 +63,16 @@ def test_segment_constraint_acts_beside_the_segment_and_not_beyond_its_ends() ->
     assert clearance([0, 0, 2.13]) > 0 > clearance([0, 0, 2.11])  # 0.09 + 0.03 above
 
 
+@pytest.mark.parametrize("angle_deg", [0, 45, 90])
+def test_a_segment_far_away_is_no_obstacle_however_the_body_is_turned(angle_deg: int) -> None:
+    """On the continuation of a wire too, where it is the body's thinnest axis: above a mast."""
+    direction = np.array([0.0, np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
+    segment = Segment(-3 * direction, direction, 1.0, 0.03)
+    o, l = lines.scaled_line((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), components(segment.centre), components(direction), tuple(r + 0.03 for r in RADII))
+    h = lines.segment_clearance((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), components(segment.centre), components(direction), 1.0, 0.03, RADII)
+    assert h >= 2 * np.dot(l, l) * (1 - 1e-9)
+
+
 def test_activation_is_negligible_where_the_body_can_touch() -> None:
     inside = lines.segment_activation((0.0, 0.0, 1.0 + 0.3), (0.0, 0.0, 0.0), 1.0, 0.3)
     outside = lines.segment_activation((0.0, 0.0, 1.0 + 0.3 + 0.05), (0.0, 0.0, 0.0), 1.0, 0.3)

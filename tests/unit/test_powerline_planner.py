@@ -119,6 +119,14 @@ def test_the_wire_is_met_from_above_the_gripper_with_room_beside_the_rotors_unti
     assert all(bound.holds for bound in perch.bounds)
 
 
+def test_a_recovery_above_a_mast_is_found(planner: PowerlinePlanner) -> None:
+    mast = Segment([2.5, 0.0, 1.0], [0.0, 0.0, 1.0], 1.0, 0.05)
+    start = REQUEST.start.copy()
+    start[P] = 2.5, 0.0, 4.2
+    recovery = planner.plan(replace(REQUEST, start=start, lines=(mast,), perch=None, recovery_only=True)).recovery
+    assert recovery.duration < 1.0 and all(bound.holds for bound in recovery.bounds)
+
+
 def test_a_recovery_from_inside_a_wire_is_refused(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
     state = planned.plan.perch.states[-1].copy()
     state[P] -= 0.1 * REQUEST.perch.s3_W

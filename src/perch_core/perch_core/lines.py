@@ -159,6 +159,10 @@ def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half
                       body_radii: Vector) -> Scalar:
     """h_ca: positive where body and segment do not touch. [defines P:eq7]
 
+    [P:eq5] is at least -|l|^2, where the line would pass through the body's centre, and |l| at most lambda_1. The paper adds lambda_1^2
+    far from the segment, which leaves nothing above zero where the line meets the body's thinnest axis: above a mast. Here it is three
+    times that, so that there h_ca >= 2 |l|^2, as for a line at sqrt(3) radii.
+
     Args:
         p_WB, q_WB: pose of the body [m, xyzw].
         o_W, l_W, half_length, radius: the segment [m].
@@ -172,7 +176,7 @@ def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half
     smallest, largest = min(body_radii), max(body_radii)
     largest_eigenvalue = 1 / (smallest + radius)  # lambda_1 of Delta
     far = segment_activation(p_WB, o_W, half_length, largest + radius)
-    return line_clearance(o, l) + largest_eigenvalue * largest_eigenvalue * far
+    return line_clearance(o, l) + 3 * largest_eigenvalue**2 * far
 
 
 def scaled_clearance(states_p: Array, states_q: Array, segment: Segment, body_radii: Vector) -> Array:

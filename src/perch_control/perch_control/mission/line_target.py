@@ -25,11 +25,13 @@ def mapped_target(lines: PowerlineMap, goal: Goal, p_WB: np.ndarray) -> Target |
     Returns:
         The target, b2 along the line and b3 leaning towards the vehicle's side; None where no line passes near, or a vertical one.
     """
-    near = [(float(line.segment.distance(goal.perch_point)), k) for k, line in enumerate(lines.lines)]
+    segments = [mapped.segment for mapped in lines.lines]
+    near = [(float(line.distance(goal.perch_point)), k) for k, line in enumerate(segments)]
     if not near or min(near)[0] >= _REACH:
         return None
-    mapped = lines.lines[min(near)[1]]
-    line, point = mapped.segment, mapped.segment.closest_point(goal.perch_point)
+    chosen = min(near)[1]
+    mapped, line = lines.lines[chosen], segments[chosen]
+    point = line.closest_point(goal.perch_point)
     try:
         b3 = perch_normal(line, point, goal.perch_pitch, p_WB)
     except PerchError:

@@ -190,7 +190,8 @@ FRAME = Text(256)
 ID = Limit(0, 2**32 - 1)
 _PIXELS = Limit(1, 1e4, "px")
 _FOCAL, _CENTRE = Limit(1.0, 1e5, "px"), Limit(-1e5, 1e5, "px")
-_CAMERA = {"width": Limit(IMAGE_LEAST, 1e4, "px"), "height": Limit(IMAGE_LEAST, 1e4, "px"), "fx": _FOCAL, "fy": _FOCAL, "cx": _CENTRE, "cy": _CENTRE}
+_SIDE = Limit(IMAGE_LEAST, 1e4, "px")
+_CAMERA = {"width": _SIDE, "height": _SIDE, "fx": _FOCAL, "fy": _FOCAL, "cx": _CENTRE, "cy": _CENTRE}
 _DISTORTED = {**_CAMERA, "coefficients": Limit(-1e3, 1e3, "", (-1,), 8)}
 
 LIMITS: dict[type, dict[str, Any]] = {

@@ -143,8 +143,6 @@ class PowerlinePlanner:
 
     def _recovery(self, request: PowerlineRequest, start: np.ndarray, hover: np.ndarray) -> _Task:
         s, formulation = self.settings, self.formulation
-        start = start.copy()
-        start[THRUST] = np.clip(start[THRUST], self.vehicle.thrust_min, s.thrust_share * self.vehicle.thrust_max)
         margins, reduction = self._room(start, request.lines)
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
