@@ -8,7 +8,7 @@ from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, detect_lines, place)
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.powerline_mapper import mapping_pose
-from perch_sim.rendering import Renderer
+from perch_sim.rendering import CableCurve, Renderer, Scene
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,20 @@ def test_maps_within_three_centimetres_from_a_motion_of_80_cm(wires, start, end)
             assert line.segment.radius == pytest.approx(0.012, rel=0.5)
     assert np.mean(errors) <= 0.03
     assert np.max(errors) <= 0.06
+
+
+def test_wires_that_cross_in_the_image_are_where_they_are_once_they_are_seen_apart():
+    """Before and after they cross they are one blob, whose middle is neither's, and would put the near one 17 cm too far away."""
+    ends = [(x, z) for x, z in ((4.0, 4.25), (5.0, 3.75), (5.0, 4.75))]
+    scene = Scene(np.array([-4.0, -4.5, 0.0]), np.array([10.0, 4.5, 8.0]), contrast=0.25, seed=1, cables=tuple(
+        CableCurve(np.linspace([x, -2.0, z], [x, 2.0, z], 30), 0.03, (190.0, 35.0, 35.0)) for x, z in ends))
+    flight = Flight(Renderer(scene, MOUNT, seed=1), 1)
+    flight.drift, flight.turn = np.zeros(3), np.eye(3)
+    found = flight.fly((0.0, 0.0, 1.5), (0.0, 0.0, 4.3), 46).lines
+    assert len(found) == 3
+    for x, z in ends:
+        wire = min((line.segment for line in found), key=lambda one: float(one.distance(np.array([x, 0.0, z]))))
+        assert wire.distance(np.array([x, 0.0, z])) < 0.04 and wire.radius == pytest.approx(0.03, rel=0.02)
 
 
 def test_ids_are_stable_and_the_extent_is_what_was_seen(wires):

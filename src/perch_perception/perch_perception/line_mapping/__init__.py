@@ -6,7 +6,7 @@ from perch_perception.line_mapping.detection import LineDetectionConfig, LineSig
 from perch_perception.line_mapping.mapper import LineMapper, MapperConfig
 from perch_perception.line_mapping.observation import LineObservation, place
 from perch_perception.line_mapping.triangulation import (
-    DegenerateBaseline, TriangulationConfig, WireEstimate, triangulate)
+    TriangulationConfig, Undetermined, WireEstimate, triangulate)
 
-__all__ = ["Backdrop", "DegenerateBaseline", "LineDetectionConfig", "LineMapper", "LineObservation", "LineSighting", "MapperConfig",
+__all__ = ["Backdrop", "Undetermined", "LineDetectionConfig", "LineMapper", "LineObservation", "LineSighting", "MapperConfig",
            "TriangulationConfig", "WireCurve", "WireEstimate", "detect_lines", "place", "triangulate"]

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from perch_perception.line_mapping.detection import LEAST_WIDTH, SIGMA
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import WireEstimate
 
 
-WIDTH_RATIO = 1.4  # of wires in line, the sighting is of those that look as wide as it, up to this factor
+WIDTH_RATIO = 1.4  # a wire looks as wide as it did, up to this factor: two that meet in the image look wider, a part of one less wide
 MAPPED_GATE = 1.2  # of a sighting to a triangulated wire [deg]
 FOLLOWED_GATE = 5.0  # to the last sighting of a wire that is not triangulated yet [deg]
 DISTINCT = 2.0  # the second-best wire must be so many times worse
@@ -28,6 +29,8 @@ class Track(Protocol):
 
 def score(track: Track, seen: LineObservation) -> float:
     """Misfit of a sighting to a wire in units of the gate; inf where it cannot be the same."""
+    if not _as_wide(track, seen):
+        return np.inf
     if track.estimate is not None:
         return _score_mapped(track.estimate, track.extent, seen)
     return _score_followed(track.last, seen) / np.radians(FOLLOWED_GATE)
@@ -65,11 +68,12 @@ def _score_followed(last: LineObservation, seen: LineObservation) -> float:
 
 
 def _as_wide(track: Track, seen: LineObservation) -> bool:
-    """Whether a wire looks about as wide as a sighting: of wires in line it is the nearest that is seen, and it is the widest."""
-    if track.estimate is None or seen.width <= 0.0:
-        return False
-    ratio = seen.width / track.estimate.width_from(seen.p_WC)
-    return bool(1.0 / WIDTH_RATIO < ratio < WIDTH_RATIO)
+    """Whether a sighting looks about as wide as a wire does, or did in its last image; those too thin to be measured look alike."""
+    width = track.last.width if track.estimate is None else track.estimate.width_from(seen.p_WC)
+    if np.isnan(width):  # nothing is known of its radius
+        return True
+    thin = LEAST_WIDTH / SIGMA * seen.sigma
+    return bool(1.0 / WIDTH_RATIO < max(seen.width, thin) / max(width, thin) < WIDTH_RATIO)
 
 
 def associate(tracks: Sequence[Track], seen: Sequence[LineObservation]) -> list[int | None]:
@@ -78,11 +82,6 @@ def associate(tracks: Sequence[Track], seen: Sequence[LineObservation]) -> list[
     A triangulated wire may be seen in several pieces at once; one that is only followed, in one.
     """
     scores = np.array([[score(track, one) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
-    for i, one in enumerate(seen):
-        near = np.flatnonzero(scores[i] <= 1.0)
-        as_wide = [_as_wide(tracks[j], one) for j in near.tolist()]
-        if len(near) > 1 and any(as_wide):
-            scores[i, near[~np.array(as_wide)]] = np.inf
     answer: list[int | None] = [-1] * len(seen)
     taken: set[int] = set()
     order = sorted((scores[i, j], i, j) for i in range(len(seen)) for j in range(len(tracks)) if scores[i, j] <= 1.0)

@@ -151,7 +151,7 @@ def _edges(around: np.ndarray, column: np.ndarray, first: np.ndarray, last: np.n
 def _arcs(pixels, edges, camera) -> list[LineSighting]:
     """Arcs through the ridge points of one blob, the best first, each split where it has holes."""
     rays = camera.unproject(pixels)
-    seen = np.all(np.isfinite(rays), axis=1)
+    seen = np.all(np.isfinite(rays), axis=1) & np.all(np.isfinite(edges), axis=(1, 2))  # the middle of what the image cuts off is not the wire's
     pixels, edges, rays = pixels[seen], edges[seen], rays[seen]
     if len(rays) < RED_LENGTH:
         return []

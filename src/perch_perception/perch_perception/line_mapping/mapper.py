@@ -15,7 +15,7 @@ from perch_perception.line_mapping.association import associate
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import (
-    DegenerateBaseline, TriangulationConfig, WireEstimate, triangulate)
+    TriangulationConfig, Undetermined, WireEstimate, triangulate)
 from perch_perception.pose_buffer import BodyState
 
 BASELINE = 0.03  # motion between the sightings kept [m]
@@ -138,7 +138,7 @@ class LineMapper:
     def _triangulate(self, track: _Track) -> None:
         try:
             track.estimate = triangulate(track.observations, self.settings.triangulation, track.estimate)
-        except DegenerateBaseline as refusal:
+        except Undetermined as refusal:
             if track.estimate is None:
                 track.refusal = str(refusal)
             return

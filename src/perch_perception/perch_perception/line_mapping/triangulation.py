@@ -49,12 +49,8 @@ class TriangulationConfig:
                                     doc="radius of a wire that is too thin to be measured")
 
 
-class DegenerateBaseline(PerchError):
-    """The camera's motion does not determine the wire. `ratio` is sigma2/sigma1 of the planes' normals."""
-
-    def __init__(self, ratio: float) -> None:
-        self.ratio = ratio
-        super().__init__(f"baseline ratio {ratio:.3f} < {MIN_RATIO:g}: move across the wire, not along it or towards it")
+class Undetermined(PerchError):
+    """The sightings do not determine a wire, and why."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,6 @@ class WireEstimate:
     Attributes:
         curve: the wire in W.
         covariance: of its five parameters (see `WireCurve.moved`), shape (5, 5).
-        ratio: sigma2/sigma1 of the baseline.
         used: sightings that agree with it, shape (n,).
         mount: error of the camera's attitude on the body that fits them best, in C [rad], shape (3,).
         radius: of the wire [m]; nan where it is not known and was never wide enough in an image.
@@ -73,7 +68,6 @@ class WireEstimate:
 
     curve: WireCurve
     covariance: np.ndarray
-    ratio: float
     used: np.ndarray
     mount: np.ndarray
     radius: float
@@ -95,20 +89,20 @@ class WireEstimate:
         return by_parameters @ self.covariance @ by_parameters.T
 
 
-def intersect_planes(observations: Sequence[LineObservation]) -> tuple[WireCurve, float]:
-    """The straight line that all planes share, and sigma2/sigma1 of their normals.
+def intersect_planes(observations: Sequence[LineObservation]) -> WireCurve:
+    """The straight line that all planes share.
 
     Raises:
-        DegenerateBaseline: fewer than two sightings, or planes that are nearly the same.
+        Undetermined: fewer than two sightings, or planes that are nearly the same.
     """
     if len(observations) < 2:
-        raise DegenerateBaseline(0.0)
+        raise Undetermined("seen once only")
     normals = np.array([o.normal for o in observations])
     centres = np.array([o.p_WC for o in observations])
     _, sizes, axes = np.linalg.svd(normals)
     ratio = float(sizes[1] / sizes[0])
     if ratio < MIN_RATIO:
-        raise DegenerateBaseline(ratio)
+        raise Undetermined(f"baseline ratio {ratio:.3f} < {MIN_RATIO:g}: move across the wire, not along it or towards it")
     direction = axes[2]
     # the point of the line beside the last sighting's middle: a useful origin for s
     rows = np.concatenate([normals, direction[None]])
@@ -116,7 +110,7 @@ def intersect_planes(observations: Sequence[LineObservation]) -> tuple[WireCurve
     point = np.linalg.lstsq(rows, values, rcond=None)[0]
     line = WireCurve(point, direction)
     s = float(line.nearest(observations[-1].p_WC[None], observations[-1].middle[None])[0])
-    return WireCurve(line.at(s), direction), ratio
+    return WireCurve(line.at(s), direction)
 
 
 def triangulate(observations: Sequence[LineObservation], settings: TriangulationConfig,
@@ -129,9 +123,9 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         before: an earlier result; its point keeps the origin of s where it is.
 
     Raises:
-        DegenerateBaseline: the camera's motion does not determine the wire, or puts it behind the camera.
+        Undetermined: the camera's motion does not determine the wire, or puts it behind the camera, or the sightings are of several.
     """
-    line, ratio = intersect_planes(observations)
+    line = intersect_planes(observations)
     curve, mount = (line, np.zeros(3)) if before is None else (before.curve, before.mount)
     centres = np.repeat([o.p_WC for o in observations], len(observations[0].rays_W), axis=0)
     rays = np.concatenate([o.rays_W for o in observations])
@@ -148,23 +142,25 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         # an earlier result is where the wire was at its own last sighting: what came since may be off by the walk and by its error
         apart = np.abs(walked[newest if number == rounds else -1] - walked) + known
         residual, _ = _whitened(curve, mount, observations, centres, rays, apart)
+        widths, one_wire = _widths(curve, size, observations, apart if known > 0.0 else apart + WIDTH_GATE**2)
         misfit = np.sqrt(np.mean(residual**2, axis=1))  # (n,), 1 where all is as expected
-        used = misfit < 3.0 * max(1.0, float(np.median(misfit)))
+        used = one_wire & (misfit < 3.0 * max(1.0, float(np.median(misfit))))
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
         by_rays = _normal_equations(_whitened(curve, mount, observations, centres, rays, rigid), weight)
-        apart = apart if known > 0.0 else apart + WIDTH_GATE**2
-        by_widths = _normal_equations(_widths(curve, size, observations, apart), weight)
+        by_widths = _normal_equations(widths, weight)
         information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount)
         try:
             step = -np.linalg.solve(information, gradient)
         except np.linalg.LinAlgError:  # the sightings that are left say nothing of one direction
-            raise DegenerateBaseline(ratio) from None
+            raise Undetermined("the sightings that agree are from places too much alike") from None
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
-        raise DegenerateBaseline(ratio)
+        raise Undetermined("it would be behind the camera")
+    if 2 * used.sum() <= len(used):
+        raise Undetermined("its sightings are of several wires that meet in the image")
     covariance = np.linalg.inv(information)[:PARAMETERS, :PARAMETERS] * max(1.0, float(np.mean(misfit[used] ** 2)))
-    return WireEstimate(curve, covariance, ratio, used, mount, float(np.exp(size)), observations[-1].time)
+    return WireEstimate(curve, covariance, used, mount, float(np.exp(size)), observations[-1].time)
 
 
 def _before(observations: Sequence[LineObservation], before: WireEstimate | None) -> tuple[float, int]:
@@ -226,15 +222,17 @@ def _feet(curve, observations):
 
 
 def _widths(curve, size, observations, apart):
-    """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, and their Jacobian (n, 1, 9).
+    """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas with their Jacobian (n, 1, 9), and which are of one wire.
 
-    A width that says a distance farther off than `apart` (n,) [m^2] allows is that of two wires, or of a part of one.
+    A width that says a distance farther off than `apart` (n,) [m^2] allows is that of two wires which meet in the image, or of a part
+    of one: the rays to its middle are not those to a wire's axis, either.
     """
     residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, ALL))
+    one_wire = np.ones(len(observations), bool)
     width, ray = np.array([(o.width, o.sigma) for o in observations]).T
     seen = np.flatnonzero(width > 0.0)
     if not len(seen):
-        return residual, jacobian
+        return (residual, jacobian), one_wire
     width, ray = width[seen], ray[seen]
     to, s = _feet(curve, [observations[k] for k in seen])
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
@@ -243,9 +241,9 @@ def _widths(curve, size, observations, apart):
     x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
     zero = np.zeros_like(s)
     rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]
-    one_wire = np.abs(misfit) < GATE * np.hypot(sigma, np.sqrt(apart[seen]) / distance)
-    residual[seen, 0], jacobian[seen, 0] = np.where(one_wire, misfit / sigma, 0.0), np.where(one_wire[:, None], rows, 0.0)
-    return residual, jacobian
+    one_wire[seen] = np.abs(misfit) < GATE * np.hypot(sigma, np.sqrt(apart[seen]) / distance)
+    residual[seen, 0], jacobian[seen, 0] = misfit / sigma, rows
+    return (residual, jacobian), one_wire
 
 
 def _whitened(curve, mount, observations, centres, rays, walk):
