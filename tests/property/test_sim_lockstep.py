@@ -12,6 +12,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Owed, Packet, Schedule, Task, local_servers
+from perch_sim.lockstep.link import pack, unpack
 from perch_sim.pacing import LONGEST_CATCH_UP, Pacing
 
 MS = 1_000_000
@@ -447,3 +448,13 @@ def test_pacing_keeps_up_with_the_clock_or_says_what_it_gave_up(waits):
         done += due
         assert done + pacing.skipped == (now - 1000) // period  # every period is done or owned up to
     assert pacing.misses >= pacing.skipped
+
+
+def test_a_batch_that_is_cut_short_is_refused():
+    packets = [Packet.received("imu/data_raw", b"1234567"), Packet.received("clock", b"")]
+    data = pack(5, packets)
+    stamp, read = unpack(data, None)
+    assert stamp == 5 and [(p.channel, p.data) for p in read] == [(p.channel, p.data) for p in packets]
+    for length in range(len(data)):
+        with pytest.raises(PerchError, match="no batch"):
+            unpack(data[:length], None)

@@ -167,6 +167,16 @@ def test_wide_lens_stops_before_its_polynomial_turns_over():
     assert np.isnan(lens.unproject([[320.0 + 275.0 * (lens.radius(turning) + 0.01), 240.0]])).all()
 
 
+def test_the_angle_is_found_up_to_a_fold_of_the_lens():
+    """Newton's method alone is 11 deg wrong there."""
+    lens = EquidistantCamera(640, 480, 275.0, 275.0, 320.0, 240.0, (0.1297, 0.0622, -0.0402, -0.0012))
+    theta = np.linspace(0.0, lens.max_angle, 20_001)
+    rays = lens.unproject(np.stack([320.0 + 275.0 * np.array([lens.radius(t) for t in theta]), np.full(len(theta), 240.0)], axis=1))
+    seen = np.isfinite(rays).all(axis=1)
+    assert seen[:-1].all()
+    assert np.abs(np.arctan2(rays[seen, 0], rays[seen, 2]) - theta[seen])[:-200].max() < 1e-9
+
+
 def test_published_lens_sees_133_degrees_across_and_over_160_along_the_diagonal():
     left, right = SNAPDRAGON.unproject([[0.0, 240.0], [639.0, 240.0]])
     corner, opposite = SNAPDRAGON.unproject([[0.0, 0.0], [639.0, 479.0]])

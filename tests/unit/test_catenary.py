@@ -109,6 +109,11 @@ def test_powerline_of_185_m_needs_15_segments_for_15_mm(rise):
     assert fit.max_error <= 0.025
 
 
+@pytest.mark.parametrize("end, sag", [([0.1, 0.0, 12.0], 0.05), ([0.9, 0.0, 60.0], 0.05), ([0.001, 0.0, 50.0], 0.01)])
+def test_a_steep_cable_has_the_sag_asked_for(end, sag):
+    assert Catenary.from_sag([0, 0, 0], end, sag).sag == pytest.approx(sag, rel=1e-6)
+
+
 def test_sag_by_an_independent_quadrature():
     """Drop at mid-span = integral of the slope's difference from the chord's; slope' = sqrt(1 + slope^2)/a."""
     cable = Catenary.from_sag([0, 0, 0], [50, 0, 0], 3.0)

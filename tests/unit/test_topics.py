@@ -56,6 +56,21 @@ def test_a_message_that_is_cut_short_is_refused(channel, value):
             topics.decode(channel, data[:length])
 
 
+@pytest.mark.parametrize("channel, value, spoil, words", [
+    ("imu/data_raw", FAST[0][1], lambda msg: msg.angular_velocity_covariance.__setitem__(0, -1.0), "no angular velocity"),
+    ("imu/data_raw", FAST[0][1], lambda msg: msg.linear_acceleration_covariance.__setitem__(0, -1.0), "no acceleration"),
+    ("odometry", _odometry(), lambda msg: setattr(msg, "child_frame_id", "odom"), "'odom'"),
+    ("vio/odometry", _odometry(), lambda msg: setattr(msg, "child_frame_id", "camera_link"), "'camera_link'")])
+def test_what_a_message_does_not_hold_is_not_read_of_it(channel, value, spoil, words):
+    row = topics.topic(channel)
+    msg = row.to_message(value)
+    spoil(msg)
+    with pytest.raises(PerchError, match=words):
+        row.to_value(msg)
+    with pytest.raises(PerchError, match=words):
+        topics.decode(channel, serialize_message(msg))
+
+
 def test_cameras_share_a_row():
     assert topics.topic("camera_front/image_raw") is topics.topic("camera_down/image_raw")
     assert topics.topic("camera_front/image_raw/compressed").message.__name__ == "CompressedImage"

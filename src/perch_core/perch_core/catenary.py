@@ -72,7 +72,7 @@ class Catenary:
         from scipy.optimize import brentq  # 0.2 s of the start of a node that hangs no cable
 
         log_a = brentq(lambda x: math.log(cls(start, end, math.exp(x), down).sag / sag),
-                       math.log(span / 60.0), math.log(span**2 / sag + span) + 2.0, xtol=1e-14)
+                       math.log(span / 60.0), math.log(span * straight.length / sag + span) + 2.0, xtol=1e-14)
         return cls(start, end, math.exp(log_a), down)
 
     @property

@@ -164,7 +164,7 @@ class SampledTrajectory:
         start_time: stamp of the start on the caller's clock [s].
 
     Raises:
-        ValueError: wrong shapes, values that are not finite, or times that do not increase.
+        ValueError: wrong shapes, values that are not finite, or times that do not increase from 0.
     """
 
     times: Array
@@ -180,8 +180,8 @@ class SampledTrajectory:
     def __post_init__(self) -> None:
         widths = {"p": 3, "q": 4, "v": 3, "w": 3, "a": 3, "dw": 3, "rotor_thrust": 4}
         times = np.array(self.times, float)
-        if times.ndim != 1 or len(times) < 2 or not (np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
-            raise ValueError("times must be at least two, finite and increasing")
+        if times.ndim != 1 or len(times) < 2 or not (np.isfinite(times).all() and abs(times[0]) < 1e-6 and (np.diff(times) > 0.0).all()):
+            raise ValueError("times must be at least two, finite, and increase from 0")
         object.__setattr__(self, "times", times)
         for name, width in widths.items():
             value = np.array(getattr(self, name), float)

@@ -44,6 +44,8 @@ class CameraConfig:
     def __post_init__(self) -> None:
         if abs(np.linalg.norm(self.orientation) - 1) > 1e-3:
             raise ConfigError("", "orientation", f"norm {np.linalg.norm(self.orientation):.4f} is not 1")
+        if self.model == "pinhole" and any(self.distortion):
+            raise ConfigError("", "distortion", f"{list(self.distortion)} is of the model equidistant: a pinhole has none")
         if self.transport_max < self.transport_min:
             raise ConfigError("", "transport_max", f"{self.transport_max:g} is below transport_min {self.transport_min:g}")
 

@@ -6,6 +6,7 @@ the end of its connection, at once. Only processes of the same user are let in.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import select
@@ -51,6 +52,8 @@ def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
         for _ in range(count):
             name, length = _PACKET.unpack_from(data, offset)
             offset += _PACKET.size
+            if offset + name + length > len(data):
+                raise PerchError(f"lockstep: {len(data)} bytes are no batch: they end within a packet")
             channel, offset = data[offset:offset + name].decode(), offset + name
             packets.append(Packet.received(channel, data[offset:offset + length], codec))
             offset += length
@@ -70,7 +73,9 @@ class Door:
         try:
             self._listener = Listener(where, "AF_UNIX", backlog=16)
         except OSError as error:
-            raise PerchError(f"another vehicle runs a lockstep in this ROS domain and namespace ({error.strerror})") from None
+            if error.errno != errno.EADDRINUSE:
+                raise PerchError(f"lockstep: cannot listen at {where[1:]!r}: {error}") from None
+            raise PerchError("another vehicle runs a lockstep in this ROS domain and namespace") from None
         self._socket: socket.socket = self._listener._listener._socket  # type: ignore[attr-defined]  # it accepts without waiting
         self._socket.setblocking(False)
 

@@ -8,6 +8,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import Header
 
 from perch_core.arrays import Numbers
+from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS
 
 
@@ -25,6 +26,27 @@ def stamp_value(stamp: Time) -> int:
 def header(stamp: int, frame: str) -> Header:
     """Header with a stamp [ns]."""
     return Header(stamp=to_stamp(stamp), frame_id=frame)
+
+
+def require_measured(gyro: float, accelerometer: float) -> None:
+    """Check the first entries of the covariances of an `Imu`: -1 says that there is no such measurement.
+
+    Raises:
+        PerchError: one is missing.
+    """
+    if gyro < 0.0 or accelerometer < 0.0:
+        missing = "angular velocity" if gyro < 0.0 else "acceleration"
+        raise PerchError(f"imu: its covariance says (-1) that there is no {missing}: both must be in one message")
+
+
+def require_body(child_frame: str) -> None:
+    """Check the frame whose pose and twist an `Odometry` has.
+
+    Raises:
+        PerchError: it is not the body.
+    """
+    if child_frame not in ("base_link", ""):
+        raise PerchError(f"odometry: child_frame_id is {child_frame!r}: pose and twist must be those of base_link")
 
 
 def floats(v: Vector3 | Point) -> tuple[float, float, float]:

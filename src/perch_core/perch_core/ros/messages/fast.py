@@ -7,6 +7,7 @@ from struct import Struct
 import numpy as np
 from nav_msgs.msg import Odometry
 from perch_core.ros.cdr import Layout
+from perch_core.ros.messages.basic import require_body, require_measured
 from perch_core.values import NANOSECONDS, AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
 from perch_msgs.msg import AttitudeThrust as AttitudeMessage
 from perch_msgs.msg import MotorCommand as MotorMessage
@@ -16,7 +17,7 @@ from sensor_msgs.msg import Imu
 _IMU, _ODOMETRY, _MOTOR, _RATES, _ATTITUDE = map(Layout, (Imu, Odometry, MotorMessage, RatesMessage, AttitudeMessage))
 _NO_ORIENTATION = np.r_[0.0, 0.0, 0.0, 1.0, -1.0, np.zeros(8)].tobytes()  # attitude and its covariance, which says that there is none
 _NO_COVARIANCE = np.zeros(9).tobytes()
-_3, _4, _6, _7, _8 = (Struct(f"<{n}d") for n in (3, 4, 6, 7, 8))
+_1, _3, _4, _6, _7, _8 = (Struct(f"<{n}d") for n in (1, 3, 4, 6, 7, 8))
 
 
 def pack_imu(sample: ImuSample) -> bytes:
@@ -26,8 +27,9 @@ def pack_imu(sample: ImuSample) -> bytes:
 
 
 def unpack_imu(data: bytes) -> ImuSample:
-    """The sample of a `sensor_msgs/Imu`."""
+    """The sample of a `sensor_msgs/Imu`; a PerchError where it does not measure both."""
     sec, nanosec, frame, x = _IMU.unpack(data)
+    require_measured(*_1.unpack_from(x, 16 * 8), *_1.unpack_from(x, 28 * 8))
     return ImuSample(sec * NANOSECONDS + nanosec, _3.unpack_from(x, 13 * 8), _3.unpack_from(x, 25 * 8), frame)
 
 
@@ -39,8 +41,9 @@ def pack_odometry(s: OdometryState) -> bytes:
 
 
 def unpack_odometry(data: bytes) -> OdometryState:
-    """The state of a `nav_msgs/Odometry`."""
-    sec, nanosec, frame, _, x = _ODOMETRY.unpack(data)
+    """The state of a `nav_msgs/Odometry`; a PerchError where it is not the body's."""
+    sec, nanosec, frame, child, x = _ODOMETRY.unpack(data)
+    require_body(child)
     pose, twist, covariances = _7.unpack_from(x), _6.unpack_from(x, 43 * 8), np.frombuffer(x, "<f8")
     return OdometryState(sec * NANOSECONDS + nanosec, pose[:3], pose[3:], twist[:3], twist[3:],
                          covariances[7:43].reshape(6, 6), covariances[49:85].reshape(6, 6), frame)

@@ -141,6 +141,6 @@ def powerline_plan_value(msg: PlanPowerline.Response) -> PowerlinePlan:
     t = msg.trajectory
     return PowerlinePlan(
         success=msg.success, error_code=msg.error_code, message=msg.message, trajectory=trajectory_value(t) if msg.success else None,
-        at_end=t.at_end, contact_time=t.contact_time, recovery_start=t.recovery_start,
+        at_end=t.at_end, contact_time=t.contact_time, recovery_start=t.recovery_start if msg.success else -1.0,
         certificates=tuple(certificate_value(c) for c in msg.certificates), perch_time=msg.perch_time, recovery_time=msg.recovery_time,
         solve_time=msg.solve_time, recovery_solve_time=msg.recovery_solve_time, iterations=msg.iterations, solver=msg.solver)

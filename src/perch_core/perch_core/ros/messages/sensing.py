@@ -9,7 +9,7 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from perch_core.camera import camera_of, camera_parameters
 from perch_core.errors import PerchError
-from perch_core.ros.messages.basic import flat, floats, header, quaternion_floats, stamp_value, to_quaternion, to_vector
+from perch_core.ros.messages.basic import flat, floats, header, quaternion_floats, require_measured, stamp_value, to_quaternion, to_vector
 from perch_core.values import CameraImage, CameraModel, CompressedPixels, ImuSample, StampedTransform, Transform
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
@@ -18,7 +18,8 @@ _ENCODINGS = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' ge
 
 
 def imu_value(msg: Imu) -> ImuSample:
-    """`sensor_msgs/Imu` to its sample."""
+    """`sensor_msgs/Imu` to its sample; a PerchError where it does not measure both."""
+    require_measured(msg.angular_velocity_covariance[0], msg.linear_acceleration_covariance[0])
     return ImuSample(stamp_value(msg.header.stamp), floats(msg.angular_velocity), floats(msg.linear_acceleration), msg.header.frame_id)
 
 
@@ -52,7 +53,10 @@ def compressed_value(msg: CompressedImage) -> CameraImage:
     Raises:
         PerchError: it cannot be decoded.
     """
-    pixels = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED) if len(msg.data) else None
+    try:
+        pixels = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED) if len(msg.data) else None
+    except cv2.error:  # more pixels than OpenCV decodes
+        pixels = None
     if pixels is None or pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise PerchError(f"compressed image: {len(msg.data)} bytes of format {msg.format!r} are no image of 8 bits per channel")
     encoding = "mono8" if pixels.ndim == 2 else "bgr8"

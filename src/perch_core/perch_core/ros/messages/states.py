@@ -6,7 +6,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped as PoseStampedMessage
 from nav_msgs.msg import Odometry
 from perch_core.ros.messages.basic import (
-    flat, floats, header, quaternion_floats, square, stamp_value, to_point, to_pose, to_quaternion, to_vector)
+    flat, floats, header, quaternion_floats, require_body, square, stamp_value, to_point, to_pose, to_quaternion, to_vector)
 from perch_core.values import Contact, EstimatorHealth, InertialState, OdometryState, PoseStamped, RotorState
 from perch_msgs.msg import Contact as ContactMessage
 from perch_msgs.msg import EstimatorStatus, VioState
@@ -14,7 +14,8 @@ from perch_msgs.msg import RotorState as RotorStateMessage
 
 
 def odometry_value(msg: Odometry) -> OdometryState:
-    """`nav_msgs/Odometry` to a state."""
+    """`nav_msgs/Odometry` to a state; a PerchError where it is not the body's."""
+    require_body(msg.child_frame_id)
     pose, twist = msg.pose.pose, msg.twist.twist
     return OdometryState(
         stamp_value(msg.header.stamp), floats(pose.position), quaternion_floats(pose.orientation), floats(twist.linear), floats(twist.angular),
