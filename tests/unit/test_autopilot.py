@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import select
-import socket
 import struct
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +15,12 @@ from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, levelling, msp
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
+from perch_autopilot.mavlink import Mavlink, MavlinkParameters
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
 from perch_autopilot.rates import Sticks, rate_curves
 from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog
-from perch_autopilot.link import Link, LinkError
+from perch_autopilot.link import LinkError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
 from perch_core.values import RatesThrust
@@ -153,27 +152,36 @@ def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
 class StubAutopilot:
     """In the place of link and supervisor: an autopilot that answers with its version and its battery's voltage."""
 
-    voltage, silent = 16.0, False
+    voltage, silent, armed, opened = 16.0, False, False, 0
 
     def __init__(self, address, hover, descent, disarm_after, curves) -> None:
+        StubAutopilot.opened += 1
         self.throttles, self._said, self._parser, self.closed = (hover, descent), b"", msp.Parser(), False
         self.mode: list[str] = []
+        self.ended, self.told = False, []
 
     def request(self, data: bytes) -> None:
         known = {msp.FC_VARIANT: b"BTFL", msp.FC_VERSION: bytes((4, 6, 0)),
                  msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * StubAutopilot.voltage)),
-                 msp.RAW_IMU: struct.pack("<9h", 0, 0, 2048, *(0,) * 6), msp.STATUS: struct.pack("<HHHIBHBBBBIB", *(0,) * 9, 29, 0, 0)}
+                 msp.RAW_IMU: struct.pack("<9h", 0, 0, 2048, *(0,) * 6),
+                 msp.STATUS: struct.pack("<HHHIBHBBBBIB", 0, 0, 0, self.armed, *(0,) * 5, 29, 0, 0)}
         if self.silent:
             return
         for frame in self._parser.feed(data.replace(b"$M<", b"$M>")):  # requests have the form of answers
             self._said += answer(frame.command, known[frame.command]) if frame.command in known else b""
 
     def receive(self, timeout: float = 0.0):
+        if self.ended:
+            raise LinkError("the process that holds the link has ended")
         (said, mode), self._said, self.mode = (self._said, self.mode), b"", []
         return said, mode
 
     def command(self, armed: bool, sticks) -> None:
         self.mode = ["following"]
+        self.told.append((armed, sticks))
+
+    def turning(self) -> None:
+        self.told.append("turning")
 
     def set_throttles(self, hover: int, descent: int) -> None:
         self.throttles = hover, descent
@@ -247,6 +255,24 @@ def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
         assert {report.level for report in reports[before:]} == {0}
 
 
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_process_that_holds_the_link_and_ends_is_replaced(armed, flown_on, monkeypatch):
+    """What flies keeps its throttle, and the new process is told of a hover, so that it descends where no command follows."""
+    monkeypatch.setattr(StubAutopilot, "armed", armed)
+    node = flown_on(16.0)
+    assert polled(node, 1.0, 50, armed=True) == []
+    last, opened = node._link, StubAutopilot.opened
+    last.ended = True
+    assert polled(node, 1.5, 10) == ["the process that holds the link has ended: another one is started"]
+    assert StubAutopilot.opened == opened + 1 and last.closed and not node._link.closed
+    hover = True, node._sticks.channels((0.0, 0.0, 0.0), 9.81)
+    assert node._link.told == (["turning", hover] if armed else [])
+    for k in range(100):
+        node._link.ended = True
+        node.on_poll(round(1.6e9) + k * 10_000_000)
+    assert StubAutopilot.opened == opened + 6  # five times a second
+
+
 def test_of_samples_that_come_at_once_the_newest_counts(flown_on):
     """A torn length keeps the frames behind it back: they come together, and all but one are old."""
     node, samples = flown_on(16.0), []
@@ -294,8 +320,7 @@ def test_a_serial_line_that_answers_at_another_rate_is_refused_and_motors_stay_o
         Betaflight(BetaflightParameters(link=f"{os.ttyname(theirs)}@9600"))
     assert "\n" not in str(error.value) and links[0].process.wait(60.0) == 0
     heard = msp.Parser().feed(os.read(ours, 1 << 16).replace(b"$M<", b"$M>"))
-    sent = [struct.unpack("<6H", frame.payload) for frame in heard if frame.command == msp.SET_RAW_RC]
-    assert sent and {channels[2:] for channels in sent} == {(1000, 1500, OFF, OFF)}
+    assert heard and msp.SET_RAW_RC not in {frame.command for frame in heard}
     os.close(theirs)
     os.close(ours)
 
@@ -336,6 +361,17 @@ def test_it_arms_with_the_throttle_down():
     assert dog.channels(5.03) == (1500, 1500, 1000, 1500, ON, OFF)
     dog.command(5.25, True, STICKS)
     assert dog.channels(5.25) == (*STICKS, ON, OFF)
+
+
+def test_of_what_flies_already_the_throttle_does_not_come_down():
+    dog = Watchdog(hover=1450, descent=1420)
+    dog.turning()
+    assert not dog.begun
+    dog.command(5.0, True, STICKS)
+    assert dog.begun and dog.channels(5.0) == (*STICKS, ON, OFF)
+    dog.command(5.1, False, STICKS)
+    dog.command(5.2, True, STICKS)
+    assert dog.channels(5.2) == (1500, 1500, 1000, 1500, ON, OFF)
 
 
 def test_a_fresh_command_goes_on_and_a_stale_one_never_does():
@@ -424,50 +460,6 @@ def test_far_from_level_rates_are_commanded_while_the_attitude_is_fresh_and_self
     assert not dog.levels(16.0)
 
 
-# -- link ------------------------------------------------------------------------------------------------------------
-
-@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
-def test_a_wire_that_is_none_is_one_line(address):
-    with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
-        Link(address)
-    assert "\n" not in str(error.value)
-
-
-def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
-    ours, theirs = pty.openpty()
-    link = Link(os.ttyname(theirs) + "@921600")
-    try:
-        link.write(b"$M<")
-        assert os.read(ours, 10) == b"$M<" and link.read() == b""
-        os.write(ours, bytes(range(256)))
-        got, last = b"", time.monotonic() + 60.0
-        while len(got) < 256 and time.monotonic() < last:
-            got += link.read(0.1)
-        assert got == bytes(range(256))  # raw: nothing is translated
-        os.close(theirs)
-        os.close(ours)
-        with pytest.raises(LinkError, match="has ended"):
-            link.read(1.0)
-    finally:
-        link.close()
-
-
-def test_the_supervisor_sends_without_a_node_reopens_the_link_and_ends_with_the_motors_off():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(120.0)
-        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", 1450, 1420, 4.0, CURVES)
-        frame = msp.channels((1500, 1500, 1000, 1500, OFF, OFF))
-        for _ in range(2):  # the first link ends; the supervisor opens another
-            with server.accept()[0] as peer:
-                peer.settimeout(120.0)
-                got = b""
-                while len(got) < 5 * len(frame):
-                    got += peer.recv(4096)
-                assert got[:4 * len(frame)] == 4 * frame
-        link.close()
-        assert link.process.wait(120.0) == 0
-
-
 # -- configuration ---------------------------------------------------------------------------------------------------
 
 def test_what_is_set_otherwise_is_named():
@@ -482,8 +474,9 @@ def test_a_configuration_that_is_none_is_refused(tmp_path, text, words):
     file.write_text(text)
     with pytest.raises(ConfigError, match=words):
         load_configuration(str(file))
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_configuration(str(tmp_path / "none.txt"))
+    for name in ("none.txt", "no\0ne.txt"):
+        with pytest.raises(ConfigError, match="cannot be read"):
+            load_configuration(str(tmp_path / name))
 
 
 @pytest.mark.parametrize("came, words", [(b"", "within 0 s$"), (b"\x00\xf8" * 40, "bytes came, at last .*: is the baud rate right")])
@@ -499,6 +492,26 @@ def test_rates_of_another_type_are_refused():
         rate_curves({"rates_type": "BETAFLIGHT"}, "x")
     with pytest.raises(ConfigError, match="roll_srate"):
         rate_curves({"rates_type": "ACTUAL", "roll_rc_rate": "40"}, "x")
+
+
+@pytest.mark.parametrize("key, value, words", [
+    ("roll_rc_rate", "abc", "abc is no number"), ("roll_rc_rate", "nan", "nan is outside"), ("pitch_rc_rate", "0", "0 is outside"),
+    ("yaw_rc_rate", "-7", "-7 is outside"), ("roll_srate", "39", r"39 is outside \[40, 199.8\]"), ("yaw_srate", "inf", "inf is outside"),
+    ("pitch_expo", "500", r"500 is outside \[0, 100\]"), ("yaw_expo", "-1", "-1 is outside")])
+def test_rates_that_the_firmware_cannot_have_are_refused_by_file_and_key(key, value, words):
+    with pytest.raises(ConfigError, match=f"mine.txt: {key}: {words}"):
+        rate_curves({**load_configuration("betaflight").settings, key: value}, "mine.txt")
+
+
+def test_a_stick_for_no_rate_is_centred():
+    assert [RateCurve(centre, centre, 0.0).stick(0.0) for centre in (0.0, 400.0)] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("component, parameters", [(Betaflight, BetaflightParameters), (Mavlink, MavlinkParameters)])
+def test_a_vehicle_that_takes_rotor_speeds_is_refused(component, parameters):
+    pytest.importorskip("pymavlink", reason="pymavlink is an optional extra (scripts/setup.py --extra mavlink)")
+    with pytest.raises(ConfigError, match="snapdragon: actuation.type: rotor_speeds: an autopilot takes rates_and_thrust"):
+        component(parameters(vehicle="snapdragon", link="/dev/no_such_device"))
 
 
 def test_the_firmware_that_is_built_is_the_one_that_is_locked():

@@ -9,6 +9,7 @@ import signal
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -284,6 +285,39 @@ def test_the_node_arms_flies_levels_and_hands_over(vehicle):
         until(lambda: not vehicle.turning)                                        # level, down, off
     finally:
         node.close()
+
+
+def test_what_flies_goes_on_when_node_or_supervisor_are_started_anew(vehicle):
+    node, got = component(vehicle)
+    nodes = [node]
+
+    def poll(armed=True):
+        nodes[-1].on_rates_thrust(RatesThrust(0, armed, STILL, 9.81))
+        nodes[-1].on_poll(time.monotonic_ns())
+
+    def flown(seconds):
+        begin = time.monotonic()
+        with suppress(AssertionError):
+            until(lambda: False, seconds, poll)
+        return min(min(motors) for moment, motors in vehicle.history if moment >= begin)
+
+    try:
+        poll(False)
+        until(lambda: min(vehicle.motors) > 0.6, often=poll)
+        flown(1.0)                                                                # its state is known
+        node._link.process.kill()
+        assert flown(1.5) > 0.6
+        assert "the process that holds the link has ended: another one is started" in {line.text for line in got["log"]}
+        node._link.process.kill()                                                 # and the node with it
+        nodes.append(component(vehicle)[0])
+        assert flown(1.5) > 0.6
+        nodes[-1]._link.process.kill()                                            # and again, and no command follows
+        last = time.monotonic()
+        until(lambda: not vehicle.turning, often=lambda: nodes[-1].on_poll(time.monotonic_ns()))
+        assert 4.0 < time.monotonic() - last < 8.0
+    finally:
+        for one in nodes:
+            one.close()
 
 
 @pytest.mark.parametrize("switched", [True, False])

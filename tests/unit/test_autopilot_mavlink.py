@@ -7,6 +7,7 @@ import socket
 
 import numpy as np
 import pytest
+from perch_autopilot.link import Link, LinkError
 from perch_autopilot.mavlink import ClockOffset, Mavlink, MavlinkParameters
 from perch_autopilot.offboard import ARDUPILOT, ARMED, GUIDED_NOGPS, OFFBOARD, PX4, Ask, Offboard
 from perch_core.component import Output, ports
@@ -49,6 +50,13 @@ def test_a_pilot_who_takes_the_mode_back_keeps_it():
     assert Ask.MODE in asked(machine, 2.0, start=8.0)
 
 
+def test_what_flies_already_is_asked_for_nothing():
+    """A node that is started anew in flight: neither the pilot's mode, nor a vehicle that follows without set points, is its to change."""
+    assert asked(Offboard(autopilot=PX4, armed=True), 5.0) == []
+    following = Offboard(autopilot=PX4, armed=True, following=True)
+    assert asked(following, 5.0, wanted=False, streaming=False) == [] and Ask.DISARM in asked(following, 1.0, start=5.0, wanted=False)
+
+
 def test_nothing_is_asked_of_an_autopilot_that_is_gone_or_without_set_points():
     machine = Offboard()
     assert [machine.ask(0.01 * k, True, True) for k in range(300)] == [Ask.NOTHING] * 300
@@ -72,12 +80,12 @@ def test_the_clock_of_the_shortest_way_counts_and_a_jump_is_followed():
 class Autopilot:
     """The other end of the link."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: int = PX4) -> None:
         common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (scripts/setup.py --extra mavlink)")
         ours, self.link = socket.socketpair()
         self.mavlink = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self.mavlink.robust_parsing = True
-        self.say(self.mavlink.heartbeat_encode(2, PX4, 0, 0, 4))
+        self.say(self.mavlink.heartbeat_encode(2, kind, 0, 0, 4))
         self.node = Mavlink(MavlinkParameters(link=f"fd:{ours.detach()}"))
         self.got: dict = {}
         for port in ports(Mavlink, Output):
@@ -133,6 +141,22 @@ def test_odometry_leaves_as_ned_with_its_covariance(autopilot):
     assert [said.pose_covariance[k] for k in (0, 6, 11, 15, 18, 20)] == [2.0, 1.0, 3.0, 5.0, 4.0, 6.0]
 
 
+def test_odometry_has_the_hosts_time_and_says_what_it_lacks(autopilot):
+    """The autopilot itself knows the host's clock against its own."""
+    autopilot.say(autopilot.mavlink.timesync_encode(500 * SECOND, autopilot.now))
+    autopilot.heard()
+    P, unknown = np.eye(6), np.diag([-1.0, *(0.0,) * 5])
+
+    def said(stamp, twist):
+        autopilot.node.on_odometry(OdometryState(stamp, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, P, twist))
+        return autopilot.heard()["ODOMETRY"]
+
+    one, other = said(7 * SECOND, unknown), said(-5, np.zeros((6, 6)))
+    assert (one.time_usec, other.time_usec) == (7_000_000, 0)
+    assert np.isnan([one.vx, one.vy, one.vz, one.rollspeed, one.velocity_covariance[0], other.velocity_covariance[0]]).all()
+    assert (other.vx, other.vy, other.vz) == (0.0, 0.0, 0.0) and one.pose_covariance[0] == 1.0
+
+
 def test_imu_comes_in_by_the_hosts_clock_and_torn_frames_are_counted(autopilot):
     m = autopilot.mavlink
     imu = m.highres_imu_encode(5_000_000, 1.0, 2.0, -9.81, 0.1, 0.2, 0.3, 0, 0, 0, 0, 0, 0, 0, 63)
@@ -150,6 +174,38 @@ def test_imu_comes_in_by_the_hosts_clock_and_torn_frames_are_counted(autopilot):
     assert sample.stamp == pytest.approx(autopilot.now, abs=10_000_000)
     autopilot.heard(1.1)
     assert autopilot.got["diagnostics"][-1].values["torn_frames"] >= 1
+
+
+def test_ardupilot_gets_set_points_when_it_is_known_to_take_their_thrust():
+    """GUID_OPTIONS, bit 3; without it ArduPilot takes the thrust as a climb rate."""
+    autopilot = Autopilot(ARDUPILOT)
+    m = autopilot.mavlink
+
+    def second(options: float | None = None) -> dict:
+        """What the node says in a second, with commands, heartbeats and, where it is given, the parameter's value."""
+        said: dict = {}
+        autopilot.say(m.heartbeat_encode(2, ARDUPILOT, 0, 0, 4))
+        if options is not None:
+            autopilot.say(m.param_value_encode(b"GUID_OPTIONS", options, 6, 1, 0))
+        for _ in range(200):
+            autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+            said |= autopilot.heard()
+        return said
+
+    try:
+        for options in (None, 0.0, 4.0, float("nan")):
+            said = second(options)
+            assert said["PARAM_REQUEST_READ"].param_id == "GUID_OPTIONS" and said["PARAM_REQUEST_READ"].param_index == -1
+            assert not {"SET_ATTITUDE_TARGET", "COMMAND_LONG"} & set(said)
+        report = autopilot.got["diagnostics"][-1]
+        assert report.level == 2 and "GUID_OPTIONS does not have bit 3 (value 8)" in report.message
+        second(9.0)
+        said = second()
+        assert {"SET_ATTITUDE_TARGET", "COMMAND_LONG"} <= set(said) and "PARAM_REQUEST_READ" not in said
+        assert autopilot.got["diagnostics"][-1].level == 0
+    finally:
+        autopilot.node.close()
+        autopilot.link.close()
 
 
 def test_it_arms_by_its_own_way_and_says_why_not(autopilot):
@@ -208,15 +264,48 @@ def test_samples_of_an_autopilot_that_has_started_anew_wait_for_its_new_clock(au
     m = autopilot.mavlink
     autopilot.heard()
     for own in (500 * SECOND, 2 * SECOND):
-        autopilot.say(m.highres_imu_encode(own // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
-        autopilot.heard()
-        assert autopilot.got["imu"] == []
+        for _ in range(3):
+            autopilot.say(m.highres_imu_encode(own // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+        asked = autopilot.heard()
+        assert autopilot.got["imu"] == [] and ("TIMESYNC" in asked) == (own == 2 * SECOND)  # it is asked at once
         autopilot.say(m.timesync_encode(own, autopilot.now))
         autopilot.say(m.highres_imu_encode(own // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
         autopilot.heard()
         assert autopilot.got["imu"].pop().stamp == pytest.approx(autopilot.now, abs=10_000_000)
     line, = autopilot.got["log"]
     assert "the autopilot's clock went from 500.000 to 2.000 s at once" in line.text
+
+
+def test_a_single_sample_of_the_past_is_dropped(autopilot):
+    m = autopilot.mavlink
+    autopilot.say(m.timesync_encode(500 * SECOND, autopilot.now))
+    for own in (500.0, 500.01, 490.0, 500.02, 491.0, 492.0, 500.03, 700.0, 500.04):
+        autopilot.say(m.highres_imu_encode(round(own * 1e6), 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+        autopilot.heard()
+    stamps = [sample.stamp for sample in autopilot.got["imu"]]
+    assert np.diff(stamps) == pytest.approx(0.01 * SECOND) and len(stamps) == 5 and autopilot.got["log"] == []
+
+
+def test_a_link_that_has_ended_is_opened_anew(autopilot, monkeypatch):
+    ours, theirs = socket.socketpair()
+    tried: list[int] = []
+
+    def opened(address: str) -> Link:
+        tried.append(autopilot.now)
+        if len(tried) < 3:
+            raise LinkError(f"{address}: cannot be opened")
+        return Link(f"fd:{ours.detach()}")
+
+    monkeypatch.setattr("perch_autopilot.mavlink.Link", opened)
+    autopilot.link.close()
+    autopilot.link = theirs
+    said = autopilot.heard(2.0)
+    assert len(tried) == 3 and min(np.diff(tried)) >= 0.2 * SECOND
+    assert {"HEARTBEAT", "TIMESYNC"} <= set(said) and autopilot.node.offboard == Offboard()  # nothing is known of who is there now
+    autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+    autopilot.heard()
+    assert autopilot.node.offboard.following
+    assert [line.text for line in autopilot.got["log"][:2]] == ["the link to the autopilot has ended", f"{autopilot.node.config.link}: cannot be opened"]
 
 
 @pytest.mark.parametrize("noise, words", [(b"", "check its power, link and system id"), (b"\x00\xf8\x06" * 9, "is the baud rate right?")])

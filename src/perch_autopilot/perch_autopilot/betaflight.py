@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
 from perch_core.config import quantity, text
 from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import GRAVITY
 from perch_autopilot import msp
 from perch_autopilot.clock import jumped
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
-from perch_autopilot.rates import Sticks, rate_curves
+from perch_autopilot.rates import Sticks, commanded_vehicle, rate_curves
 from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER
-from perch_autopilot.link import LinkError
+from perch_autopilot.link import REOPEN, LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
 _REFUSED = NANOSECONDS               # an order to arm that has had no effect for so long is refused [ns]
@@ -49,28 +49,31 @@ class Betaflight(Component[BetaflightParameters]):
     def __init__(self, config: BetaflightParameters) -> None:
         """
         Raises:
-            ConfigError: there is no such vehicle or configuration.
+            ConfigError: there is no such vehicle or configuration, or the vehicle takes other commands.
             LinkError: the link cannot be opened.
             MspError: nobody answers, another firmware than this was written for, or one that is not armed and will not fly: it refuses to
                 arm for a lasting reason, or the vehicle has no thrust curve for the battery.
         """
         super().__init__(config)
-        vehicle, loaded = load_vehicle(config.vehicle), load_configuration(config.configuration)
+        vehicle, loaded = commanded_vehicle(config.vehicle), load_configuration(config.configuration)
         self._sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        self._link, self._parser = SupervisedLink(config.link, *self._throttles(), config.disarm_after, self._sticks.curves[:2]), msp.Parser()
+        self._link, self._parser = self._opened_link(), msp.Parser()
+        self._status: msp.Status | None = None
         try:
             self.version = self._identify()
         except BaseException:
             self._link.close()
             raise
         self._polls, self._mode = 0, "disarmed"
-        self._status: msp.Status | None = None
         self._attitude: tuple[float, float, float] | None = None
         self._battery: msp.Battery | None = None
         self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
         self._wanted = False
         self._now: int | None = None            # of the last poll [ns]
-        self._answered = self._diagnosed = self._torn = 0
+        self._answered = self._diagnosed = self._opened = self._torn = 0
+
+    def _opened_link(self) -> SupervisedLink:
+        return SupervisedLink(self.config.link, *self._throttles(), self.config.disarm_after, self._sticks.curves[:2])
 
     def _throttles(self) -> tuple[int, int]:
         """Throttles of hover and descent [us]."""
@@ -89,7 +92,10 @@ class Betaflight(Component[BetaflightParameters]):
                 answers[frame.command] = frame
             if answers.keys() >= set(wanted):
                 version = msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
-                if not (status := msp.status(answers[msp.STATUS])).armed:  # what flies goes on when the node is started again
+                self._status = status = msp.status(answers[msp.STATUS])
+                if status.armed:  # what flies goes on when the node is started again
+                    self._link.turning()
+                else:
                     self._take_battery(msp.battery(answers[msp.ANALOG]).voltage)
                     if status.lasting:
                         raise msp.MspError(f"{self.config.link}: the autopilot refuses to arm: {'; '.join(status.lasting)}")
@@ -120,21 +126,40 @@ class Betaflight(Component[BetaflightParameters]):
         self._now = now
         try:
             data, said = self._link.receive()
-            for line in said:
-                self._mode = line
-                self.log(LogLine("info" if line in ("disarmed", "following") else "warning", f"autopilot: {line}"))
-            for frame in {frame.command: frame for frame in self._parser.feed(data)}.values():
-                self._take(frame, now)
-            self._polls += 1
-            asked = msp.request(msp.RAW_IMU)
-            if self._polls % 10 == 0:
-                asked += msp.request(_SELDOM[self._polls // 10 % len(_SELDOM)])
-            self._link.request(asked)
         except LinkError as error:
-            self.log(LogLine("error", str(error), 1.0))
+            data, said = b"", []
+            self._reopen(now, error)
+        for line in said:
+            self._mode = line
+            self.log(LogLine("info" if line in ("disarmed", "following") else "warning", f"autopilot: {line}"))
+        for frame in {frame.command: frame for frame in self._parser.feed(data)}.values():
+            self._take(frame, now)
+        self._polls += 1
+        asked = msp.request(msp.RAW_IMU)
+        if self._polls % 10 == 0:
+            asked += msp.request(_SELDOM[self._polls // 10 % len(_SELDOM)])
+        self._link.request(asked)
         if now - self._diagnosed >= NANOSECONDS:
             self._diagnosed = now
             self._diagnose(now)
+
+    def _reopen(self, now: int, ended: LinkError) -> None:
+        """Start another process that holds the link: what flies follows the next command, and descends without one."""
+        if 0 <= now - self._opened < REOPEN * NANOSECONDS:
+            return
+        self._opened = now
+        self.log(LogLine("error", f"{ended}: another one is started", 1.0))
+        try:
+            link = self._opened_link()
+        except LinkError as error:
+            self.log(LogLine("error", str(error), 1.0))
+            return
+        self._link.close()
+        self._link = link
+        if self._status is not None and self._status.armed:
+            link.turning()
+            if self._wanted:
+                link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY))
 
     def _take(self, frame: msp.Frame, now: int) -> None:
         try:

@@ -52,7 +52,7 @@ def load_configuration(name: str) -> Configuration:
     file = Path(name) if Path(name).suffix else config.config_dir() / "autopilot" / f"{name}.txt"
     try:
         text = file.read_text()
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise ConfigError("autopilot.configuration", str(name), f"cannot be read: {error}") from None
     lines = tuple(line for raw in text.splitlines() if (line := " ".join(raw.split("#")[0].split())))
     for line in lines:

@@ -1,7 +1,8 @@
-"""The link to an autopilot: a serial port, or TCP."""
+"""The link to an autopilot: a serial port, which one process has at a time, or TCP."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import select
@@ -12,6 +13,7 @@ import tty
 from perch_core.errors import PerchError
 
 CONNECT_TIMEOUT = 3.0  # [s]
+REOPEN = 0.2           # from one attempt to open a link that has ended to the next [s]
 
 
 class LinkError(PerchError):
@@ -39,24 +41,10 @@ class Link:
             elif found := re.fullmatch(r"fd:(\d+)", address):
                 self.file = int(found[1])
             else:
-                device, _, baud = address.partition("@")
-                self.file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-                self._set_serial(baud or "115200", address)
+                self.file = _opened_port(address)
             os.set_blocking(self.file, False)
         except (OSError, OverflowError) as error:
             raise LinkError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
-
-    def _set_serial(self, baud: str, address: str) -> None:
-        speed = getattr(termios, f"B{baud}", None)
-        if speed is None:
-            raise LinkError(f"{address}: {baud} is not a baud rate of a serial port")
-        try:
-            tty.setraw(self.file)
-            attributes = termios.tcgetattr(self.file)
-            attributes[4] = attributes[5] = speed
-            termios.tcsetattr(self.file, termios.TCSANOW, attributes)
-        except termios.error as error:
-            raise LinkError(f"{address}: is not a serial port: {error.args[-1]}") from None
 
     def write(self, data: bytes) -> None:
         """Send; what the port cannot accept now is dropped, because a late command would be worse.
@@ -95,3 +83,36 @@ class Link:
             self._socket.close()
         else:
             os.close(self.file)
+
+
+def _opened_port(address: str) -> int:
+    """File number of a serial port, which is locked and set up.
+
+    Raises:
+        OSError, LinkError: it cannot be opened.
+    """
+    device, _, baud = address.partition("@")
+    file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _set_serial(file, baud or "115200", address)
+    except BlockingIOError:
+        os.close(file)
+        raise LinkError(f"{address}: another process has this port: another node, or what a node has left behind to land its vehicle") from None
+    except BaseException:
+        os.close(file)
+        raise
+    return file
+
+
+def _set_serial(file: int, baud: str, address: str) -> None:
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        raise LinkError(f"{address}: {baud} is not a baud rate of a serial port")
+    try:
+        tty.setraw(file)
+        attributes = termios.tcgetattr(file)
+        attributes[4] = attributes[5] = speed
+        termios.tcsetattr(file, termios.TCSANOW, attributes)
+    except termios.error as error:
+        raise LinkError(f"{address}: is not a serial port: {error.args[-1]}") from None

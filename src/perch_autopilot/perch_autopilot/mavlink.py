@@ -1,8 +1,8 @@
 """Component of the node `mavlink`: an autopilot that speaks MAVLink 2 (PX4, ArduPilot) follows body rates and thrust.
 
-| to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm) |
+| to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm), PARAM_REQUEST_READ |
 | --- | --- |
-| from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT |
+| from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT, PARAM_VALUE (GUID_OPTIONS of ArduPilot) |
 
 Where commands cease, so do set points: the autopilot's own failsafe for their loss then counts. The messages are those of `pymavlink`, an
 optional extra (`python3 scripts/setup.py --extra mavlink`).
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from math import isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -20,13 +21,14 @@ from perch_core.component import Component, Diagnostics, Input, LogLine, Output,
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
-from perch_core.vehicle import load_vehicle
 from perch_autopilot import frames
 from perch_autopilot.clock import JUMP, jumped
-from perch_autopilot.offboard import ARDUPILOT, PX4, SILENT, Ask, Offboard
-from perch_autopilot.link import Link, LinkError
+from perch_autopilot.offboard import ARDUPILOT, GUID_OPTIONS, PX4, SILENT, THRUST_AS_THRUST, Ask, Offboard
+from perch_autopilot.link import REOPEN, Link, LinkError
+from perch_autopilot.rates import commanded_vehicle
 
 _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
+_JUMPED = 3                          # samples in a row that do not follow the last one: its clock has jumped
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _COMMANDS = {176: "the mode", 400: "arming"}
@@ -80,7 +82,7 @@ class Mavlink(Component[MavlinkParameters]):
     def __init__(self, config: MavlinkParameters) -> None:
         """
         Raises:
-            ConfigError: there is no such vehicle.
+            ConfigError: there is no such vehicle, or it takes other commands.
             LinkError: the link cannot be opened.
             PerchError: pymavlink is not installed, no heartbeat comes, or that of another autopilot.
         """
@@ -89,30 +91,31 @@ class Mavlink(Component[MavlinkParameters]):
             from pymavlink.dialects.v20 import common
         except ImportError:
             raise PerchError("the node mavlink needs pymavlink (an optional extra): python3 scripts/setup.py --extra mavlink") from None
-        vehicle = load_vehicle(config.vehicle)
+        vehicle = commanded_vehicle(config.vehicle)
         self._thrust_max = 4.0 * vehicle.thrust_max / vehicle.mass
-        self._link = Link(config.link)
+        link = Link(config.link)
+        self._link: Link | None = link       # None: it has ended
         self._mavlink = common.MAVLink(None, srcSystem=config.system, srcComponent=191)  # MAV_COMP_ID_ONBOARD_COMPUTER
         self._mavlink.robust_parsing = True
         self.offboard, self._clock = Offboard(), ClockOffset()
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
-        self._begun = self._came = self._second = self._torn = self._named = 0
+        self._begun = self._came = self._second = self._opened = self._torn = self._named = self._jumps = 0
         self._sampled: int | None = None     # stamp of its last sample, by its own clock [ns]
         try:
-            self._identify()
+            self._identify(link)
         except BaseException:
-            self._link.close()
+            self.close()
             raise
 
-    def _identify(self) -> None:
+    def _identify(self, link: Link) -> None:
         """Wait for the autopilot's first heartbeat."""
         last = time.monotonic() + _HANDSHAKE
         while not self.offboard.autopilot and (left := last - time.monotonic()) > 0.0:
-            for message in self._mavlink.parse_buffer(self._link.read(left)) or ():
+            for message in self._mavlink.parse_buffer(link.read(left)) or ():
                 if message.get_type() in ("HEARTBEAT", "BAD_DATA"):
                     self._take(message, 0)
-        if trouble := self._trouble(0):
+        if trouble := self._absent(0):
             raise PerchError(f"{self.config.link}: {trouble}")
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
@@ -125,22 +128,24 @@ class Mavlink(Component[MavlinkParameters]):
         self._command, self._came = command, self._now or 0
 
     def on_odometry(self, state: OdometryState) -> None:
-        """On to the autopilot's own estimator, in its axes."""
+        """On to the autopilot's own estimator, in its axes, by the host's clock, which it knows by TIMESYNC."""
         mavlink = self._mavlink
         x, y, z = frames.world(state.p_WB)
-        vx, vy, vz = frames.body(state.v_B)
-        p, q, r = frames.body(state.w_B)
+        measured = state.twist_covariance[0, 0] >= 0.0
+        twist = (*frames.body(state.v_B), *frames.body(state.w_B)) if measured else (nan,) * 6
         i, j, k, w = frames.attitude(np.array(state.q_WB))
         self._send(mavlink.odometry_encode(
-            (state.stamp - (self._clock.offset or 0)) // 1000, 1, 12, x, y, z, (w, i, j, k), vx, vy, vz, p, q, r,  # LOCAL_NED, BODY_FRD
+            max(state.stamp, 0) // 1000, 1, 12, x, y, z, (w, i, j, k), *twist,  # LOCAL_NED, BODY_FRD
             _upper(state.pose_covariance, frames.WORLD), _upper(state.twist_covariance, frames.BODY)))
 
     def _send(self, message: Any) -> None:
+        if self._link is None:
+            return
         try:
             self._link.write(message.pack(self._mavlink))
             self._mavlink.seq = (self._mavlink.seq + 1) % 256
         except LinkError as error:
-            self.log(LogLine("error", str(error), 1.0))
+            self._lose(error)
 
     def _target(self, command: RatesThrust) -> None:
         rates = frames.body(np.array(command.w_B)) if command.armed else np.zeros(3)
@@ -157,12 +162,9 @@ class Mavlink(Component[MavlinkParameters]):
             if self._now is not None:
                 self.warn(jump)
         self._now = now
-        try:
-            for message in self._mavlink.parse_buffer(self._link.read()) or ():
-                self._take(message, now)
-        except LinkError as error:
-            self.log(LogLine("error", str(error), 1.0))
-        command = self._command
+        for message in self._mavlink.parse_buffer(self._received(now)) or ():
+            self._take(message, now)
+        command = self._command if self.offboard.takes_thrust else None
         if command is not None and not 0 <= now - self._came <= _STALE:
             command = None
         if command is not None:
@@ -176,7 +178,26 @@ class Mavlink(Component[MavlinkParameters]):
             self._second = now
             self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
             self._send(self._mavlink.timesync_encode(0, now))
+            if not self.offboard.takes_thrust:
+                self._send(self._mavlink.param_request_read_encode(self.config.system, 1, GUID_OPTIONS.encode(), -1))
             self._diagnose(now)
+
+    def _received(self, now: int) -> bytes:
+        """What has come; a link that has ended is opened anew."""
+        try:
+            if self._link is None and not 0 <= now - self._opened < REOPEN * NANOSECONDS:
+                self._opened = now
+                self._link = Link(self.config.link)
+            return b"" if self._link is None else self._link.read()
+        except LinkError as error:
+            self._lose(error)
+            return b""
+
+    def _lose(self, error: LinkError) -> None:
+        """The link has ended: at its next beginning nothing is known of the autopilot."""
+        self.log(LogLine("error", str(error), 1.0))
+        self.close()
+        self.offboard, self._clock, self._sampled = Offboard(), ClockOffset(), None
 
     def _order(self, command: int, *words: float) -> None:
         self._send(self._mavlink.command_long_encode(self.config.system, 1, command, 0, *words, *(0.0,) * (7 - len(words))))
@@ -189,10 +210,12 @@ class Mavlink(Component[MavlinkParameters]):
             return
         elif kind == "HEARTBEAT" and message.get_srcComponent() == 1:
             self.offboard.heartbeat(now * 1e-9, message.autopilot, message.base_mode, message.custom_mode)
-        elif kind == "HIGHRES_IMU" and self._known(message.time_usec * 1000):
+        elif kind == "HIGHRES_IMU" and self._known(message.time_usec * 1000, now):
             f = frames.body(np.array([message.xacc, message.yacc, message.zacc]))
             w = frames.body(np.array([message.xgyro, message.ygyro, message.zgyro]))
             self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
+        elif kind == "PARAM_VALUE" and message.param_id == GUID_OPTIONS and isfinite(message.param_value):
+            self.offboard.options = int(message.param_value)
         elif kind == "TIMESYNC":
             if message.tc1 == 0:
                 self._send(self._mavlink.timesync_encode(now, message.ts1))
@@ -205,16 +228,28 @@ class Mavlink(Component[MavlinkParameters]):
             said = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
             self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {said}", 1.0))
 
-    def _known(self, stamp: int) -> bool:
-        """Whether the autopilot's clock is known at its time [ns]; after a jump it has to be asked anew."""
+    def _known(self, stamp: int, now: int) -> bool:
+        """Whether a sample's stamp, by the autopilot's clock [ns], can be converted; after a jump the clock is asked for anew."""
         if self._sampled is not None and not 0 <= stamp - self._sampled < JUMP:
+            self._jumps += 1
+            if self._jumps < _JUMPED:
+                return False
             self.warn(f"the autopilot's clock went from {self._sampled * 1e-9:.3f} to {stamp * 1e-9:.3f} s at once: it has started anew?")
             self._clock = ClockOffset()
-        self._sampled = stamp
+            self._send(self._mavlink.timesync_encode(0, now))
+        self._sampled, self._jumps = stamp, 0
         return self._clock.offset is not None
 
     def _trouble(self, now: int) -> str:
         """Why it cannot follow; empty: it can."""
+        if absent := self._absent(now):
+            return absent
+        if not self.offboard.takes_thrust:
+            return f"ArduPilot's {GUID_OPTIONS} does not have bit 3 (value {THRUST_AS_THRUST}), so that thrust is a climb rate: set it; not armed"
+        return ""
+
+    def _absent(self, now: int) -> str:
+        """Why there is no autopilot to follow; empty: there is."""
         if not self.offboard.alive(now * 1e-9):
             noise = f"; {self._torn} torn frames: is the baud rate right?" if self._torn else ": check its power, link and system id"
             return f"no heartbeat of the autopilot{noise}"
@@ -234,7 +269,9 @@ class Mavlink(Component[MavlinkParameters]):
 
     def close(self) -> None:
         """Close the link; the autopilot's failsafe for the loss of set points counts from now on."""
-        self._link.close()
+        if self._link is not None:
+            self._link.close()
+            self._link = None
 
 
 def _mode_words(mode: int) -> tuple[float, ...]:
@@ -243,5 +280,6 @@ def _mode_words(mode: int) -> tuple[float, ...]:
 
 
 def _upper(covariance: np.ndarray, axes: np.ndarray) -> list[float]:
-    """Upper triangle, row by row, of a covariance in other axes."""
-    return frames.covariance(covariance, axes)[np.triu_indices(6)].tolist()
+    """Upper triangle, row by row, of a covariance in other axes; its first entry is NaN where the covariance is not known."""
+    upper = frames.covariance(covariance, axes)[np.triu_indices(6)].tolist()
+    return upper if covariance[0, 0] > 0.0 else [nan, *upper[1:]]

@@ -8,6 +8,8 @@ from enum import Enum
 PX4, ARDUPILOT = 12, 3              # MAV_AUTOPILOT
 ARMED = 128                         # MAV_MODE_FLAG_SAFETY_ARMED
 OFFBOARD, GUIDED_NOGPS = 6 << 16, 20  # custom modes: PX4's main mode, ArduPilot's copter mode
+GUID_OPTIONS = "GUID_OPTIONS"       # parameter of ArduPilot
+THRUST_AS_THRUST = 8                # its bit SetAttitudeTarget_ThrustAsThrust: a thrust, no climb rate
 SETTLED = 0.5                       # set points are sent for so long before the mode is asked for; PX4 wants more than 2 Hz [s]
 AGAIN = 1.0                         # between two requests for the same [s]
 SILENT = 2.0                        # without a heartbeat for so long the autopilot is gone [s]
@@ -30,15 +32,16 @@ class Offboard:
         autopilot: PX4, ARDUPILOT or another number, by its heartbeat; 0: none has come.
         armed: its motors may turn.
         following: its mode is the one in which it follows.
+        options: ArduPilot's GUID_OPTIONS, as far as it is known.
     """
 
     autopilot: int = 0
     armed: bool = False
     following: bool = False
+    options: int = 0
     _heard: float = -1e9
     _streaming: float | None = None
     _asked: float = -1e9
-    _was_following: bool = False
 
     @property
     def mode(self) -> int:
@@ -49,7 +52,11 @@ class Offboard:
         """Take a heartbeat of the autopilot at a time [s]."""
         self._heard, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
-        self._was_following |= self.following
+
+    @property
+    def takes_thrust(self) -> bool:
+        """Whether it takes a set point's thrust as a thrust, not as a climb rate."""
+        return self.autopilot != ARDUPILOT or bool(self.options & THRUST_AS_THRUST)
 
     def alive(self, now: float) -> bool:
         """Whether its heartbeat is of the present."""
@@ -58,7 +65,7 @@ class Offboard:
     def ask(self, now: float, wanted: bool, streaming: bool) -> Ask:
         """What to ask for now.
 
-        A pilot who leaves the mode in flight has taken over: it is not asked for again until the motors were off.
+        The mode is asked for with the motors off only: in flight the pilot selects it, and leaves it.
 
         Args:
             now: [s].
@@ -69,18 +76,13 @@ class Offboard:
             self._streaming = None
         elif self._streaming is None or now < self._streaming:
             self._streaming = now
-        if not self.armed and not wanted:
-            self._was_following = False
         step = Ask.NOTHING
         if not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return step
         if not wanted:
-            step = Ask.DISARM if self.armed and self.following else step
-        elif self._streaming is not None and now - self._streaming >= SETTLED:
-            if not self.following:
-                step = step if self.armed and self._was_following else Ask.MODE
-            elif not self.armed:
-                step = Ask.ARM
+            step = Ask.DISARM if streaming and self.armed and self.following else step
+        elif not self.armed and self._streaming is not None and now - self._streaming >= SETTLED:
+            step = Ask.ARM if self.following else Ask.MODE
         if step is Ask.NOTHING or 0.0 <= now - self._asked < AGAIN:
             return Ask.NOTHING
         self._asked = now

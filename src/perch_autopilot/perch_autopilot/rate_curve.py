@@ -15,7 +15,7 @@ class RateCurve:
 
     Attributes:
         centre: c, slope at the centre of the stick [deg/s].
-        most: m, at its end [deg/s].
+        most: m >= c, at its end [deg/s].
         expo: e, 0..1.
     """
 
@@ -25,14 +25,16 @@ class RateCurve:
 
     def rate(self, stick: float) -> float:
         """Angular velocity [deg/s] at a stick's deflection in [-1, 1]."""
-        return self.centre * stick + max(self.most - self.centre, 0.0) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
+        return self.centre * stick + (self.most - self.centre) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
 
     def stick(self, rate: float) -> float:
         """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. By bisection, as the curve rises."""
+        if rate == 0.0:
+            return 0.0
         if abs(rate) >= self.rate(1.0):
             return 1.0 if rate > 0 else -1.0
         low, high = 0.0, 1.0
         for _ in range(14):  # finer than a microsecond of the pulse
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.rate(middle) < abs(rate) else (low, middle)
-        return 0.5 * (low + high) if rate > 0 else -0.5 * (low + high) if rate < 0 else 0.0
+        return 0.5 * (low + high) if rate > 0 else -0.5 * (low + high)

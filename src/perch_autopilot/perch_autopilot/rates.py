@@ -6,10 +6,11 @@ from math import degrees, sqrt
 
 from perch_core.arrays import Numbers
 from perch_core.errors import ConfigError
-from perch_core.vehicle import GRAVITY, Vehicle
+from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_autopilot.rate_curve import CENTRE, HALF, RateCurve
 
 LOW, HIGH = 1000, 2000  # pulse widths [us]
+FASTEST = 1998.0        # rate that the firmware can command [deg/s]
 AXES = ("roll", "pitch", "yaw")
 
 
@@ -17,15 +18,40 @@ def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
     """The curves of roll, pitch and yaw of a configuration.
 
     Raises:
-        ConfigError: they are of another type, or missing.
+        ConfigError: they are of another type, missing, or none that the firmware can have.
     """
     if settings.get("rates_type") != "ACTUAL":
         raise ConfigError(source, "rates_type", f"{settings.get('rates_type')} is not ACTUAL, the one type that is known here")
-    try:
-        return tuple(RateCurve(10.0 * float(settings[f"{axis}_rc_rate"]), 10.0 * float(settings[f"{axis}_srate"]),
-                               float(settings[f"{axis}_expo"]) / 100.0) for axis in AXES)
-    except KeyError as error:
-        raise ConfigError(source, error.args[0], "is not set: the sticks' meaning depends on it") from None
+
+    def value(key: str, low: float, high: float) -> float:
+        try:
+            number = float(settings[key])
+        except KeyError:
+            raise ConfigError(source, key, "is not set: the sticks' meaning depends on it") from None
+        except ValueError:
+            raise ConfigError(source, key, f"{settings[key]} is no number") from None
+        if not low <= number <= high:
+            raise ConfigError(source, key, f"{number:g} is outside [{low:g}, {high:g}]")
+        return number
+
+    curves = []
+    for axis in AXES:
+        centre = value(f"{axis}_rc_rate", 1.0, FASTEST / 10.0)
+        most = value(f"{axis}_srate", centre, FASTEST / 10.0)
+        curves.append(RateCurve(10.0 * centre, 10.0 * most, value(f"{axis}_expo", 0.0, 100.0) / 100.0))
+    return tuple(curves)
+
+
+def commanded_vehicle(name: str) -> Vehicle:
+    """The vehicle of `config/vehicles/<name>.yaml`, or of a file, which an autopilot flies by body rates and thrust.
+
+    Raises:
+        ConfigError: no such vehicle, or it takes other commands.
+    """
+    vehicle = load_vehicle(name)
+    if vehicle.actuation.type != "rates_and_thrust":
+        raise ConfigError(name, "actuation.type", f"{vehicle.actuation.type}: an autopilot takes rates_and_thrust")
+    return vehicle
 
 
 class Sticks:

@@ -1,10 +1,11 @@
 """A separate process owns the link to the autopilot: it continues when the commanding node is killed, hangs, or is restarted.
 
 Betaflight before 2026.6 holds the last MSP command for ever. Commands therefore go through this process, which sends frames at a fixed
-rate in every case; without fresh commands the `Watchdog` decides what they contain. It ends when the node has gone and the motors are
-off.
+rate from the first command on; without fresh commands the `Watchdog` decides what they contain. It ends when the node has gone and the
+motors are off.
 
     node -> supervisor   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot       b"H" hover, descent: throttles
+                         b"T": the motors turn already
     supervisor -> node   b"D" bytes: from the autopilot          b"M" text: the watchdog's mode, or an error
 """
 
@@ -19,17 +20,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import astuple
 from pathlib import Path
 
 from perch_autopilot import msp
 from perch_autopilot.rate_curve import RateCurve
 from perch_autopilot.watchdog import Mode, Watchdog
-from perch_autopilot.link import Link, LinkError
+from perch_autopilot.link import REOPEN, Link, LinkError
 
-RATE = 200.0    # of the frames to the autopilot, in every case [Hz]
+RATE = 200.0        # of the frames to the autopilot [Hz]
 COMMAND, THROTTLES = struct.Struct("<?4H"), struct.Struct("<2H")
-_REOPEN = 0.2   # from one attempt to open a link that has ended to the next [s]
 _FINAL_FRAMES = 10  # with the motors off, before it ends
 
 
@@ -79,13 +80,14 @@ class LinkSupervisor:
             self._reported = self._watchdog.mode
             self._notify(b"M" + self._reported.value.encode())
         self._final_frames = self._final_frames + 1 if self._node_gone and self._reported is Mode.DISARMED else 0
-        if self._link is None and now - self._opened > _REOPEN:
+        if self._link is None and now - self._opened > REOPEN:
             self._opened = now
             try:
                 self._link = Link(self._address)
             except LinkError:
                 return
-        self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.levels(now) else b""))
+        if self._watchdog.begun:
+            self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.levels(now) else b""))
 
     def _send(self, data: bytes) -> None:
         try:
@@ -114,6 +116,8 @@ class LinkSupervisor:
             self._send(packet[1:])
         elif packet[:1] == b"H" and len(packet) == 1 + THROTTLES.size:
             self._watchdog.set_throttles(*THROTTLES.unpack_from(packet, 1))
+        elif packet == b"T":
+            self._watchdog.turning()
 
     def _forward(self, link: Link) -> None:
         try:
@@ -178,13 +182,13 @@ class SupervisedLink:
         """Send bytes to the autopilot beside the commands."""
         self._send(b"R" + data)
 
+    def turning(self) -> None:
+        """Say that the motors turn already, before the first command."""
+        self._send(b"T")
+
     def _send(self, packet: bytes) -> None:
-        try:
+        with suppress(OSError):  # it is busy, or it has ended: `receive` says so
             self._control.send(packet)
-        except BlockingIOError:
-            pass
-        except OSError:
-            raise LinkError("the process that holds the link has ended") from None
 
     def receive(self, timeout: float = 0.0) -> tuple[bytes, list[str]]:
         """Bytes from the autopilot and messages of the supervisor that arrive within a time [s].
@@ -194,7 +198,10 @@ class SupervisedLink:
         """
         data, messages = b"", []
         while select.select([self._control], [], [], timeout)[0]:
-            packet = self._control.recv(8192)
+            try:
+                packet = self._control.recv(8192)
+            except OSError:
+                packet = b""
             if not packet:
                 raise LinkError("the process that holds the link has ended")
             if packet[:1] == b"D":

@@ -32,6 +32,7 @@ class Watchdog:
 
     Attributes:
         mode: present mode.
+        begun: a command has come; before, what flies already is left as it is.
     """
 
     def __init__(self, hover: int, descent: int, disarm_after: float = DISARM_AFTER, arming: float = ARMING,
@@ -47,7 +48,8 @@ class Watchdog:
         self.set_throttles(hover, descent)
         self.mode = Mode.DISARMED
         self._sticks: Channels = CENTRED
-        self._wanted, self._came, self._since = False, 0.0, 0.0
+        self._wanted, self._came, self._since = False, 0.0, -1e9
+        self.begun = self._turning = False
         self._locked = False  # the motors were stopped: only a command to disarm allows arming again
 
     def set_throttles(self, hover: int, descent: int) -> None:
@@ -62,6 +64,10 @@ class Watchdog:
         """Whether its attitude is needed at a time [s]: commands are late."""
         return bool(self._curves) and self._wanted and now - self._came > 0.5 * STALE_AFTER
 
+    def turning(self) -> None:
+        """The motors turn before the first command, whose throttle therefore follows at once."""
+        self._turning = True
+
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
         """Take a command.
 
@@ -70,9 +76,10 @@ class Watchdog:
             armed: whether the motors shall turn.
             sticks: roll, pitch, throttle, yaw [us].
         """
-        if armed and not self._wanted:
+        if armed and not (self._wanted or self._turning):
             self._since = now
         self._wanted, self._came, self._sticks = armed, now, sticks
+        self.begun, self._turning = True, False
         self._locked = self._locked and armed
 
     def channels(self, now: float) -> Channels:

@@ -1,0 +1,134 @@
+"""The link to an autopilot, and the process that holds it: ports, who may open them, and what goes on when somebody ends."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import socket
+import time
+
+import pytest
+from perch_autopilot import msp
+from perch_autopilot.supervised_link import SupervisedLink
+from perch_autopilot.rate_curve import RateCurve
+from perch_autopilot.watchdog import OFF, ON
+from perch_autopilot.link import Link, LinkError
+
+CURVES = (RateCurve(400, 900, 0.0), RateCurve(400, 900, 0.3))
+STICKS = (1500, 1500, 1500, 1500)
+
+
+@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
+def test_a_wire_that_is_none_is_one_line(address):
+    with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
+        Link(address)
+    assert "\n" not in str(error.value)
+
+
+def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
+    ours, theirs = pty.openpty()
+    link = Link(os.ttyname(theirs) + "@921600")
+    try:
+        link.write(b"$M<")
+        assert os.read(ours, 10) == b"$M<" and link.read() == b""
+        os.write(ours, bytes(range(256)))
+        got, last = b"", time.monotonic() + 60.0
+        while len(got) < 256 and time.monotonic() < last:
+            got += link.read(0.1)
+        assert got == bytes(range(256))  # raw: nothing is translated
+        os.close(theirs)
+        os.close(ours)
+        with pytest.raises(LinkError, match="has ended"):
+            link.read(1.0)
+    finally:
+        link.close()
+
+
+def test_the_supervisor_sends_without_commands_reopens_the_link_and_ends_with_the_motors_off():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(120.0)
+        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", 1450, 1420, 4.0, CURVES)
+        link.command(False, (1500, 1500, 1000, 1500))
+        frame = msp.channels((1500, 1500, 1000, 1500, OFF, OFF))
+        for _ in range(2):  # the first link ends; the supervisor opens another
+            with server.accept()[0] as peer:
+                peer.settimeout(120.0)
+                got = b""
+                while len(got) < 5 * len(frame):
+                    got += peer.recv(4096)
+                assert got[:4 * len(frame)] == 4 * frame
+        link.close()
+        assert link.process.wait(120.0) == 0
+
+
+def test_a_port_belongs_to_one_process_at_a_time():
+    ours, theirs = pty.openpty()
+    first = Link(os.ttyname(theirs))
+    with pytest.raises(LinkError, match=f"{os.ttyname(theirs)}: another process has this port"):
+        Link(os.ttyname(theirs))
+    first.close()
+    Link(os.ttyname(theirs)).close()
+    os.close(theirs)
+    os.close(ours)
+
+
+def test_a_port_that_cannot_be_set_up_is_not_left_open():
+    ours, theirs = pty.openpty()
+    files = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(LinkError, match="12345 is not a baud rate"):
+            Link(f"{os.ttyname(theirs)}@12345")
+    assert len(os.listdir("/proc/self/fd")) == files
+    os.close(theirs)
+    os.close(ours)
+
+
+def commanded(link: SupervisedLink, file: int, seconds: float, armed: bool | None = True) -> list[int]:
+    """Arming switches that reach a port's other end [us] while commands are sent for a time; None: none is."""
+    parser, switches, last = msp.Parser(), [], time.monotonic() + seconds
+    while time.monotonic() < last:
+        if armed is not None:
+            link.command(armed, STICKS)
+        time.sleep(0.005)
+        try:
+            data = os.read(file, 1 << 16)
+        except BlockingIOError:
+            continue
+        frames = parser.feed(data.replace(b"$M<", b"$M>"))
+        switches += [int.from_bytes(frame.payload[8:10], "little") for frame in frames if frame.command == msp.SET_RAW_RC]
+    return switches
+
+
+def test_what_flies_is_landed_by_one_process_alone():
+    """A node that ends in flight leaves the port to its supervisor; the next node gets it when the motors are off."""
+    ours, theirs = pty.openpty()
+    os.set_blocking(ours, False)
+    address = os.ttyname(theirs)
+    link = SupervisedLink(address, 1450, 1420, 0.6, CURVES)
+    assert commanded(link, ours, 0.3, armed=None) == []        # before the first command nothing is said
+    assert set(commanded(link, ours, 0.3)) == {ON}
+    link.close()
+    with pytest.raises(LinkError, match="another process has this port"):
+        SupervisedLink(address, 1450, 1420, 0.6, CURVES)
+    assert link.process.wait(120.0) == 0
+    switches = commanded(link, ours, 0.1, armed=None)
+    assert ON in switches and switches[-1] == OFF and switches == sorted(switches, reverse=True)
+    SupervisedLink(address, 1450, 1420, 0.6, CURVES).close()
+    os.close(theirs)
+    os.close(ours)
+
+
+def test_the_end_of_the_process_that_holds_the_link_is_told_again_and_again():
+    """Also where commands had not been read, which ends the connection otherwise."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = SupervisedLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", 1450, 1420, 4.0, CURVES)
+        os.kill(link.process.pid, signal.SIGSTOP)
+        link.command(True, STICKS)
+        link.process.kill()
+        link.process.wait(120.0)
+        for _ in range(3):
+            with pytest.raises(LinkError, match="the process that holds the link has ended"):
+                link.receive(60.0)
+            link.command(False, STICKS)
+        link.close()
