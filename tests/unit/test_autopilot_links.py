@@ -7,6 +7,7 @@ import pty
 import signal
 import socket
 import time
+from collections.abc import Iterator
 
 import pytest
 from perch_autopilot import msp
@@ -62,15 +63,26 @@ def test_the_supervisor_sends_without_commands_reopens_the_link_and_ends_with_th
         assert link.process.wait(120.0) == 0
 
 
-def test_a_port_belongs_to_one_process_at_a_time():
-    ours, theirs = pty.openpty()
-    first = Link(os.ttyname(theirs))
-    with pytest.raises(LinkError, match=f"{os.ttyname(theirs)}: another process has this port"):
-        Link(os.ttyname(theirs))
+@pytest.fixture(params=["serial", "tcp"])
+def address(request) -> Iterator[str]:
+    """A serial port, or one by TCP."""
+    if request.param == "tcp":
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
+    else:
+        ours, theirs = pty.openpty()
+        yield os.ttyname(theirs)
+        os.close(theirs)
+        os.close(ours)
+
+
+def test_a_port_belongs_to_one_process_at_a_time(address):
+    first = Link(address)
+    for _ in range(2):
+        with pytest.raises(LinkError, match=f"{address}: another process has this port"):
+            Link(address)
     first.close()
-    Link(os.ttyname(theirs)).close()
-    os.close(theirs)
-    os.close(ours)
+    Link(address).close()
 
 
 def test_a_port_that_cannot_be_set_up_is_not_left_open():
@@ -79,6 +91,8 @@ def test_a_port_that_cannot_be_set_up_is_not_left_open():
     for _ in range(3):
         with pytest.raises(LinkError, match="12345 is not a baud rate"):
             Link(f"{os.ttyname(theirs)}@12345")
+        with pytest.raises(LinkError, match="cannot be opened"):
+            Link("tcp:127.0.0.1:1")
     assert len(os.listdir("/proc/self/fd")) == files
     os.close(theirs)
     os.close(ours)

@@ -1,4 +1,4 @@
-"""The link to an autopilot: a serial port, which one process has at a time, or TCP."""
+"""The link to an autopilot: a serial port, or TCP. One process has it at a time."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from perch_core.errors import PerchError
 
 CONNECT_TIMEOUT = 3.0  # [s]
 REOPEN = 0.2           # from one attempt to open a link that has ended to the next [s]
+
+_TAKEN = "another process has this port: another node, or what a node has left behind to land its vehicle"
 
 
 class LinkError(PerchError):
@@ -32,12 +34,11 @@ class Link:
         Raises:
             LinkError: it cannot be opened.
         """
-        self._socket: socket.socket | None = None
+        self._sockets: tuple[socket.socket, ...] = ()
         try:
             if found := re.fullmatch(r"tcp:([^:]+):(\d+)", address):
-                self._socket = socket.create_connection((found[1], int(found[2])), timeout=CONNECT_TIMEOUT)
-                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self.file = self._socket.fileno()
+                self._sockets = _connected(address, found[1], int(found[2]))
+                self.file = self._sockets[0].fileno()
             elif found := re.fullmatch(r"fd:(\d+)", address):
                 self.file = int(found[1])
             else:
@@ -79,10 +80,31 @@ class Link:
 
     def close(self) -> None:
         """Close it."""
-        if self._socket is not None:
-            self._socket.close()
-        else:
+        for one in self._sockets:
+            one.close()
+        if not self._sockets:
             os.close(self.file)
+
+
+def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socket.socket]:
+    """The connection, and the lock of its address: a name that one process of this machine can have, until it closes it.
+
+    Raises:
+        OSError, OverflowError, LinkError: there is none.
+    """
+    lock = socket.socket(socket.AF_UNIX)
+    try:
+        lock.bind(f"\0perch_autopilot {address}")
+    except OSError:
+        lock.close()
+        raise LinkError(f"{address}: {_TAKEN}") from None
+    try:
+        connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
+    except BaseException:
+        lock.close()
+        raise
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection, lock
 
 
 def _opened_port(address: str) -> int:
@@ -98,7 +120,7 @@ def _opened_port(address: str) -> int:
         _set_serial(file, baud or "115200", address)
     except BlockingIOError:
         os.close(file)
-        raise LinkError(f"{address}: another process has this port: another node, or what a node has left behind to land its vehicle") from None
+        raise LinkError(f"{address}: {_TAKEN}") from None
     except BaseException:
         os.close(file)
         raise
