@@ -48,7 +48,7 @@ def test_odometry_that_repeats_itself_ends_in_a_descent_that_brakes():
 
 def descent(v):
     vehicle = load_vehicle("snapdragon")
-    return BlindDescent(vehicle, ControlGains(), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.0, v)
+    return BlindDescent(vehicle, ControlGains(), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.0, 0.0, v)
 
 
 @pytest.mark.parametrize("blow, ends", [((60.0, 0.0, 9.0), False), ((0.0, 0.0, 60.0), True)])

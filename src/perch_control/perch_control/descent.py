@@ -64,16 +64,22 @@ class AttitudeByImu:
 class BlindDescent:
     """The descent itself; owns the attitude and decides when the ground is felt."""
 
-    def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], now: float,
+    def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], seen: float, now: float,
                  v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
-        """`q`, `w`, `v`: last attitude (xyzw), body rates [rad/s] and velocity in W [m/s] that could be trusted, zero where none
-        could; `now`: time of the beginning [s]."""
+        """
+        Args:
+            vehicle: with the thrust that it has shown in the air.
+            gains: of the attitude.
+            q, w, v: last attitude (xyzw), body rates [rad/s] and velocity in W [m/s] that could be trusted, zero where none could.
+            seen: their time [s].
+            now: time at which the descent begins to fly [s]; samples before it only tell the attitude and the velocity.
+        """
         self._gains, self._constants = gains, packed_vehicle(vehicle)
         self._mass = vehicle.mass
         self.attitude = AttitudeByImu(tuple(q), tuple(w))
         self.v_W = tuple(v) if norm(v) < _KNOWN_SPEED else (0.0, 0.0, 0.0)
-        self._stamp, self._start = now, now
-        self._rest, self._force = Debounce(_REST_TIME), GRAVITY
+        self._stamp, self._start = seen, now
+        self._rest, self._f_B = Debounce(_REST_TIME), (0.0, 0.0, GRAVITY)
         self._touched: float | None = None  # when the ground was hit [s]
         self.landed = False
 
@@ -87,15 +93,17 @@ class BlindDescent:
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))
         # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `_SHARE` of it.
         middle = 0.5 * (1.0 + _SHARE) * GRAVITY
-        self._force += dt / _MEAN_TIME * (norm(accel) - self._force)  # rotor vibration is ten times the difference
-        calm = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
-        resting = self._rest.update(calm and middle < self._force < 1.1 * GRAVITY, stamp)
+        # The mean of the vector: vibration is ten times the difference, and would lengthen a mean of lengths.
+        self._f_B = axpy(dt / _MEAN_TIME, axpy(-1.0, self._f_B, accel), self._f_B)
+        force = norm(self._f_B)
         begun = stamp - self._start > _SETTLE_TIME
+        calm = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
+        resting = self._rest.update(begun and calm and middle < force < 1.1 * GRAVITY, stamp)
         if begun and f_W[2] > _IMPACT:  # a wall pushes sideways, the ground upwards
             self._touched = stamp
-        elif self._touched is not None and stamp - self._touched > _BOUNCE and self._force < 0.7 * GRAVITY:
+        elif self._touched is not None and stamp - self._touched > _BOUNCE and force < 0.7 * GRAVITY:
             self._touched = None  # nothing carries the vehicle
-        self.landed = self.landed or (begun and resting)
+        self.landed = self.landed or resting
 
     def _specific_thrust(self) -> tuple[float, float, float]:
         """Wanted thrust per mass in W [m/s^2]: speed across is braked, a climb and a fall are bounded."""

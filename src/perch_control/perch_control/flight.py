@@ -62,7 +62,7 @@ class FlightController:
         self._schedule = Schedule()
         self._thrust = ThrustBelief(vehicle)
         self._imu_stamp = -inf
-        self._unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=250)  # IMU samples since the last odometry
+        self._unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=500)  # IMU samples since the last odometry
         self._refused = ""
         self._smooth = SmoothPosition()
         self._period = MeasuredPeriod()
@@ -224,7 +224,7 @@ class FlightController:
         self.flown = self._descending(self.flown, message, moving)
 
     def _descending(self, x: FlightState, message: str, moving: bool = True) -> FlightState:
-        after = descending(x, message, self.gains, self._unseen, moving)
+        after = descending(x, message, self._thrust.shown(x), self.gains, self._unseen, moving)
         if after is not x:
             self._unseen.clear()
         return after

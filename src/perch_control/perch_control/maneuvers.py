@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from math import dist
 
 from perch_core.vector3 import axes_of, norm
-from perch_core.vehicle import ControlGains
+from perch_core.vehicle import ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
 from perch_control.flight_state import FlightState
@@ -112,13 +112,14 @@ def landing_weak(x: FlightState, message: str, speed: float) -> FlightState:
     return following(entered(x, State.LANDING, f"landing on weak rotors: {message}"), guidance)
 
 
-def descending(x: FlightState, message: str, gains: ControlGains, unseen: Iterable[tuple[float, tuple[float, ...], tuple[float, ...]]],
-               moving: bool = True) -> FlightState:
+def descending(x: FlightState, message: str, vehicle: Vehicle, gains: ControlGains,
+               unseen: Iterable[tuple[float, tuple[float, ...], tuple[float, ...]]], moving: bool = True) -> FlightState:
     """Descend without position: level, with a little less thrust than the weight.
 
     Args:
         x: state of the flight.
         message: why.
+        vehicle: with the thrust that it has shown in the air.
         gains: of the attitude.
         unseen: IMU samples since the last odometry that was accepted: time [s], rates [rad/s], specific force [m/s^2]. The descent
             begins there: the prediction since then knows less than the IMU.
@@ -127,7 +128,7 @@ def descending(x: FlightState, message: str, gains: ControlGains, unseen: Iterab
     if x.blind is not None or not x.flying:
         return x
     stamp, sure = x.seen
-    blind = BlindDescent(x.vehicle, gains, sure[6:10], sure[10:13], stamp, sure[3:6] if moving else _ZERO)
+    blind = BlindDescent(vehicle, gains, sure[6:10], sure[10:13], stamp, x.now, sure[3:6] if moving else _ZERO)
     for sample in unseen:
         blind.imu(*sample)
     return entered(x, State.LANDING, f"descent without position: {message}")._replace(blind=blind)

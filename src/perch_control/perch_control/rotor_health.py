@@ -15,6 +15,7 @@ from perch_core.vehicle import GRAVITY
 _STEP = 0.02           # the believed ratio follows in steps of this size
 _MEAN_TIME = 0.5       # time constant of the mean [s]
 _GREATEST = 1.1        # a vehicle is believed to be no stronger than this
+_SHOWN_MOST = 1.5      # a greater ratio of felt to promised thrust is a fault of the IMU
 _FILTER_TIME = 0.05    # time constant of the fast filter; with 0.316 m/s^2 of noise at 500 Hz the ratio is good to 1 % [s]
 _WEAK = 0.77           # felt / promised thrust below which the rotors are weak; +20 % mass reads 0.83, -15 % on one rotor 0.96
 _WEAK_TIME = 0.02      # for so long [s]
@@ -74,6 +75,11 @@ class RotorHealth:
         self._last, self.ratio, self.mean = now, self._felt / self._promised, self._mean_felt / self._mean_promised
         self.weak = self._low.update(self.ratio < _WEAK, now) or self.weak
         return self.weak and self._believe(self.ratio)
+
+    @property
+    def shown(self) -> float:
+        """The mean, within what a sound vehicle may show."""
+        return min(max(self.mean, self._least), _SHOWN_MOST)
 
     @property
     def adoptable(self) -> float:

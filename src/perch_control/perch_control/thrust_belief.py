@@ -47,6 +47,10 @@ class ThrustBelief:
         """Thrust / mass that a contact would be flown with, over the vehicle file's: what `adopted` would believe."""
         return self.health.believed if compensator is None else self.health.adoptable
 
+    def shown(self, x: FlightState) -> Vehicle:
+        """The vehicle whose thrust is what has been felt in the air lately, however little that differs from the file's."""
+        return x.vehicle if x.weak else self._nominal.giving(self.health.shown)
+
     def adopted(self, x: FlightState, law: Law, compensator: L1Augmentation | None) -> FlightState:
         """Before a contact: what L1 makes up for in hover because thrust / mass is not the file's belongs to the thrust.
 

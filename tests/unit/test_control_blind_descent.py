@@ -1,0 +1,52 @@
+"""The descent without position ends on the ground, whatever thrust, mass, vibration and timeout are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from closed_loop.plant import Disturbances
+from perch_control.descent import BlindDescent
+from perch_control.flight_settings import FlightSettings
+from perch_control.modes import State
+from perch_core.vehicle import ControlGains, load_vehicle
+from unit.controller_flight import Flight, hovering, parameters
+
+LEVEL, ZERO = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+
+
+def lands(flight, **odometry) -> None:
+    for _ in range(40):
+        flight.step(0.1, **odometry)
+        if not flight.motors[-1].armed:
+            break
+    assert flight.state is State.DISARMED and flight.plant.p[2] < 0.02 and flight.plant.impact_speed < 1.5
+
+
+@pytest.mark.parametrize("disturbances", [Disturbances(rotor_factor=(1.06,) * 4), Disturbances(mass_factor=0.95)])
+def test_a_thrust_that_is_not_the_files_is_not_taken_for_the_ground(disturbances):
+    lands(Flight(disturbances=disturbances).take_off(), odometry=False)
+
+
+def test_vibration_is_not_taken_for_the_ground():
+    flight, rng = hovering(), np.random.default_rng(0)
+    felt = flight.imu
+    flight.imu = lambda: felt()._replace(f_B=tuple(np.add(felt().f_B, 2.0 * rng.standard_normal(3))))
+    lands(flight, odometry=False)
+
+
+def test_a_late_begin_lands_on_the_ground():
+    flight = Flight(params=replace(parameters(), flight=FlightSettings(odometry_timeout=0.25))).take_off()
+    lands(flight, p_WB=(float("nan"),) * 3)
+
+
+def test_what_was_felt_before_the_descent_is_no_rest():
+    x = BlindDescent(load_vehicle("snapdragon"), ControlGains(), LEVEL, ZERO, 0.0, 1.0)
+    for k in range(500):
+        x.imu(0.002 * k, ZERO, (0.0, 0.0, 9.81))
+    assert not x.landed
+    for k in range(500, 820):
+        x.imu(0.002 * k, ZERO, (0.0, 0.0, 9.81))
+    assert x.landed, "rest after the descent has begun is the ground"
