@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from closed_loop.plant import Plant
+from closed_loop.plant import Disturbances, Plant
 from perch_control.controller import Controller
 from perch_control.laws import LAWS
 from perch_control.modes import Command, State
@@ -425,6 +425,36 @@ def test_gains_change_in_flight_and_what_is_fixed_is_refused():
     assert flight.status[-1].controller == "geometric+l1" and np.linalg.norm(flight.plant.v) < 0.05
     with pytest.raises(ConfigError, match="'pid' is not one of geometric, nmpc"):
         parameters(type="pid")
+
+
+def test_a_parameter_leaves_alone_what_the_service_has_chosen():
+    component = Controller(parameters())
+    component._assembly.choose("geometric", True)
+    component.reconfigure(replace(component.config, flight=replace(component.config.flight, silence_time=50.0)))
+    assert component.flight.law_name == "geometric+l1"
+    component._assembly.laws["nmpc"] = component._assembly.laws["geometric"].__class__.build(component._assembly.vehicle, component.config)
+    component._assembly.laws["nmpc"].name = "nmpc"
+    component._assembly.choose("nmpc", False)
+    component.reconfigure(replace(component.config, controller=replace(component.config.controller, adaptive=True)))
+    assert component.flight.law_name == "nmpc+l1"
+
+
+def test_l1_works_at_every_rate_that_is_flown():
+    flight = Flight(30.0, parameters(adaptive=True), Disturbances(mass_factor=1.1)).take_off()
+    assert flight.component.flight.compensator.disturbance[2] < -0.3
+
+
+def test_below_the_place_of_the_take_off_a_disturbance_is_air():
+    flight = Flight(params=parameters(adaptive=True), disturbances=Disturbances(mass_factor=1.1))
+    flight.plant.p, flight.plant.floor = np.array([0.0, 0.0, 1.0]), 1.0
+    flight.step(0.3)
+    flight.order(Command.ARM)
+    flight.follow(flight.path((0, 0, 1.0), (0, 0, 1.5), 1.0))
+    flight.step(1.2)
+    flight.plant.floor = 0.0
+    flight.follow(flight.path(flight.plant.p, (0, 0, 0.5), 1.5), id=6)
+    flight.step(3.0)
+    assert flight.state is State.HOVERING and flight.plant.p[2] == pytest.approx(0.5, abs=0.03)
 
 
 def test_abort_brakes_to_a_hover():

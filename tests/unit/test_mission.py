@@ -72,7 +72,7 @@ class World:
                 self.controller, self.hover_at, self.perch_end = ControllerState.RECOVERING, self.time + 1.0, None
                 self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
             elif command is Command.ATTACHED:
-                self.controller, self.off_at = ControllerState.DISARMED, self.time
+                self.controller, self.off_at = ControllerState.ATTACHED, self.time
             elif command is Command.DISARM:
                 self.controller = ControllerState.DISARMED
         if out.reference is not None:
@@ -94,6 +94,15 @@ class World:
             if not phases or phases[-1] is not self.machine.phase:
                 phases.append(self.machine.phase)
         return phases
+
+
+def reached(phase: Phase, attempts: int = 1) -> World:
+    """A goal that has come to a phase."""
+    world = World()
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=attempts), world.time)
+    while world.machine.phase is not phase:
+        world.tick()
+    return world
 
 
 def test_a_perch_passes_through_every_phase():
@@ -213,7 +222,50 @@ def test_cancel_works_in_every_phase(phase):
     assert world.outcome.result is Result.CANCELLED
     on_ground = phase is Phase.ARMING
     attached = phase in (Phase.VERIFYING, Phase.PERCHED)  # there is no way out any more
-    assert world.controller is (ControllerState.DISARMED if on_ground or attached else ControllerState.HOVERING)
+    assert world.controller is (
+        ControllerState.DISARMED if on_ground else ControllerState.ATTACHED if attached else ControllerState.HOVERING)
+
+
+def test_a_cancel_at_the_take_off_holds_whether_or_not_it_has_begun():
+    world = reached(Phase.ARMING)
+    world.tick()
+    assert world.controller is ControllerState.ARMED
+    world.tick(cancel=True)
+    assert world.commands[-2:] == [Command.LAND, Command.DISARM]
+
+
+@pytest.mark.parametrize("phase", [Phase.TRACKING, Phase.VERIFYING])
+@pytest.mark.parametrize("state", [ControllerState.LANDING, ControllerState.DISARMED])
+def test_a_landing_that_somebody_orders_on_the_perch_is_not_undone(phase, state):
+    world = reached(phase)
+    world.controller = state
+    world.tick()
+    assert world.outcome.result is Result.TRACKING_LOST and "descends" in world.outcome.message
+    assert world.commands == [Command.ARM]
+
+
+def test_a_cancel_does_not_undo_a_landing():
+    world = reached(Phase.TRACKING)
+    world.controller = ControllerState.LANDING
+    world.tick(cancel=True)
+    world.tick()
+    assert world.outcome.result is Result.CANCELLED and Command.HOVER not in world.commands
+
+
+def test_a_perch_that_was_given_up_before_the_contact_is_not_flown_again():
+    world = reached(Phase.TRACKING, attempts=2)
+    world.controller, world.hover_at, world.perch_end = ControllerState.RECOVERING, world.time + 0.5, None
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.MISSED and "given up" in world.outcome.message and world.queries == 1
+
+
+def test_a_perch_holds_only_with_a_controller_that_is_attached():
+    world = reached(Phase.PERCHED)
+    world.controller = ControllerState.FAILED
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.TRACKING_LOST and "not attached" in world.outcome.message
 
 
 def test_recovery_without_end_is_bounded():

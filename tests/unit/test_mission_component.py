@@ -71,7 +71,7 @@ class World:
     def obey(self, command):
         self.commands.append(Command(command.command))
         assert command.stamp == self.stamp
-        states = {Command.ARM: ControllerState.ARMED, Command.ATTACHED: ControllerState.DISARMED, Command.DISARM: ControllerState.DISARMED,
+        states = {Command.ARM: ControllerState.ARMED, Command.ATTACHED: ControllerState.ATTACHED, Command.DISARM: ControllerState.DISARMED,
                   Command.HOVER: ControllerState.HOVERING}
         self.state = states.get(self.commands[-1], self.state)
 

@@ -140,10 +140,10 @@ class Assembly:
         self.laws = {name: law for name, law in changed.items() if law is not None}
         if flight.compensator is not None:
             flight.compensator.bandwidth = choice.l1_bandwidth
-        if (choice.type, choice.adaptive) != (old.controller.type, old.controller.adaptive):
-            self.choose(choice.type, choice.adaptive)
-        else:
-            flight.use(self.laws[flown], params.gain_set, params.flight)
+        # What the service has chosen stays where the parameter has not changed.
+        adaptive = flight.compensator is not None
+        self.choose(choice.type if choice.type != old.controller.type else flown,
+                    choice.adaptive if choice.adaptive != old.controller.adaptive else adaptive)
         failed, self._failed = self._failed, {}
         for _, again in failed.values():
             again()

@@ -19,7 +19,7 @@ from perch_control.geometric.step import predicted
 from perch_control.inner_loop import Later
 from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
-from perch_control.maneuvers import attached, descending, entered, landing, motors_off, recovered, stayed, stopped
+from perch_control.maneuvers import attached, brought_down, descending, entered, landing, motors_off, recovered, stayed, stopped
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.odometry_gate import OdometryGate, Verdict
@@ -28,8 +28,8 @@ from perch_control.rotor_health import RotorHealth
 from perch_control.rotor_lag import thrusts
 from perch_control.schedule import Schedule
 from perch_control.smooth_position import SmoothPosition
-from perch_control.supervisor import Supervisor, committed
-from perch_control.thrust_belief import AIRBORNE, ThrustBelief
+from perch_control.supervisor import LOW, Supervisor, committed
+from perch_control.thrust_belief import ThrustBelief
 
 _SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
 _NOWHERE = (0.0,) * 6        # position and velocity of a descent that knows neither
@@ -121,6 +121,8 @@ class FlightController:
             CommandRefused: it is not possible in the present state.
         """
         self.flown = COMMANDS[command](self, self.flown, f": {reason}" if reason else "")
+        if not self.flown.flying and command is not Command.ARM:
+            self._schedule.drop()
 
     def _kill(self, x: FlightState, why: str) -> FlightState:
         return motors_off(x, State.FAILED, f"killed{why}")
@@ -128,6 +130,8 @@ class FlightController:
     def _attach(self, x: FlightState, why: str) -> FlightState:
         if not x.belief:
             raise CommandRefused("attached is refused: no usable odometry yet")
+        if x.mode is State.FAILED:
+            raise CommandRefused(f"attached is refused: {x.message}; disarm first")
         return attached(x, f"attached, motors off{why}")
 
     def _disarm(self, x: FlightState, why: str) -> FlightState:
@@ -137,13 +141,13 @@ class FlightController:
 
     def _land(self, x: FlightState, why: str) -> FlightState:
         _check_flying(x, "land")
-        return landing(x, f"landing{why}", self.settings.land_speed)
+        return brought_down(x, f"landing{why}", self.settings.land_speed)
 
     def _hover(self, x: FlightState, why: str) -> FlightState:
         _check_flying(x, "hover")
         if x.mode is State.RECOVERING:  # it ends in a hover, and must not be cut short
             return x
-        return self._schedule.leave(x, f"hover{why}") or stopped(x, f"hover{why}")
+        return self._left(x, f"hover{why}")
 
     def _arm(self, x: FlightState, why: str) -> FlightState:
         if x.mode is State.ARMED or x.flying:
@@ -166,6 +170,10 @@ class FlightController:
             TrajectoryRefused: it may not be flown.
         """
         x = self.flown
+        if self.odometry_age > self.settings.odometry_timeout:
+            raise TrajectoryRefused("no usable odometry")
+        if self._schedule.leaving:
+            raise TrajectoryRefused("what is flown is about to be left by a planned way out")
         if x.mode is State.ATTACHED:
             x = self.flown = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):
@@ -192,11 +200,22 @@ class FlightController:
         """End whatever is flown in a hover, through a recovery where the vehicle is tilted. Returns what is done."""
         x = self.flown
         if x.mode in (State.TRACKING, State.HOVERING):
-            left = self._schedule.leave(x, reason)
-            if left is None:
-                self._schedule.drop()
-            self.flown = left or stopped(x, reason)
+            self.flown = self._left(x, reason)
+        elif x.mode in (State.ARMED, State.ATTACHED):
+            self._schedule.drop()
+            self.flown = x._replace(message=f"{reason}; nothing is flown")
         return self.flown.message
+
+    def _left(self, x: FlightState, reason: str) -> FlightState:
+        """End what is flown: by the next planned way out, or at once."""
+        return self._schedule.leave(x, reason) or self._stopped(x, reason)
+
+    def _stopped(self, x: FlightState, reason: str) -> FlightState:
+        """Brake to a hover in which nothing waits to be flown; where that would touch the ground, land."""
+        self._schedule.drop()
+        if x.belief[2] - x.ground < LOW:
+            return landing(x, f"landing: {reason}", self.settings.land_speed)
+        return stopped(x, reason)
 
     def refused(self, message: str) -> None:
         """Publish why an order was not taken."""
@@ -217,7 +236,7 @@ class FlightController:
         """Leave a trajectory by a planned way out, or brake; where even the hardest brake would end in the surface, go on."""
         if x.mode is not State.TRACKING:
             return x
-        return self._schedule.leave(x, reason) or (x if committed(x) else stopped(x, f"hover: {reason}"))
+        return self._schedule.leave(x, reason) or (x if committed(x) else self._stopped(x, f"hover: {reason}"))
 
     def descend(self, message: str, moving: bool = True) -> None:
         """Descend without position from now on; `moving`: the velocity can be trusted."""
@@ -259,14 +278,19 @@ class FlightController:
         # Odometry that repeats itself does not stop the time.
         x = self._believed(self.flown, stamp if stamp > self.flown.now else max(self.flown.now, self._imu_stamp), verdict, sample)
         self.odometry_age = x.now - self.gate.stamp if self.gate.stamp is not None else inf
+        lost = self.odometry_age > self.settings.odometry_timeout
+        if lost or verdict.jumped:
+            self._schedule.drop()
         if x.blind is None and x.flying:
-            if self.odometry_age > self.settings.odometry_timeout:
+            if lost:
                 x = self._descending(x, self._refused or "no odometry")
             elif verdict.jumped:
                 x = stayed(x, verdict.reason)
         if x.blind is None:
             x = self._schedule.activated(x)
             if x.flying:
+                if not x.airborne and not x.at_ground:
+                    x = x._replace(airborne=True)
                 x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator))
         return self._answered(x)
 
@@ -321,7 +345,7 @@ class FlightController:
         """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
         if self.compensator is None:
             return NO_COMPENSATION
-        if x.belief[2] - x.ground < AIRBORNE:
+        if x.at_ground:
             self.compensator.reset()
             return NO_COMPENSATION
         if x.mode in (State.LANDING, State.RECOVERING) or contact <= 0.0 or x.may_touch(0.0):

@@ -16,6 +16,7 @@ from perch_control.reference import Setpoint, Source
 from perch_control.rotor_lag import RotorEstimate
 
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
+AIRBORNE = 0.1        # so far above where it was armed, the ground no longer carries the vehicle [m]
 _AWAY = 2.0           # radii of the body from the place of a contact at which nothing there holds the vehicle
 
 
@@ -31,7 +32,7 @@ class FlightState(NamedTuple):
         meeting: when and where a surface or a wire is met [s, m].
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
-        ground: height at which the vehicle was armed [m].
+        ground: height at which the vehicle was armed [m]; `airborne`: it has been clear of it since.
         events: what has happened since the last step.
         now: time of the step [s].
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
@@ -53,6 +54,7 @@ class FlightState(NamedTuple):
     attached_to: tuple[float, ...] | None
     blind: BlindDescent | None
     ground: float
+    airborne: bool
     events: tuple[str, ...]
     # the last seven change in each step
     now: float
@@ -66,7 +68,7 @@ class FlightState(NamedTuple):
     @classmethod
     def disarmed(cls, vehicle: Vehicle) -> FlightState:
         """A vehicle of which nothing is known but its file."""
-        return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, (),
+        return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, (),
                    0.0, (), (0.0, ()), stopped(vehicle), 1.0, 1.0, 0.0)
 
     def sensed(self, now: float, belief: tuple[float, ...], seen: tuple[float, tuple[float, ...]],
@@ -82,6 +84,11 @@ class FlightState(NamedTuple):
     def flying(self) -> bool:
         """The motors carry the vehicle."""
         return self.mode in FLYING
+
+    @property
+    def at_ground(self) -> bool:
+        """The ground may carry the vehicle: it has not left it yet, or is on the way down to it."""
+        return not (self.airborne and self.mode in (State.TRACKING, State.HOVERING)) and self.belief[2] - self.ground < AIRBORNE
 
     @property
     def elapsed(self) -> float:

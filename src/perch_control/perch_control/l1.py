@@ -20,7 +20,7 @@ from perch_control.geometric.step import drag_compensation, wrench_of
 from perch_control.rotor_lag import thrusts
 
 _ZERO = (0.0,) * 6
-_LONGEST_GAP = 0.025  # a longer time between samples starts the predictor anew [s]
+_LONGEST_GAP = 0.06  # a longer time between samples starts the predictor anew [s]
 _DECAY = 10.0         # of the prediction error: slow beside the adaptation, which removes it in each period [1/s]
 _FORCE_MAX = 6.0      # largest acceleration that is made up for, below the bound of the position feedback [m/s^2]
 _MOMENT_MAX = 60.0    # largest angular acceleration that is made up for, a quarter of what may be commanded [rad/s^2]

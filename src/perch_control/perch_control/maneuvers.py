@@ -7,7 +7,8 @@
 | `stayed` | as `stopped` | a hover where the vehicle believes to be | odometry has jumped and stays |
 | `recovered` | RECOVERING | guidance by the state | off the plan, contact missed, departure |
 | `settled` | HOVERING | a brake from the state | a recovery has come to rest |
-| `landing` | LANDING | a brake into a descent | LAND, geofence, rotors at their limit, silence |
+| `brought_down` | as `landing`; as `recovered` where `stopped` is | | LAND |
+| `landing` | LANDING | a brake into a descent | geofence, rotors at their limit, silence |
 | `landing_weak` | LANDING | guidance by the state | weak rotors |
 | `descending` | LANDING, `blind` | none | no position |
 | `attached` | ATTACHED | none | the mission: the surface holds |
@@ -61,7 +62,7 @@ def tracked(x: FlightState, order: Order, source: Source, leaving: str = "") -> 
 
 def motors_off(x: FlightState, mode: State, message: str) -> FlightState:
     """Stop the motors."""
-    return entered(x, mode, message)._replace(blind=None, trajectory_id=0, rotors=x.rotors.turning(0.0))
+    return entered(x, mode, message)._replace(blind=None, trajectory_id=0, airborne=False, rotors=x.rotors.turning(0.0))
 
 
 def attached(x: FlightState, message: str) -> FlightState:
@@ -78,8 +79,7 @@ def stopped(x: FlightState, message: str) -> FlightState:
     if turning or x.surface_normal or reference_tilt_deg(x.belief, setpoint) > TILT_MARGIN:
         return recovered(x, message)
     p, v, a = _point_of_departure(x, setpoint)
-    deceleration = max(_BRAKE, min(x.needed_deceleration, BRAKE_HARD))
-    return following(entered(x, State.HOVERING, message), brake(p, v, a, setpoint.h, deceleration=deceleration))
+    return following(entered(x, State.HOVERING, message), brake(p, v, a, setpoint.h, deceleration=_deceleration(x)))
 
 
 def stayed(x: FlightState, message: str) -> FlightState:
@@ -102,7 +102,18 @@ def landing(x: FlightState, message: str, speed: float) -> FlightState:
     """Descend with a speed [m/s] until the ground is felt."""
     setpoint = x.setpoint()
     p, v, a = _point_of_departure(x, setpoint)
-    return following(entered(x, State.LANDING, message), brake(p, v, a, setpoint.h, (0.0, 0.0, -speed), _BRAKE))
+    return following(entered(x, State.LANDING, message), brake(p, v, a, setpoint.h, (0.0, 0.0, -speed), _deceleration(x)))
+
+
+def brought_down(x: FlightState, message: str, speed: float) -> FlightState:
+    """Land with a speed [m/s]; where a hover would begin with a recovery, after that."""
+    if x.mode is State.LANDING:
+        return landing(x, message, speed)
+    after = x if isinstance(x.source, Recovery) else stopped(x, message)
+    if not isinstance(after.source, Recovery):
+        return landing(x, message, speed)
+    after.source.lands = True
+    return after._replace(message=message)
 
 
 def landing_weak(x: FlightState, message: str, speed: float) -> FlightState:
@@ -132,6 +143,11 @@ def descending(x: FlightState, message: str, vehicle: Vehicle, gains: ControlGai
     for sample in unseen:
         blind.imu(*sample)
     return entered(x, State.LANDING, f"descent without position: {message}")._replace(blind=blind)
+
+
+def _deceleration(x: FlightState) -> float:
+    """Of a brake [m/s^2]: gentle in the open, before a surface as hard as is needed."""
+    return max(_BRAKE, min(x.needed_deceleration, BRAKE_HARD))
 
 
 def _point_of_departure(x: FlightState, setpoint: Setpoint) -> tuple:

@@ -42,7 +42,12 @@ def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:
 
 
 class Recovery(ByState):
-    """Guidance from the present state; `update` first in each period, then `setpoint`."""
+    """Guidance from the present state; `update` first in each period, then `setpoint`.
+
+    Attributes:
+        finished: the vehicle is upright and slow, and away from the surface.
+        lands: a landing follows, not a hover.
+    """
 
     def __init__(self, specific_thrust_max: float, state: tuple[float, ...], normal: Vector | None) -> None:
         """
@@ -56,7 +61,7 @@ class Recovery(ByState):
         self._push = None if normal is None or normal[2] >= cos(radians(30.0)) else normal
         _, self._h, _ = axes_of(state[6:10])
         self._setpoint = Setpoint(state[0:3], state[3:6], h=self._h)
-        self.finished = False
+        self.finished = self.lands = False
 
     def update(self, state: tuple[float, ...], elapsed: float) -> None:
         """Take the present state, `elapsed` seconds after the beginning."""

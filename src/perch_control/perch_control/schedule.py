@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import dist, inf
 
-from perch_control.admission import AtEnd, Order, check_joints
+from perch_control.admission import START_GAP, AtEnd, Order, check_joints
 from perch_control.flight_state import FlightState
 from perch_control.guidance import blended
 from perch_control.maneuvers import tracked
@@ -26,6 +26,11 @@ class Schedule:
     def waiting(self) -> bool:
         """Whether a trajectory is to follow."""
         return self._pending is not None
+
+    @property
+    def leaving(self) -> bool:
+        """Whether a way out is to follow."""
+        return self._pending is not None and bool(self._pending[1])
 
     def put(self, order: Order) -> None:
         """The next trajectory."""
@@ -56,6 +61,7 @@ class Schedule:
             return None
         own = order.start + order.recovery_start if order.recovery_start >= 0.0 else inf
         if x.now >= own:
+            self._pending = None
             return x._replace(message=f"{reason}; the recovery is under way")
         ways = [o for o in self._ways_out if o.id == order.id and o.start >= x.now]
         start = min([o.start for o in ways] + [own])  # a plan may end in a recovery of its own
@@ -90,5 +96,6 @@ class Schedule:
         if order is None or order.at_end is not AtEnd.RECOVER or order.recovery_start < 0.0:
             return x
         own = order.start + order.recovery_start
-        way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= x.now), None)
+        way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= x.now
+                    and dist(o.source.setpoint(x.now - o.start).p, x.belief[0:3]) < START_GAP), None)
         return x if way is None else tracked(x, way, way.source)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from enum import Enum
 
-_JUMP = 1_000_000_000    # further away from the newest stamp than this, a stamp is not of the present [ns] ...
+_JUMP = 1_000_000_000    # further behind the newest stamp than this, a stamp is not of the present [ns] ...
+_AHEAD = 80_000_000      # further ahead of it, no stamp of running streams is [ns] ...
 _CONFIRM = 50_000_000    # ... unless nothing but such stamps has come for so long by themselves [ns]
 
 
@@ -37,7 +38,7 @@ class StampGuard:
             may_restart: time may begin anew; otherwise stamps of the past are refused however many there are.
         """
         newest = self.newest
-        if not self.begun or -_JUMP <= stamp - newest <= _JUMP:
+        if not self.begun or -_JUMP <= stamp - newest <= _AHEAD:
             self._first = -1
             self.newest, self.begun = max(stamp, newest) if self.begun else stamp, True
             return Stamp.PRESENT

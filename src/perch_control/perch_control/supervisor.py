@@ -21,8 +21,9 @@ from perch_control.weak_landing import WeakLanding
 _FENCE_SLACK = 1.0   # so far outside the fence: land, since a hover has not come back [m]
 _MISSED_SPEED = 1.0  # faster than this after the planned contact: it was missed; a contact that may hold is slower [m/s]
 _GROUND_GAP = 0.12   # the descending reference is so far below the vehicle ... [m]
+_GROUND_SPEED = 0.1  # ... not moving faster than this up or down ... [m/s]
 _GROUND_TIME = 0.25  # ... for so long: on the ground [s]
-_LOW = 0.25          # a recovery that ends nearer to the ground lands: a hover would touch it [m]
+LOW = 0.25           # what ends nearer to the ground lands: a hover would touch it [m]
 _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
 
 
@@ -94,7 +95,9 @@ class Supervisor:
             return self._on_reference(x)  # a planned way out
         source.update(x.belief, x.elapsed)
         if source.finished:
-            if x.belief[2] - x.ground < _LOW:
+            if source.lands:
+                return landing(x, "landing after the recovery", self.settings.land_speed)
+            if x.belief[2] - x.ground < LOW:
                 return landing(x, "landing: the recovery ended at the ground", self.settings.land_speed)
             return settled(x, "recovered: hovering")
         if x.elapsed > TIMEOUT:
@@ -154,7 +157,7 @@ class Supervisor:
         if isinstance(x.source, WeakLanding):
             resting = x.source.resting(x.belief)
         else:
-            resting = abs(x.belief[5]) < 0.1 and x.belief[2] - setpoint.p[2] > _GROUND_GAP
+            resting = abs(x.belief[5]) < min(_GROUND_SPEED, 0.5 * self.settings.land_speed) and x.belief[2] - setpoint.p[2] > _GROUND_GAP
         return self._ground.update(resting, x.now)
 
 

@@ -12,7 +12,6 @@ from perch_control.rotor_lag import thrusts
 from perch_core.vector3 import axes_of, scale
 from perch_core.vehicle import Vehicle
 
-AIRBORNE = 0.1    # so far above where it was armed, the ground no longer carries the vehicle [m]
 _TOUCHING = 0.1   # from so long before a planned contact on, a surface or a wire may act on the vehicle [s]
 
 
@@ -35,7 +34,7 @@ class ThrustBelief:
 
     def judged(self, x: FlightState, law: Law, compensator: L1Augmentation | None) -> FlightState:
         """Compare felt and promised thrust in free air; weak rotors are a weaker vehicle from now on."""
-        if x.belief[2] - x.ground < AIRBORNE or x.may_touch(_TOUCHING) or hypot(*x.belief[10:13]) > RATE_MOST:
+        if x.at_ground or x.may_touch(_TOUCHING) or hypot(*x.belief[10:13]) > RATE_MOST:
             self.health.pause(x.now)
         elif self.health.update(self.felt, self._promised(x), x.now):
             if not x.weak:

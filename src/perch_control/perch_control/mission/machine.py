@@ -238,14 +238,20 @@ class MissionMachine(ABC):
         if inputs.controller is ControllerState.RECOVERING:
             self._gave_up(inputs, f"controller recovers: {inputs.controller_message}")
             return True
-        if inputs.controller in (ControllerState.LANDING, ControllerState.DISARMED):
-            self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
+        if self._descends(inputs, outputs):
             return True
         if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "take-off took too long"))
             self._end(outputs, Result.TIMEOUT, f"search hover not reached within {self.settings.phase_timeout:g} s; landing")
             return True
         return False
+
+    def _descends(self, inputs: Inputs, outputs: Outputs) -> bool:
+        """The controller lands, or has landed: the goal ends, and nothing undoes the landing."""
+        if inputs.controller not in (ControllerState.LANDING, ControllerState.DISARMED):
+            return False
+        self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
+        return True
 
     def _astray(self, inputs: Inputs) -> bool:
         """The controller hovers, but not where it was sent: it has recovered on the way."""
@@ -255,7 +261,7 @@ class MissionMachine(ABC):
         return True
 
     def _gave_up(self, inputs: Inputs, why: str) -> None:
-        """The controller has left the way to the target: recover, without a further attempt."""
+        """The controller has left the way to the target, or was told to: recover, without a further attempt."""
         self._attempts_left = 1
         self._missed(inputs, why)
 
@@ -268,12 +274,14 @@ class MissionMachine(ABC):
         if self.phase is Phase.PERCHED:
             self._end(outputs, Result.CANCELLED, "cancelled; attached with motors off")
         elif inputs.controller in (ControllerState.DISARMED, ControllerState.ARMED):
-            outputs.commands.append((Command.DISARM, "cancelled"))
+            # By now it may have taken off: one of the two is refused.
+            outputs.commands += [(Command.LAND, "cancelled"), (Command.DISARM, "cancelled")]
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
         elif why := self.committed(inputs.time):
             self.message = f"cancelled too late: {why}"
         else:
-            outputs.commands.append((Command.HOVER, "cancelled"))
+            if inputs.controller is not ControllerState.LANDING:
+                outputs.commands.append((Command.HOVER, "cancelled"))
             self._missed(inputs, "cancelled")
 
     def _end(self, outputs: Outputs, result: Result, message: str, contact_time: float = float("nan")) -> None:

@@ -92,8 +92,10 @@ class PerchingMission(MissionMachine, Generic[R]):
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
         end = self._running.plan.end
         self.time_to_contact = end - inputs.time
+        if self._descends(inputs, outputs):
+            return
         if inputs.trajectory_id == self._flown_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
-            self._missed(inputs, f"perch given up: {inputs.controller_message}")
+            self._gave_up(inputs, f"perch given up: {inputs.controller_message}")
             return
         self.better(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
@@ -107,6 +109,8 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._adhesion.reset()
             outputs.commands.append((Command.ATTACHED, "the surface carries the vehicle"))
             self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
+        elif self._descends(inputs, outputs):
+            pass
         elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             self._missed(inputs, f"no adhesion: {inputs.controller_message}")
         elif not self.waiting(inputs, outputs):
@@ -118,6 +122,8 @@ class PerchingMission(MissionMachine, Generic[R]):
             outputs.commands.append((Command.ARM, "came off the surface"))
             outputs.commands.append((Command.HOVER, "came off the surface"))
             self._missed(inputs, "came off the surface after the motors stopped")
+        elif self._elapsed(inputs) > self.settings.rest_time and inputs.controller is not ControllerState.ATTACHED:
+            self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
         elif self._elapsed(inputs) > self.settings.rest_time:
             result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
             self._moves.wire = self._running.target if self._running.target.lines else None

@@ -1,0 +1,144 @@
+"""What stops a flight also ends what waits to be flown; what is stopped is not begun again by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from closed_loop.loop import make_loop, perch
+from closed_loop.plant import Disturbances
+from perch_control.admission import AtEnd, Order, TrajectoryRefused
+from perch_control.flight_settings import FlightSettings
+from perch_control.modes import Command, State
+from perch_control.reference import SampledReference
+from perch_core.values import Ask
+from unit.controller_flight import Flight, hovering, parameters
+from unit.test_control_supervisor import along_x, leaving, ready
+
+NOWHERE = {"p_WB": (float("nan"),) * 3}
+
+
+def waiting(flight: Flight, end=(1.0, 0.0, 0.6)) -> Flight:
+    """With a trajectory that starts half a second from now."""
+    path = flight.path(flight.plant.p, end, 1.5)
+    flight.follow(replace(path, start_time=path.start_time + 0.5))
+    flight.step(0.1)
+    return flight
+
+
+def abort(flight: Flight) -> None:
+    flight.component.on_abort(Ask(), lambda done: None)
+
+
+@pytest.mark.parametrize("stop", [
+    lambda flight: flight.order(Command.HOVER), abort, lambda flight: flight.step(0.1, p_WB=(0.0, 1.0, 0.6))])
+def test_a_hover_is_the_end_of_what_was_to_follow(stop):
+    flight = waiting(hovering())
+    stop(flight)
+    flight.step(0.8)
+    assert flight.state is State.HOVERING and abs(flight.plant.p[0]) < 0.05
+
+
+@pytest.mark.parametrize("command, state", [(Command.ARM, State.ARMED), (Command.ATTACHED, State.ATTACHED)])
+def test_an_abort_at_rest_is_the_end_of_what_was_to_follow(command, state):
+    flight = Flight()
+    flight.step(0.2)
+    flight.order(command)
+    waiting(flight, (0.0, 0.0, 0.6))
+    abort(flight)
+    flight.step(0.8)
+    assert flight.state is state and flight.plant.p[2] < 0.01
+
+
+def test_what_waited_when_the_motors_were_stopped_is_not_flown_when_they_run_again():
+    flight = Flight()
+    flight.step(0.2)
+    flight.order(Command.ARM)
+    waiting(flight, (0.0, 0.0, 0.6))
+    flight.order(Command.DISARM)
+    flight.order(Command.ARM)
+    flight.step(0.8)
+    assert flight.state is State.ARMED
+
+
+def test_attached_does_not_undo_a_kill():
+    flight = hovering()
+    flight.order(Command.KILL)
+    flight.order(Command.ATTACHED)
+    assert flight.state is State.FAILED and "attached is refused: killed" in flight.said
+
+
+def test_without_odometry_nothing_is_begun_from_rest():
+    flight = Flight()
+    flight.step(0.2)
+    flight.order(Command.ARM)
+    waiting(flight, (0.0, 0.0, 0.6)).step(0.8, **NOWHERE)
+    assert flight.state is State.ARMED
+    flight.order(Command.ATTACHED)
+    flight.follow(flight.path(flight.plant.p, (0.0, 0.0, 0.6), 1.5))
+    flight.step(0.1, **NOWHERE)
+    assert flight.state is State.ATTACHED and "refused: no usable odometry" in flight.said
+
+
+@pytest.mark.parametrize("before", [0.25, 0.45])
+def test_a_landing_before_a_surface_stops_there_first(before):
+    plan, loop = perch("surface_90_1.7m"), make_loop()
+    loop.begin_in_hover()
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(0.04 + plan.trajectory.duration - before)
+    loop.controller.command(Command.LAND)
+    nearest = []
+    landed = loop.run(5.5, until=lambda x: nearest.append((x.plant.p - plan.contact) @ plan.normal) or x.controller.state is State.DISARMED)
+    assert landed and min(nearest) > 0.03 and loop.plant.impact_speed < 1.0
+
+
+def test_a_hover_at_the_ground_is_a_landing():
+    flight = Flight()
+    flight.step(0.5)
+    flight.order(Command.ARM)
+    flight.follow(flight.path((0, 0, 0), (0, 0, 0.6), 1.0))
+    flight.step(0.1)
+    flight.order(Command.HOVER)
+    flight.step(2.0)
+    assert flight.state is State.DISARMED
+
+
+def test_an_abort_that_waits_for_its_way_out_is_not_undone_by_the_next_plan():
+    loop, start = leaving()
+    ready(loop, start, start + 0.6)
+    loop.run(0.3)
+    loop.controller.abort("stop it")
+    now, mass = loop.controller.flown.now, loop.controller.vehicle.mass
+    with pytest.raises(TrajectoryRefused, match="about to be left"):
+        loop.controller.follow(Order(7, SampledReference(along_x(now, 0.4 * (now - start), 0.4, 2.5), mass), now, AtEnd.RECOVER, 0.25, 1.6))
+    loop.run(0.4)
+    assert loop.controller.state is State.RECOVERING
+
+
+def test_a_recovery_that_begins_elsewhere_does_not_take_the_place_of_the_appended_one():
+    loop, start = leaving(recovery_start=0.8)
+    path = along_x(start + 0.8, 0.32 + 0.5, 0.4, 0.6, brakes=True)
+    loop.controller.keep_ready(Order(7, SampledReference(path, loop.controller.vehicle.mass), start + 0.8))
+    loop.run(0.9)
+    assert loop.controller.flown.order.source.duration > 1.0, "the plan's own one is flown"
+
+
+def test_a_slow_landing_of_strong_rotors_ends_on_the_ground():
+    settings = FlightSettings(land_speed=0.1)
+    flight = Flight(params=replace(parameters(), flight=settings), disturbances=Disturbances(rotor_factor=(1.2,) * 4)).take_off()
+    height = flight.plant.p[2]
+    flight.order(Command.LAND)
+    flight.step(2.0)
+    assert flight.state is State.LANDING and 0.1 < height - flight.plant.p[2] < 0.3
+
+
+@pytest.mark.parametrize("stream", ["on_imu", "on_odometry"])
+@pytest.mark.parametrize("ahead", [0.1, 0.9])
+def test_one_stamp_ahead_of_the_others_ends_nothing(stream, ahead):
+    flight = hovering()
+    stamp = flight.stamp + int(ahead * 1e9)
+    getattr(flight.component, stream)((flight.imu if stream == "on_imu" else flight.odometry)(stamp=stamp))
+    flight.step(0.3)
+    assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05
