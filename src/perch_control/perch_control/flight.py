@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
-from math import dist, inf
+from math import dist
 
 import numpy as np
 
@@ -14,20 +13,16 @@ from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joint
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
-from perch_control.geometric import packed_vehicle
-from perch_control.geometric.step import predicted
 from perch_control.inner_loop import Later
 from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
 from perch_control.maneuvers import attached, brought_down, descending, entered, landing, motors_off, recovered, stayed, stopped
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
-from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.rotor_health import RotorHealth
-from perch_control.rotor_lag import thrusts
 from perch_control.schedule import Schedule
-from perch_control.smooth_position import SmoothPosition
+from perch_control.senses import Senses
 from perch_control.supervisor import LOW, Supervisor, committed
 from perch_control.thrust_belief import ThrustBelief
 
@@ -49,22 +44,16 @@ class FlightController:
         flown: the state of the flight; each input and each step makes the next one of it.
         law, compensator: that fly; no compensator: without L1.
         gains, settings: that count; `use` replaces them.
-        odometry_age: of the last sample that was accepted [s].
     """
 
     def __init__(self, vehicle: Vehicle, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
         self.law, self.gains, self.settings = law, gains, settings
         self.flown = FlightState.disarmed(vehicle)
         self.supervisor = Supervisor(vehicle, settings)
-        self.gate = OdometryGate()
-        self.odometry_age = inf
         self.compensator: L1Augmentation | None = None
         self._schedule = Schedule()
         self._thrust = ThrustBelief(vehicle)
-        self._imu_stamp = -inf
-        self._unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=500)  # IMU samples since the last odometry
-        self._refused = ""
-        self._smooth = SmoothPosition()
+        self._senses = Senses()
         self._period = MeasuredPeriod()
 
     def use(self, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
@@ -86,6 +75,11 @@ class FlightController:
     def vehicle(self) -> Vehicle:
         """As it is believed to be."""
         return self.flown.vehicle
+
+    @property
+    def odometry_age(self) -> float:
+        """Of the last odometry sample that was accepted [s]."""
+        return self._senses.age
 
     @property
     def health(self) -> RotorHealth:
@@ -155,7 +149,7 @@ class FlightController:
         if x.mode not in (State.DISARMED, State.ATTACHED):
             raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry_timeout:
-            raise CommandRefused("arm is refused: no usable odometry" + (f" ({self._refused})" if self._refused else ""))
+            raise CommandRefused("arm is refused: no usable odometry" + (f" ({why})" if (why := self._senses.refused) else ""))
         if x.mode is State.DISARMED and axes_of(x.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
         x = self._thrust.reset(x, self.law, self.compensator)
@@ -243,22 +237,22 @@ class FlightController:
         self.flown = self._descending(self.flown, message, moving)
 
     def _descending(self, x: FlightState, message: str, moving: bool = True) -> FlightState:
-        after = descending(x, message, self._thrust.shown(x), self.gains, self._unseen, moving)
-        if after is not x:
-            self._unseen.clear()
-        return after
+        if x.blind is not None or not x.flying:
+            return x
+        x = descending(x, message, self._thrust.shown(x), self.gains, self._senses.unseen, moving)
+        self._senses.unseen.clear()
+        return x
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample; used in a descent without position, and kept for its beginning. Time [s], in B [rad/s, m/s^2].
 
         Its time also shows that odometry with an old stamp is late.
         """
-        self._imu_stamp, self._thrust.felt = stamp, accel[2]
+        self._thrust.felt = accel[2]
         self.flown = self.supervisor.imu(self.flown, stamp, gyro, accel)
         if self.flown.blind is not None:
             self.flown.blind.imu(stamp, gyro, accel)
-        else:
-            self._unseen.append((stamp, gyro, accel))
+        self._senses.imu(stamp, gyro, accel, keep=self.flown.blind is None)
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -274,16 +268,13 @@ class FlightController:
         """
         if self._period.update(stamp):
             self.law.pace(self._period.value)
-        verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self.gate.check(stamp, sample, covariances)
-        # Odometry that repeats itself does not stop the time.
-        x = self._believed(self.flown, stamp if stamp > self.flown.now else max(self.flown.now, self._imu_stamp), verdict, sample)
-        self.odometry_age = x.now - self.gate.stamp if self.gate.stamp is not None else inf
+        x, verdict = self._senses.odometry(self.flown, stamp, sample, covariances, problem)
         lost = self.odometry_age > self.settings.odometry_timeout
         if lost or verdict.jumped:
             self._schedule.drop()
         if x.blind is None and x.flying:
             if lost:
-                x = self._descending(x, self._refused or "no odometry")
+                x = self._descending(x, self._senses.refused or "no odometry")
             elif verdict.jumped:
                 x = stayed(x, verdict.reason)
         if x.blind is None:
@@ -296,10 +287,8 @@ class FlightController:
 
     def step_blind(self, stamp: float) -> StepResult:
         """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
-        dt, rotors = _later(self.flown, stamp)
-        x = self.flown.sensed(stamp, self.flown.belief, self.flown.seen, rotors)
-        self.odometry_age += dt
-        if x.flying and stamp - self._imu_stamp > DOWN_TIME:
+        x = self._senses.silence(self.flown, stamp)
+        if x.flying and stamp - self._senses.imu_stamp > DOWN_TIME:
             x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
         return self._answered(self._descending(x, "no odometry"))
 
@@ -308,22 +297,6 @@ class FlightController:
         x, result = self._descent(x, x.blind) if x.blind is not None else self._fly(x) if x.flying else self._idle(x)
         self.flown = x._replace(events=()) if x.events else x
         return result
-
-    def _believed(self, x: FlightState, now: float, verdict: Verdict, sample: tuple[float, ...]) -> FlightState:
-        """The state at a time [s], with a sample that is usable, or predicted."""
-        dt, rotors = _later(x, now)
-        if verdict.usable:
-            self._refused = ""
-            self._unseen.clear()
-            return x.sensed(now, self._smooth.of(now, sample, x.order), (now, sample), rotors)
-        if verdict.reason and not self._refused:
-            x = x._replace(events=(*x.events, f"refused: {verdict.reason}"))
-        self._refused, belief = verdict.reason, x.belief
-        if belief and x.flying:
-            body, _, forward, *_ = packed_vehicle(x.vehicle)
-            f = thrusts(rotors.speed, x.vehicle.thrust_coefficient)
-            belief = predicted(belief, f, NO_COMPENSATION, dt, body[0], body[1:4], forward)
-        return x.sensed(now, belief, x.seen, rotors)
 
     def _fly(self, x: FlightState) -> tuple[FlightState, StepResult]:
         setpoint = self.supervisor.wanted(x)
@@ -373,12 +346,6 @@ class FlightController:
         rotors = x.rotors.following(speed, x.belief or _STILL, x.vehicle)
         return (x.commanded(rotors, 1.0, x.spare, 0.0),
                 StepResult(armed, speed, event="; ".join(x.events), loop=rotors.sent))
-
-
-def _later(x: FlightState, now: float) -> tuple:
-    """Time that has passed until `now` [s], at most 0.1 s, and the rotors then."""
-    dt = min(max(now - x.now, 0.0), 0.1)
-    return dt, x.rotors.after(dt, x.vehicle.motor_time_constant)
 
 
 def _check_flying(x: FlightState, name: str) -> None:

@@ -136,8 +136,6 @@ def descending(x: FlightState, message: str, vehicle: Vehicle, gains: ControlGai
             begins there: the prediction since then knows less than the IMU.
         moving: the velocity can be trusted.
     """
-    if x.blind is not None or not x.flying:
-        return x
     stamp, sure = x.seen
     blind = BlindDescent(vehicle, gains, sure[6:10], sure[10:13], stamp, x.now, sure[3:6] if moving else _ZERO)
     for sample in unseen:

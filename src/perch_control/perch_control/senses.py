@@ -1,0 +1,75 @@
+"""What odometry and IMU have said: the state that is flown on, and what has been felt since the last odometry."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+
+import numpy as np
+
+from perch_control.flight_state import FlightState
+from perch_control.geometric import packed_vehicle
+from perch_control.geometric.step import predicted
+from perch_control.law import NO_COMPENSATION
+from perch_control.odometry_gate import OdometryGate, Verdict
+from perch_control.rotor_lag import thrusts
+from perch_control.smooth_position import SmoothPosition
+
+
+class Senses:
+    """Owns the gate of the odometry.
+
+    Attributes:
+        age: of the last odometry sample that was accepted [s].
+        refused: why the last sample was refused; empty: it was accepted.
+        imu_stamp: of the last IMU sample [s].
+        unseen: IMU samples since the odometry that was accepted last: time [s], rates [rad/s], specific force [m/s^2].
+    """
+
+    def __init__(self) -> None:
+        self.age, self.refused, self.imu_stamp = inf, "", -inf
+        self.unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=500)
+        self._gate, self._smooth = OdometryGate(), SmoothPosition()
+
+    def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...], keep: bool) -> None:
+        """Take an IMU sample: time [s], in B [rad/s, m/s^2]; `keep` it for the beginning of a descent without position."""
+        self.imu_stamp = stamp
+        if keep:
+            self.unseen.append((stamp, gyro, accel))
+
+    def odometry(self, x: FlightState, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None,
+                 problem: str) -> tuple[FlightState, Verdict]:
+        """The state by a sample, or predicted where it is refused, and the verdict on it; arguments as of `FlightController.step`."""
+        verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self._gate.check(stamp, sample, covariances)
+        # Odometry that repeats itself does not stop the time.
+        x = self._believed(x, stamp if stamp > x.now else max(x.now, self.imu_stamp), verdict, sample)
+        self.age = x.now - self._gate.stamp if self._gate.stamp is not None else inf
+        return x, verdict
+
+    def silence(self, x: FlightState, now: float) -> FlightState:
+        """The state at a time [s] for which no odometry has come."""
+        dt, rotors = _later(x, now)
+        self.age += dt
+        return x.sensed(now, x.belief, x.seen, rotors)
+
+    def _believed(self, x: FlightState, now: float, verdict: Verdict, sample: tuple[float, ...]) -> FlightState:
+        """The state at a time [s], with a sample that is usable, or predicted."""
+        dt, rotors = _later(x, now)
+        if verdict.usable:
+            self.refused = ""
+            self.unseen.clear()
+            return x.sensed(now, self._smooth.of(now, sample, x.order), (now, sample), rotors)
+        if verdict.reason and not self.refused:
+            x = x._replace(events=(*x.events, f"refused: {verdict.reason}"))
+        self.refused, belief = verdict.reason, x.belief
+        if belief and x.flying:
+            body, _, forward, *_ = packed_vehicle(x.vehicle)
+            f = thrusts(rotors.speed, x.vehicle.thrust_coefficient)
+            belief = predicted(belief, f, NO_COMPENSATION, dt, body[0], body[1:4], forward)
+        return x.sensed(now, belief, x.seen, rotors)
+
+
+def _later(x: FlightState, now: float) -> tuple:
+    """Time that has passed until `now` [s], at most 0.1 s, and the rotors then."""
+    dt = min(max(now - x.now, 0.0), 0.1)
+    return dt, x.rotors.after(dt, x.vehicle.motor_time_constant)
