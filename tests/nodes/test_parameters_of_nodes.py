@@ -11,7 +11,7 @@ def test_a_parameter_is_described_before_and_after_a_refusal_alike(graph):
 
     name = "flight.odometry_timeout"
     described = param("describe", "/controller", name).stdout
-    assert "double, to 5, [s], > 0" in described
+    assert "double, to 0.25, [s], > 0" in described
     refused = param("set", "/controller", name, "50.0")
     assert refused.returncode == 1 and name in refused.stdout and "50" in refused.stdout
     assert param("describe", "/controller", name).stdout == described
