@@ -1,11 +1,14 @@
 """The map of wires: from rendered images, its ids and extents, and what changes it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from oracles.wires import MOUNT, WIRE, cables, observe
 from perch_core import so3
 from perch_perception.line_mapping import (
-    LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, detect_lines, place)
+    LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, WireEstimate, detect_lines, place)
+from perch_perception.line_mapping.association import meets_another
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.powerline_mapper import mapping_pose
 from perch_sim.rendering import CableCurve, Renderer, Scene
@@ -129,6 +132,18 @@ def test_a_sighting_of_wires_in_line_counts_only_where_its_width_tells_which_it_
     body = BodyState(1.3, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
     after = mapper.update(1.3, body, [observe(rng, near, centre, 2e-4, time=1.3, radius=radius)])
     assert [a.observations - b.observations for a, b in zip(after.lines, before.lines, strict=True)] == [int(k == counted) for k in (0, 1)]
+
+
+@pytest.mark.parametrize("height, meets", [(0.0, False), (0.03, True), (0.06, True), (0.2, False)],
+                         ids=["hidden", "sticks out", "beside it", "apart"])
+@pytest.mark.parametrize("sigma, width", [(1e-3, 0.03), (1e-3, 0.0)])
+def test_the_width_of_a_wire_before_another_counts_only_where_it_is_its_own(height, meets, sigma, width):
+    """From 1 m, the other one 1 m behind and some centimetres higher: its image is half as wide."""
+    along, seen_from = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+    near, far = WireCurve(np.array([1.0, 0.0, 0.0]), along), WireCurve(np.array([2.0, 0.0, height]), along)
+    tracks = [SimpleNamespace(estimate=WireEstimate(w, sigma**2 * np.eye(5), np.ones(4, bool), np.zeros(3), 0.03), extent=(-2.0, 2.0))
+              for w in (near, far)]
+    assert meets_another(tracks, 0, observe(np.random.default_rng(0), near, seen_from, radius=width)) is (meets and width > 0.0)
 
 
 def test_the_doubt_of_the_cameras_mount_is_counted_once():

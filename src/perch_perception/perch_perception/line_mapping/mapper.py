@@ -11,7 +11,7 @@ from perch_core import config, so3
 from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
 from perch_core.values import MappedPowerline, PowerlineMap, nanoseconds
-from perch_perception.line_mapping.association import associate
+from perch_perception.line_mapping.association import associate, meets_another
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import (
@@ -85,7 +85,7 @@ class LineMapper:
             if owner < 0:
                 self._tracks.append(_Track(self._next_id, [one], one))
                 self._next_id += 1
-            elif self._extend(self._tracks[owner], one):
+            elif self._extend(self._tracks[owner], replace(one, width=0.0) if meets_another(self._tracks, owner, one) else one):
                 changed.add(owner)
         for index in sorted(changed):
             self._triangulate(self._tracks[index])
