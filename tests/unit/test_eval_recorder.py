@@ -89,6 +89,13 @@ def test_values_are_taken_as_well_as_messages_and_topics_have_the_namespace(tmp_
     assert [v.p_WB for _, v in RecordedFlight(recording.path, "quad1").values("odometry")] == [state(1).p_WB, state(2).p_WB]
 
 
+def test_another_namespace_than_that_of_the_recording_holds_nothing(tmp_path):
+    recording = Recording(tmp_path / "f.mcap")
+    recording.fly(range(10))
+    recording.recorder.close()
+    assert RecordedFlight(recording.path).values("odometry") and not RecordedFlight(recording.path, "quad1").topics
+
+
 @pytest.mark.parametrize("rate, count", [(0.0, 0), (0.5, 1), (6.0, 6), (60.0, 30)])
 def test_images_are_kept_at_their_rate(tmp_path, rate, count):
     recording = Recording(tmp_path / "f.mcap", image_rate=rate)

@@ -131,7 +131,7 @@ def test_the_program_flies_and_writes_a_vehicle_file(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),
-                                              (["--vehicle", "snapdragon", "--recording", "/no/file"], "no such file")])
+                                              (["--vehicle", "snapdragon", "--recording", "/no/file"], "no such recording")])
 def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["identify.py", *arguments])
     assert command.main() == 2

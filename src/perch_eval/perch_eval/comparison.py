@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins
 from perch_eval.metrics import FIGURES, figures, flight_metrics
 from perch_eval.page import image, page, section, table
-from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.recorded import opened, report_of, vehicle_of
 from perch_eval.scene_3d import scene_3d
 
 COLOURS = ("#1f77b4", "#d95f02")
@@ -33,10 +32,11 @@ exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two flights: what was recorded, and its `report.json`, or what the recording gives of it."""
+    """One of the two flights: what was recorded, what its `report.json` and the recording say, and whether the vehicle is known."""
 
     view: FlightView
     report: dict[str, Any]
+    known: bool
 
 
 def parser() -> argparse.ArgumentParser:
@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--out", type=Path, default=Path("compare.html"), metavar="FILE",
                      help="page to write (default: %(default)s)")
     out.add_argument("--names", nargs=2, metavar=("A", "B"), help="names of the flights on the page (default: the paths)")
-    out.add_argument("--vehicle", default="", help="vehicle that flew (default: that of the report, or snapdragon)")
+    out.add_argument("--vehicle", default="", help="vehicle that flew (default: that of the report, or of the recording)")
     out.add_argument("--namespace", nargs=2, default=("", ""), metavar=("A", "B"),
                      help="namespaces of the vehicles, where several were recorded")
     return out
@@ -73,38 +73,23 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
         name, colour: on the page.
         path: of the recording, or of its folder.
         namespace: of the vehicle, where several were recorded.
-        vehicle: name or file; empty: as the report says, or `snapdragon`.
+        vehicle: name or file; empty: as report or recording say.
 
     Raises:
         PerchError: no recording, or nothing in it.
     """
     file = path / "flight.mcap" if path.is_dir() else path
-    if not file.is_file():
-        raise PerchError(f"{file}: no such recording")
-    flight, report = RecordedFlight(file, namespace), _report(file.with_name("report.json"))
-    model = load_vehicle(vehicle or report.get("vehicle") or "snapdragon")
+    flight = opened(file, namespace)
+    flight.known_states("ground_truth/odometry")
+    report = report_of(flight)
+    flew = vehicle_of(flight, report, vehicle)
+    model = flew or load_vehicle("snapdragon")
     view = FlightView.of(flight, model, name, colour)
     until = report.get("simulated_time_s") or float(view.truth.t[-1])
     report = {**report, **flight_metrics(flight, model, until), "flight_hash": flight.digest(until)}
-    report.setdefault("margins", [one.mapping() for one in margins(flight, model)])
-    return Side(view, report)
-
-
-def _report(path: Path) -> dict[str, Any]:
-    """What a report says; nothing where there is none.
-
-    Raises:
-        PerchError: it is no report.
-    """
-    try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise PerchError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(content, dict):
-        raise PerchError(f"{path}: is not a report")
-    return content
+    found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
+    found |= {one.name: one.mapping() for one in margins(flight, model) if flew is not None}
+    return Side(view, report | {"margins": list(found.values())}, flew is not None)
 
 
 def compare(a: Side, b: Side) -> str:
@@ -113,7 +98,9 @@ def compare(a: Side, b: Side) -> str:
     same = a.report["flight_hash"] == b.report["flight_hash"]
     verdict = "The two are the same flight, to the last bit." if same else "The two are different flights."
     drawn = {"Path, seen from the side": plots.path_figure, "Position and velocity": plots.tracking_figure, "Errors": plots.distance_figure,
-               "Rates and tilt": plots.rates_figure, "Collective thrust, and its bounds": plots.thrust_figure}
+               "Rates and tilt": plots.rates_figure}
+    if a.known and b.known:
+        drawn["Collective thrust, and its bounds"] = plots.thrust_figure
     return page(f"{a.view.name} and {b.view.name}", f"<p>{verdict} Times count from the start of the perch.</p>",
                 section("Figures", _table(sides)), section("Margins", _margin_table(sides), "No perch was planned."),
                 section("Flight in 3-D", scene_3d(views)), *(section(name, image(draw(*views), name)) for name, draw in drawn.items()))
@@ -136,9 +123,9 @@ def _margin_table(sides: Sequence[Side]) -> str:
     by_name = [{one["name"]: one for one in side.report["margins"]} for side in sides]
     rows = []
     for name in dict.fromkeys(name for found in by_name for name in found):
-        one = next(found[name] for found in by_name if name in found)
+        both = [found[name] for found in by_name if name in found]
         kept = (f"{found[name]['value']:.2f}, {found[name]['left']:+.2f} left" if name in found else "-" for found in by_name)
-        rows.append((f"{name} [{one['unit']}]", limits(one), *kept))
+        rows.append((f"{name} [{both[0]['unit']}]", " / ".join(dict.fromkeys(map(limits, both))), *kept))
     return table(rows, ("", "limits", *(side.view.name for side in sides))) if rows else ""
 
 

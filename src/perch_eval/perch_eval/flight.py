@@ -16,6 +16,7 @@ from perch_core.values import ControlReference, OdometryState, TrajectoryOrder, 
 
 HASHED = ("ground_truth/odometry", "imu/data_raw", "odometry", "vio/odometry", "target/pose", "trajectory",
           "motor_command", "controller/reference")
+GAP = 0.1  # between states, beyond which those between them are not known [s]
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,15 @@ class States:
     q: np.ndarray
     v: np.ndarray
     w: np.ndarray
+
+    def chosen(self, rows: np.ndarray) -> States:
+        """Some of them, by a mask."""
+        return States(self.t[rows], self.p[rows], self.q[rows], self.v[rows], self.w[rows])
+
+    def covers(self, times: np.ndarray) -> np.ndarray:
+        """Which of these times lie neither outside the states nor in a gap between them, (n,)."""
+        right = np.clip(np.searchsorted(self.t, times), 1, len(self.t) - 1)
+        return (times >= self.t[0]) & (times <= self.t[-1]) & (self.t[right] - self.t[right - 1] <= GAP)
 
     def at(self, times: np.ndarray) -> States:
         """The states at given times; vectors are interpolated, the attitude is that of the next sample."""
@@ -93,7 +103,7 @@ class Flight:
         """
         found = self.states(channel)
         if found is None:
-            raise PerchError(f"{self.source}: holds no {channel}")
+            raise PerchError(f"{self.source}: holds no {channel}" + (f" as far as it can be read ({self.damage})" if self.damage else ""))
         return found
 
     def vectors(self, channel: str, pick: Callable[[Any], Any]) -> tuple[np.ndarray, np.ndarray]:

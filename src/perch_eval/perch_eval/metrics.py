@@ -12,7 +12,7 @@ from perch_core import so3
 from perch_core.values import AtEnd, Contact, seconds
 from perch_core.vehicle import Vehicle
 from perch_eval.consistency import attitude_error
-from perch_eval.flight import Flight, States
+from perch_eval.flight import GAP, Flight, States
 from perch_sim.contact_event import ContactState
 
 FIGURES: dict[str, tuple[str, str, float]] = {
@@ -34,18 +34,19 @@ def _rmse(difference: np.ndarray) -> list[float]:
 
 
 def perch_window(flight: Flight) -> tuple[float, float] | None:
-    """Start and end [s] of the perch: the first planned perch trajectory up to the contact, or to its planned end."""
-    start: float | None = None
-    end = math.nan
-    for _, order in flight.values("trajectory"):
-        if order.contact_after is not None:
-            begin = order.trajectory.start_time
-            start = begin if start is None else start
-            end = begin + order.contact_after
-    if start is None:
+    """Start and end [s] of the perch: the first plan of the attempt that touched, or else of the last, up to contact or planned end.
+
+    A plan that begins after the planned contact of the one before is a new attempt; one before it replaces the one that is flown.
+    """
+    plans = [(begin, begin + order.contact_after) for begin, order in flight.values("trajectory") if order.contact_after is not None]
+    if not plans:
         return None
     touch = touch_of(flight)
-    return (start, min(end, touch[0]) if touch is not None and touch[0] > start else end)
+    contact = math.inf if touch is None else touch[0]
+    start, end = math.nan, -math.inf
+    for begin, planned in [plan for plan in plans if plan[0] < contact] or plans:
+        start, end = begin if begin > end else start, planned
+    return start, min(end, contact) if contact > start else end
 
 
 def touch_of(flight: Flight) -> tuple[float, Contact] | None:
@@ -98,7 +99,7 @@ def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, 
         return out
     span = window or (truth.t[0], until)
     inside = (truth.t >= span[0]) & (truth.t <= span[1])
-    cut = States(truth.t[inside], truth.p[inside], truth.q[inside], truth.v[inside], truth.w[inside])
+    cut = truth.chosen(inside)
     out["window_s"] = list(span)
     out["perch_planned"] = window is not None
     if len(cut.t) < 2:
@@ -106,31 +107,35 @@ def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, 
     out["max_body_rate_deg_s"] = math.degrees(float(np.linalg.norm(cut.w, axis=1).max()))
     out["max_acceleration_m_s2"] = peak_acceleration(cut)
     if reference is not None:
-        wanted = reference.at(cut.t)
-        out["tracking_rmse_m"] = _rmse(cut.p - wanted.p)
+        judged = cut.chosen(reference.covers(cut.t))
+        out["tracking_judged"] = len(judged.t) / len(cut.t)
+        out["tracking_rmse_m"] = _rmse(judged.p - reference.at(judged.t).p)
     if estimate is not None:
-        estimated = estimate.at(cut.t)
-        out["estimation_rmse_m"] = _rmse(cut.p - estimated.p)
-        out["estimation_error_at_end_m"] = (estimated.p[-1] - cut.p[-1]).tolist()
-        out["attitude_error_at_end_deg"] = math.degrees(float(np.linalg.norm(attitude_error(cut.q[-1], estimated.q[-1]))))
-        out["velocity_rmse_m_s"] = _rmse(cut.v - estimated.v)
+        judged = cut.chosen(estimate.covers(cut.t))
+        estimated = estimate.at(judged.t)
+        out["estimation_judged"] = len(judged.t) / len(cut.t)
+        out["estimation_rmse_m"] = _rmse(judged.p - estimated.p)
+        out["velocity_rmse_m_s"] = _rmse(judged.v - estimated.v)
+        if len(judged.t) and cut.t[-1] - judged.t[-1] <= GAP:
+            out["estimation_error_at_end_m"] = (estimated.p[-1] - judged.p[-1]).tolist()
+            out["attitude_error_at_end_deg"] = math.degrees(float(np.linalg.norm(attitude_error(judged.q[-1], estimated.q[-1]))))
     out["target_error"] = target_error(flight)
     return out
 
 
 def figures(report: dict[str, Any], end_time: float) -> dict[str, float | None]:
     """The figures of a flight's report that are compared, by name; None where one could not be had."""
-    out: dict[str, float | None] = {"simulated_time_s": end_time}
-    for name in ("max_body_rate_deg_s", "max_acceleration_m_s2", "attitude_error_at_end_deg"):
-        out[name] = report.get(name)
-    for name in ("tracking_rmse_m", "estimation_rmse_m") if report.get("perch_planned") else ():  # else of a hover
+    out: dict[str, float | None] = {"simulated_time_s": end_time, "attitude_error_at_end_deg": report.get("attitude_error_at_end_deg")}
+    perch = bool(report.get("perch_planned"))  # else these are of a hover
+    out |= {name: report.get(name) for name in ("max_body_rate_deg_s", "max_acceleration_m_s2") if perch}
+    for name in ("tracking_rmse_m", "estimation_rmse_m") if perch else ():
         for axis, value in zip("xyz", report.get(name) or ()):
             out[f"{name}_{axis}"] = value
     for part, names in (("contact", ("normal_speed_m_s", "tangential_speed_m_s", "tilt_error_deg", "offset_m", "time")),
                         ("target_error", ("position_m", "attitude_deg"))):
         for name in names:
             out[f"{part}_{name}"] = (report.get(part) or {}).get(name)
-    if report.get("window_s") and report.get("perch_planned"):
+    if report.get("window_s") and perch:
         out["perch_time_s"] = report["window_s"][1] - report["window_s"][0]
     return {name: float(v) if v is not None and math.isfinite(v) else None for name, v in out.items()}
 

@@ -135,8 +135,11 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
                                 f"{100 * contact['offset_m']:.1f} cm from the centre {contact['reason']}".rstrip()))
     if report["recording_damage"]:
         rows.append(("recording", f"cut off or damaged ({report['recording_damage']}): the figures are of what can be read"))
-    return [*rows, ("tracking RMSE x, y, z", _vector(report.get("tracking_rmse_m"), 100, "cm")),
-            ("estimation RMSE x, y, z", _vector(report.get("estimation_rmse_m"), 100, "cm")),
+    for kind in ("tracking", "estimation"):
+        share = report.get(f"{kind}_judged", 1.0)
+        rows.append((f"{kind} RMSE x, y, z", _vector(report.get(f"{kind}_rmse_m"), 100, "cm") +
+                     (f" (known in {100 * share:.0f} % of the time)" if share < 0.99 else "")))
+    return [*rows,
             ("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
             ("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
             ("real-time factor", f"{report['real_time_factor']:.2f}: {report['simulated_duration_s']:.2f} s of simulated time "

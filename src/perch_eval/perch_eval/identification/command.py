@@ -66,12 +66,9 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | Re
     if arguments.recording:
         if len(arguments.recording) != max(len(voltages), 1):
             raise PerchError(f"--recording: {len(arguments.recording)} files, and {len(voltages)} voltages (--voltage)")
-        for file in arguments.recording:
-            if not file.is_file():
-                raise PerchError(f"{file}: no such file")
-        from perch_eval.ros.recorded_flight import RecordedFlight
+        from perch_eval.recorded import opened
 
-        return [RecordedFlight(file) for file in arguments.recording]
+        return [opened(file) for file in arguments.recording]
     if voltages and not vehicle.actuation.firmware:
         raise PerchError(f"--voltage: the simulated battery drives the motors of a firmware, and {arguments.vehicle} has none")
     scenario = load_scenario(arguments.scenario)

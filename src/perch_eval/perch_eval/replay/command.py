@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,9 +14,9 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.arguments import command, command_parser, count
 from perch_eval.flight_view import FlightView
+from perch_eval.recorded import opened, report_of, vehicle_of
 from perch_eval.replay.animation import Scene, write_animation
 from perch_eval.replay.stroboscope import stroboscope
-from perch_eval.ros.recorded_flight import RecordedFlight
 
 BEFORE, AFTER = 1.0, 1.0  # shown around the perch [s]
 EXAMPLES = """examples:
@@ -41,24 +40,22 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--fps", type=float, default=15.0, help="frames per second (default: %(default)s)")
     out.add_argument("--speed", type=float, default=1.0, help="1: real time, 0.25: slow motion (default: %(default)s)")
     out.add_argument("--instants", type=count, default=10, help="instants in a stroboscopic picture (default: %(default)s)")
-    out.add_argument("--vehicle", default="snapdragon", help="vehicle that is drawn (default: %(default)s)")
+    out.add_argument("--vehicle", default="", help="vehicle that is drawn (default: the one that flew)")
     out.add_argument("--namespace", default="", help="namespace of the vehicle, where several were recorded")
     return out
 
 
 def _show(args: argparse.Namespace) -> int:
-    if not args.flight.is_file():
-        raise PerchError(f"{args.flight}: no such recording")
     for name in ("fps", "speed"):
         if not 0.0 < getattr(args, name) < np.inf:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
-    flight, vehicle = RecordedFlight(args.flight, args.namespace), load_vehicle(args.vehicle)
-    if flight.damage:
-        print(f"warning: {args.flight} is cut off or damaged, and shown as far as it goes ({flight.damage})", file=sys.stderr)
-    view = FlightView.of(flight, vehicle)
+    flight = opened(args.flight, args.namespace)
+    flight.known_states("ground_truth/odometry")
+    vehicle = vehicle_of(flight, {} if args.vehicle else report_of(flight), args.vehicle)
+    view = FlightView.of(flight, vehicle or load_vehicle("snapdragon"))
     path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".png":
+    if path.suffix.lower() == ".png":
         start, end = span(view, args.start, args.end, 0.0, 0.0)
         stroboscope(view, start, end, args.instants).savefig(path, dpi=110)
         print(f"picture: {path}")
@@ -66,7 +63,7 @@ def _show(args: argparse.Namespace) -> int:
         start, end = span(view, args.start, args.end)
         _animate(args, Scene(view, start, end), start, end, path)
     if args.plots:
-        write_plots(view, args.plots)
+        write_plots(view, args.plots, thrust=vehicle is not None)
         print(f"plots: {args.plots}")
     return 0
 
@@ -92,12 +89,12 @@ def span(view: FlightView, start: float | None, end: float | None, before: float
     return max(begin, first), min(finish, last)
 
 
-def write_plots(view: FlightView, folder: Path) -> None:
-    """The figures of the flight's report as PNG files."""
+def write_plots(view: FlightView, folder: Path, thrust: bool) -> None:
+    """The figures of the flight's report as PNG files; that of the thrust needs to know the vehicle."""
     folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Callable[[FlightView], Figure | None]] = {
-        "tracking": plots.tracking_figure, "path": plots.path_figure, "rates": plots.rates_figure, "thrust": plots.thrust_figure,
-        "estimation_error": plots.error_figure}
+        "tracking": plots.tracking_figure, "path": plots.path_figure, "rates": plots.rates_figure,
+        "estimation_error": plots.error_figure, **({"thrust": plots.thrust_figure} if thrust else {})}
     for name, draw in figures.items():
         if figure := draw(view):
             figure.savefig(folder / f"{name}.png", dpi=95)

@@ -61,7 +61,7 @@ class RecordedFlight(Flight):
         for topic, type_of, time, data in read(path, on_damage=damage.append):
             key = topic.removeprefix(prefix).lstrip("/")
             channel = _channel(key, type_of)
-            if channel is not None:
+            if channel is not None and (topic.startswith(prefix) or channel.startswith("/")):
                 names[key] = channel
                 messages.setdefault(key, []).append((time, data))
         super().__init__(_Channels(names, messages), str(path), damage[0] if damage else "")

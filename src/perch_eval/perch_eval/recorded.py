@@ -1,0 +1,70 @@
+"""A recorded flight for the programs that show it, with the report that belongs to it and the vehicle that flew."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from perch_core.errors import ConfigError, PerchError
+from perch_core.urdf import urdf
+from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval.ros.recorded_flight import RecordedFlight
+
+
+def opened(path: Path, namespace: str = "") -> RecordedFlight:
+    """The flight of a file; one that is cut off or damaged is read as far as it goes, with a warning.
+
+    Raises:
+        PerchError: no such recording.
+    """
+    if not path.is_file():
+        raise PerchError(f"{path}: no such recording")
+    flight = RecordedFlight(path, namespace)
+    if flight.damage:
+        print(f"warning: {path} is cut off or damaged, and read as far as it goes ({flight.damage})", file=sys.stderr)
+    return flight
+
+
+def report_of(flight: RecordedFlight) -> dict[str, Any]:
+    """What `report.json` beside the recording says; nothing where there is none, or, with a warning, that of another flight.
+
+    Raises:
+        PerchError: it is no report.
+    """
+    path = Path(flight.source).with_name("report.json")
+    try:
+        report = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise PerchError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(report, dict):
+        raise PerchError(f"{path}: is not a report")
+    if report.get("flight_hash") != flight.digest(report.get("simulated_time_s") or 0.0):
+        print(f"warning: {path} is not the report of {flight.source}, and is not used", file=sys.stderr)
+        return {}
+    return report
+
+
+def vehicle_of(flight: RecordedFlight, report: dict[str, Any], given: str = "") -> Vehicle | None:
+    """The vehicle that flew: as it is given, as the report says, or that of `robot_description`; None, with a warning: nobody tells.
+
+    Raises:
+        ConfigError: the one that is given is none.
+    """
+    if given:
+        return load_vehicle(given)
+    with suppress(ConfigError):
+        if report.get("vehicle"):
+            return load_vehicle(report["vehicle"])
+    for _, text in flight.values("robot_description")[-1:]:
+        name = re.search(r'<robot name="([^"]+)"', text)
+        with suppress(ConfigError):
+            if name and urdf(vehicle := load_vehicle(name[1])) == text:
+                return vehicle
+    print(f"warning: {flight.source}: the vehicle is not known: drawn as snapdragon, without its thrust; give --vehicle", file=sys.stderr)
+    return None
