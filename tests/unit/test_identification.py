@@ -77,6 +77,23 @@ def test_what_the_delay_leaves_open_is_open_for_the_lags():
     assert thrust(one, VEHICLE, 0.012, 0.002)[0][0].sigma > 0.002 > thrust(one, VEHICLE, 0.012)[0][0].sigma
 
 
+def test_lags_are_not_told_without_the_delay():
+    """Neither roll nor pitch is commanded; yaw and thrust are, and tell the sum of lag and delay alone."""
+    one = record(seconds=10.0)
+    still = replace(one, rates=one.rates * (0.0, 0.0, 1.0), gyro=one.gyro * (0.0, 0.0, 1.0))
+    found = {each.key: each for each in identify(still, VEHICLE)[0]}
+    for key in ("actuation.rate_lag[2]", "actuation.thrust_lag"):
+        assert found[key].refused == "it depends on the delay, which is not identified"
+    assert not found["actuation.rate_gain[2]"].refused
+
+
+def test_parts_of_a_record_do_not_begin_settled():
+    """The scatter of the parts is the noise's, though the vehicle turns where each begins."""
+    one = record(size=4.0, seconds=10.0)
+    (lag, _, delay), _ = rates(one, 0)
+    assert lag.sigma < 3e-4 and delay.sigma < 3e-4 and abs(delay.value - DELAY) < 5e-4
+
+
 def test_a_hover_tells_nothing_and_says_so():
     found, _ = identify(record(size=0.05, seconds=10.0), VEHICLE)
     assert all(one.refused for one in found if one.key.startswith("actuation"))

@@ -54,24 +54,26 @@ class Found:
         return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{refused}"
 
 
-def _fitted(model: Callable[[np.ndarray, slice], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
+def _fitted(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
             high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters of `model(parameters, samples)`, and their standard deviations: the scatter of fits to parts / sqrt(their number)."""
+    """Parameters of `model(parameters)`, and their standard deviations: the scatter of fits to parts / sqrt(their number)."""
     def fit(samples: slice, x0: Sequence[float] | np.ndarray) -> np.ndarray:
-        return least_squares(lambda x: model(x, samples) - measured[samples], x0, bounds=(low, high),
+        return least_squares(lambda x: (model(x) - measured)[samples], x0, bounds=(low, high),
                              x_scale=np.maximum(np.abs(start), 1e-2), diff_step=1e-4).x
 
     whole, cuts = fit(slice(None), start), np.linspace(0, len(measured), PARTS + 1).astype(int)
     parts = np.array([fit(slice(a, b), whole) for a, b in zip(cuts, cuts[1:])])
     weight = np.array([np.var(measured[a:b]) for a, b in zip(cuts, cuts[1:])])  # a part in which nothing happens tells nothing
-    weight /= weight.sum()
+    weight /= max(weight.sum(), 1e-12)
     spread = np.sqrt(weight @ (parts - whole) ** 2)
-    return whole, spread / np.sqrt(1.0 / np.sum(weight**2))
+    return whole, spread * np.sqrt(np.sum(weight**2))
 
 
 def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: float | None = None) -> Found:
     bound = CERTAIN * abs(value) if bound is None else bound
-    if not why and sigma > bound:
+    if not why and sigma == inf:
+        why = "it depends on the delay, which is not identified"
+    elif not why and sigma > bound:
         why = f"its standard deviation of {sigma:.2g} {unit} is more than {bound:.2g}; fly longer and harder".replace("  ", " ")
     return Found(key, float(value), float(sigma), unit, why)
 
@@ -99,14 +101,13 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
     assert record.rates is not None
     commanded = record.rates[:, axis]
 
-    def model(x: np.ndarray, samples: slice) -> np.ndarray:
+    def model(x: np.ndarray) -> np.ndarray:
         late = x[3] if free else known
-        return lagged(x[1] * record.at(record.command_t, commanded, late + h)[samples], x[0], h) + x[2]
+        return lagged(x[1] * record.at(record.command_t, commanded, late + h), x[0], h) + x[2]
 
     n = 4 if free else 3
     x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
-    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, commanded, 0.0), w,
-                    model(x, slice(None)))
+    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, commanded, 0.0), w, model(x))
     why = _untold(answer, LEAST_RATE)
     found = [_judged(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", why),
              _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
@@ -122,14 +123,14 @@ def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) 
     unit = vehicle.thrust_coefficient / vehicle.mass if rotors else 1.0
     u = record.at(record.command_t, sent, h if rotors else delay + h)
 
-    def model(x: np.ndarray, samples: slice) -> np.ndarray:
+    def model(x: np.ndarray) -> np.ndarray:
         lag, gain, drag = x
-        felt = gain * unit * np.sum(lagged(u[samples], lag, h) ** 2, axis=1) if rotors else lagged(gain * u[samples], lag, h)
-        return felt - drag * record.v_B[samples, 2]
+        felt = gain * unit * np.sum(lagged(u, lag, h) ** 2, axis=1) if rotors else lagged(gain * u, lag, h)
+        return felt - drag * record.v_B[:, 2]
 
     x, sigma = _fitted(model, f, (0.04, 1.0, 0.05), (1e-3, 0.2, -5.0), (0.5, 5.0, 5.0))
     command = unit * np.sum(u**2, axis=1) if rotors else u
-    answer = Answer("specific thrust", "m/s^2", record.t, command, f, model(x, slice(None)))
+    answer = Answer("specific thrust", "m/s^2", record.t, command, f, model(x))
     why = _untold(answer, LEAST_THRUST)
     scale = vehicle.thrust_coefficient if rotors else 1.0
     certain = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's own offset looks like thrust
@@ -169,8 +170,8 @@ def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.
 
 def drag(record: Record, vehicle: Vehicle, axis: int) -> Found:
     """Linear drag along x or y: the only force there in free air."""
-    def model(x: np.ndarray, samples: slice) -> np.ndarray:
-        return x[1] - x[0] * record.v_B[samples, axis]
+    def model(x: np.ndarray) -> np.ndarray:
+        return x[1] - x[0] * record.v_B[:, axis]
 
     x, sigma = _fitted(model, record.accel[:, axis], (0.1, 0.0), (-5.0, -2.0), (5.0, 2.0))
     return _drag(axis, vehicle.mass * x[0], vehicle.mass * sigma[0], record)
@@ -190,13 +191,14 @@ def identify(record: Record, vehicle: Vehicle) -> tuple[list[Found], list[Answer
     if record.rates is not None:
         # One delay for all: that of roll and pitch, which turn the thrust; what yaw is later counts as its lag.
         tilt = [part[2] for part, _ in (rates(record, axis) for axis in (0, 1)) if not part[2].refused]
+        spread = inf
         if tilt:
             delay = float(np.mean([one.value for one in tilt]))
             spread = float(np.hypot(np.std([one.value for one in tilt]), max(one.sigma for one in tilt)))
         axes = [rates(record, axis, delay, spread) for axis in range(3)]
         answers += [answer for _, answer in axes]
         found += [one for part, _ in axes for one in part]
-        found.append(_judged("actuation.delay", delay, spread if tilt else inf, "s", "" if tilt else "neither roll nor pitch tells it",
+        found.append(_judged("actuation.delay", delay, spread, "s", "" if tilt else "neither roll nor pitch tells it",
                              DELAY_CERTAIN))
     if record.thrust is not None or record.rotor_speeds is not None:
         part, answer = thrust(record, vehicle, delay, spread)
