@@ -6,6 +6,7 @@ from itertools import permutations, product
 import cv2
 import numpy as np
 import pytest
+from perch_core.camera import PinholeCamera
 from perch_core.urdf import fixed_frames
 from perch_core.values import CameraModel, ControllerStatus, ImuSample
 from perch_core.vehicle import load_vehicle
@@ -77,7 +78,11 @@ def test_cameras_and_extrinsics_are_compared_with_the_file():
     camera = VEHICLE.mounts["down"].camera
     model = CameraModel(0, "camera_down_optical_frame", camera)
     assert checks.camera_model("down", model, VEHICLE).verdict is PASSED
-    for wrong in (model._replace(camera=replace(camera, fx=1.1 * camera.fx)), model._replace(frame="down"), None):
+    c = camera
+    other_lens = PinholeCamera(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+    for wrong in (replace(c, fx=1.1 * c.fx), replace(c, cx=c.cx + 80.0), other_lens, replace(c, width=c.width + 2)):
+        assert checks.camera_model("down", model._replace(camera=wrong), VEHICLE).verdict is FAILED
+    for wrong in (model._replace(frame="down"), None):
         assert checks.camera_model("down", wrong, VEHICLE).verdict is FAILED
     frames = list(fixed_frames(VEHICLE))
     assert {check.verdict for check in checks.extrinsics(frames, VEHICLE)} == {PASSED}
@@ -85,6 +90,15 @@ def test_cameras_and_extrinsics_are_compared_with_the_file():
     moved = [f._replace(p=(f.p[0] + 0.05, *f.p[1:])) if f.child.startswith("camera_front") else f for f in frames]
     failed = [check.name for check in checks.extrinsics(moved, VEHICLE) if check.verdict is FAILED]
     assert failed == ["extrinsics camera_front_optical_frame"]
+
+
+@pytest.mark.parametrize("felt, words", [
+    (lambda w, other: 57.3 * w, "57.3 times"), (lambda w, other: 0.5 * w, "0.5 times"), (lambda w, other: (1.0, 1.0, 0.5) * w, "times"),
+    (lambda w, other: w + 0.6 * other, "are not the camera's")])
+def test_a_gyroscope_with_another_scale_or_another_motion_is_found(felt, words):
+    rates, other = np.random.default_rng(6).standard_normal((2, 60, 3))
+    check = checks.shaken("down", felt(rates, other), rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
+    assert check.verdict is FAILED and words in check.seen
 
 
 def test_shaking_too_little_is_no_verdict():

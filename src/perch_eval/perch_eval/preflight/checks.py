@@ -11,6 +11,7 @@ import numpy as np
 
 from perch_control.modes import State
 from perch_core import so3
+from perch_core.camera import Camera
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import CameraModel, ControllerStatus, ImuSample, OdometryState, Transform, seconds
 from perch_core.vehicle import GRAVITY, Vehicle
@@ -21,9 +22,11 @@ FORCE = 0.5       # of the mean specific force from gravity [m/s^2]
 STILL = 0.1       # mean body rate at rest [rad/s]
 GAP = 5.0         # periods between two stamps, at most
 LATE = 0.25       # of camera frames behind IMU samples of the same stamp [s]
-CAMERA = 0.03     # share by which focal lengths may differ from the file's
+PIXELS = 3.0      # by which a point may lie elsewhere in the image than by the file's camera [px]
 EXTRINSICS = (0.02, 3.0)  # what a transform may differ from the file [m, deg]
 SHAKE = 5.0       # what the rotation from camera to IMU may differ from the file [deg]
+SCALE = 0.1       # share by which the gyroscope's rates may be larger or smaller than the camera's ...
+UNLIKE = 0.4      # ... and share of them that may be something else
 TURNED = 0.3      # root mean square of the rates about each axis that shaking needs [rad/s]
 ANSWER = 2.0      # from an order to its effect, heard by a program that shares the machine with others [s]
 STOPPED = 1.0     # from the last command to the motors' stop [s] ...
@@ -118,11 +121,20 @@ def camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Chec
     if model is None:
         return Check(title, Verdict.FAILED, "no camera_info", f"see rate camera_{name}/camera_info")
     have, want = model.camera, mount.camera
-    off = max(abs(have.fx / want.fx - 1.0), abs(have.fy / want.fy - 1.0))
-    return judged(title, (have.width, have.height) == (want.width, want.height) and off < CAMERA and model.frame == optical_frame(name),
-                  f"{have.width} x {have.height} px, f {have.fx:.1f}, {have.fy:.1f} px, frame {model.frame}",
-                  f"the file says {want.width} x {want.height} px, f {want.fx:.1f}, {want.fy:.1f} px, "
-                  f"frame {optical_frame(name)}: calibrate, or name the right file")
+    u, v = np.meshgrid(np.linspace(0.0, want.width - 1.0, 5), np.linspace(0.0, want.height - 1.0, 5))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays = want.unproject(pixels)
+    known = np.isfinite(rays).all(axis=1)  # others lie beyond a fisheye's circle
+    apart = np.linalg.norm(have.project(rays[known])[0] - pixels[known], axis=1)
+    off = float(np.nan_to_num(apart, nan=np.inf).max())
+    return judged(title, (have.width, have.height) == (want.width, want.height) and off < PIXELS and model.frame == optical_frame(name),
+                  f"{_camera(have)}, frame {model.frame}: points lie up to {off:.1f} px from where the file has them",
+                  f"the file says {_camera(want)}, frame {optical_frame(name)}: calibrate, or name the right file")
+
+
+def _camera(camera: Camera) -> str:
+    return (f"{camera.width} x {camera.height} px, {camera.model}, f {camera.fx:.1f}, {camera.fy:.1f} px, "
+            f"centre {camera.cx:.1f}, {camera.cy:.1f} px")
 
 
 def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]:
@@ -166,7 +178,10 @@ def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndar
 
 
 def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
-    """The rotation between a camera and the IMU, from shaking the vehicle by hand; arguments as those of `camera_rotation`."""
+    """The rotation between a camera and the IMU, and the gyroscope's scale, from shaking the vehicle by hand.
+
+    Arguments are those of `camera_rotation`.
+    """
     title, advice = f"rotation camera_{name} to IMU", (
         "turn the vehicle to and fro about all axes, by 20 deg, over something with texture (--shake)")
     if len(turned_B) < 20:
@@ -177,6 +192,15 @@ def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehic
     if np.linalg.det(R) < 0.0:
         return Check(title, Verdict.FAILED, f"left-handed: R_BC would be {np.round(R, 2).tolist()}",
                      "the sign of one axis of the gyroscope is wrong (or of all three): correct it in its driver")
+    seen = turned_C @ R.T
+    scale = float(np.sum(turned_B * seen) / np.sum(seen**2))
+    if abs(scale - 1.0) > SCALE:
+        return Check(title, Verdict.FAILED, f"the gyroscope reads {scale:.3g} times the camera's rates",
+                     "its unit (rad/s) or scale is wrong, or the camera's focal length")
+    unlike = float(np.linalg.norm(turned_B - scale * seen) / np.linalg.norm(turned_B))
+    if unlike > UNLIKE:
+        return Check(title, Verdict.FAILED, f"{100 * unlike:.0f} % of the gyroscope's rates are not the camera's",
+                     "an axis of the gyroscope has another scale, the clocks differ, or the scene moves: see there, and shake again")
     off = degrees(float(np.linalg.norm(so3.log(vehicle.mounts[name].R_BC.T @ R))))
     return judged(title, off < SHAKE, f"{off:.1f} deg from the file",
                   f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
