@@ -8,6 +8,7 @@ from perch_core.values import CameraImage
 from perch_eval.recordings import camera_check, sensors_command
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import evaluate
+from perch_eval.recordings.findings import Report
 from perch_eval.recordings.imu_check import allan_deviation, longest_still
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.recording import IMU, Recording, RecordingError
@@ -90,6 +91,26 @@ def test_blur_is_seen(heard):
     cv2 = pytest.importorskip("cv2")
     found = spoilt(heard, image=pixels(lambda p: cv2.GaussianBlur(p, (0, 0), 4.0)))
     assert found.get("camera cam0 sharpness") == "warning"
+
+
+@pytest.mark.parametrize("late, R, size, level, words", [
+    (0.0, np.eye(3), 1.0, "ok", "stamps are +0 ms"), (0.15, np.eye(3), 1.0, "fails", "stamps are +150 ms"),
+    (-0.4, np.eye(3), 1.0, "fails", "stamps are -400 ms"), (9.0, np.eye(3), 1.0, "fails", "do not turn so at any offset"),
+    (0.0, np.eye(3), 0.005, "ok", "too slow"), (0.0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), 1.0, "ok", "stamps are +0 ms")])
+def test_clock_and_mounting_are_told_by_the_turns(late, R, size, level, words):
+    rng, t = np.random.default_rng(7), np.arange(0.0, 30.0, 0.005)
+    smooth = np.exp(-0.5 * (np.arange(-120, 121) / 30.0) ** 2)
+    gyro = size * np.stack([np.convolve(rng.standard_normal(len(t)), smooth / np.linalg.norm(smooth), "same") for _ in range(3)], axis=1)
+    begin = np.arange(10.0, 18.0, 0.05)
+    seen = np.array([gyro[(t > b - 0.001) & (t < b + 0.051)].mean(axis=0) for b in begin]) @ R + 0.02 * rng.standard_normal((len(begin), 3))
+    report = Report()
+    camera_check._check_clock(report, "cam0", np.column_stack([begin + late, begin + late + 0.05, seen]), t, gyro, 0.0)
+    found = {f.about: f for f in report.findings}
+    assert found["camera cam0 clock"].level == level and words in found["camera cam0 clock"].text
+    if late < 9.0 and size == 1.0:
+        turned = (R != np.eye(3)).any()
+        assert found["camera cam0 mounting"].text.startswith("90." if turned else "0.")
+        assert found["camera cam0 mounting"].level == ("fails" if turned else "ok")
 
 
 def test_the_command_says_it_by_its_exit_code(files, capsys):

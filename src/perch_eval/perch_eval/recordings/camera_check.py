@@ -1,4 +1,4 @@
-"""A camera's images judged: size, rate, exposure, sharpness, texture; and its clock against the IMU's, by the turns that both see."""
+"""A camera's images judged: size, rate, exposure, sharpness, texture; and its clock and mounting against the IMU's, by the turns that both see."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ from contextlib import suppress
 import cv2
 import numpy as np
 
+from perch_core import so3
 from perch_core.sensors import Sensors
 from perch_core.values import CameraImage
 from perch_eval.camera_turns import CameraTurns
+from perch_eval.flight import interpolated
 from perch_eval.recordings.findings import Report, check_rhythm
 from perch_eval.recordings.recording import Recording
 from perch_perception.images import ImageError, image_array
 
 LOOKED_AT = 60  # images of each camera whose pixels are looked at
 CORRELATED = 5.0  # frames over which errors of an image's turn go together
-SPAN, REACH = 8.0, 0.1  # of the stretch that is looked at, and of the offsets tried [s]
+SPAN = 8.0  # of the stretch that is looked at [s]
+OFFSETS = np.arange(-0.5, 0.501, 0.002)  # of the images' stamps that are tried [s]
+TURNED = 0.2  # 1 sigma of rates that tell something [rad/s]
+ALIKE, UNLIKE = 0.25, 0.7  # what images and gyro may not share of a turn, as a share: below, its axis can be told; above, it is another turn
 
 
 class Looker:
@@ -105,7 +110,7 @@ def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarr
 
 
 def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: np.ndarray, sensors: Sensors, R_BI: np.ndarray) -> None:
-    """The time offset between each camera and the IMU, by which the turns that both see fit best."""
+    """Time offset and rotation between each camera and the IMU, by which the turns that both see fit best."""
     begin = _liveliest(stamps, imu[:, :3])
     end = begin + round(SPAN * 1e9)
     turns = {name: CameraTurns(sensors.cameras[name].camera) for name in recording.images if name in sensors.cameras}
@@ -118,20 +123,35 @@ def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: 
     for name, seen in turns.items():
         if len(seen.spans) < 20:
             continue
-        rows = [(1e-9 * (before - stamps[0]), 1e-9 * (after - stamps[0]), *rate) for before, after, rate in seen.spans]
-        told = sensors.cameras[name].stamp_offset
+        rows = np.array([(1e-9 * (before - stamps[0]), 1e-9 * (after - stamps[0]), *rate) for before, after, rate in seen.spans])
         R_CI = sensors.mounts[name].R_BC.T @ R_BI
-        offset, sigma = clock_offset(np.array(rows), 1e-9 * (stamps - stamps[0]), imu[:, :3] @ R_CI.T)
-        if sigma > 0.01:
+        _check_clock(report, name, rows, 1e-9 * (stamps - stamps[0]), imu[:, :3] @ R_CI.T, sensors.cameras[name].stamp_offset)
+
+
+def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray, told: float) -> None:
+    """Mounting and clock of one camera; `told` is the offset of the sensor file [s], the others are those of `felt_rates`."""
+    rate, felt = turns[:, 2:], felt_rates(turns, stamps, gyro_C)
+    R, unlike = mounting(rate, felt)
+    if unlike < ALIKE:
+        felt, angle = felt @ R, float(np.degrees(np.linalg.norm(so3.log(R))))
+        report.say(f"camera {name} mounting", f"{angle:.1f} deg from the sensor file by the turns that both see", fails=angle > 10.0)
+    offset, sigma = clock_offset(rate, felt, 0.5 * (turns[:, 0] + turns[:, 1]))
+    if sigma > 0.01:
+        turned = felt.std(axis=1).mean(axis=0)
+        share = ((rate - felt).std(axis=1) / felt.std(axis=1)).min(axis=0)
+        if (turned > TURNED).any() and share[turned > TURNED].min() > UNLIKE:
+            report.say(f"camera {name} clock", f"the gyro turns, but the images do not turn so at any offset up to {OFFSETS[-1]:g} s: "
+                       "clock, axes or unit are wrong, or what is seen moves", warning=True, fails=bool(turned[2] > TURNED))
+        else:
             report.say(f"camera {name} clock", f"turns are too slow to compare it with the IMU's ({1e3 * sigma:.0f} ms, 1 sigma)")
-            continue
-        report.figures[f"{name}_stamp_offset_s"] = offset
-        beyond = abs(offset - told) - 3.0 * sigma
-        report.say(f"camera {name} clock",
-                   f"stamps are {1e3 * offset:+.0f} ms ({1e3 * sigma:.0f} ms, 1 sigma) from the IMU's clock by the turns that both "
-                   f"see, {1e3 * told:+.0f} ms in the sensor file",
-                   warning=beyond > 0.005,
-                   fails=beyond > 0.02)
+        return
+    report.figures[f"{name}_stamp_offset_s"] = offset
+    beyond, edge = abs(offset - told) - 3.0 * sigma, abs(offset) > OFFSETS[-2]
+    report.say(f"camera {name} clock",
+               f"stamps are {'more than ' if edge else ''}{1e3 * offset:+.0f} ms ({1e3 * sigma:.0f} ms, 1 sigma) from the IMU's clock by "
+               f"the turns that both see, {1e3 * told:+.0f} ms in the sensor file",
+               warning=beyond > 0.005,
+               fails=edge or beyond > 0.02)
 
 
 def _liveliest(stamps: np.ndarray, gyro: np.ndarray) -> int:
@@ -141,8 +161,8 @@ def _liveliest(stamps: np.ndarray, gyro: np.ndarray) -> int:
     return int(edges[int(np.argmax([np.linalg.norm(span - span.mean(axis=0), axis=1).mean() for span in spans]))])
 
 
-def clock_offset(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> tuple[float, float]:
-    """By how much the images' stamps are late against the gyro's, and how alike the turns are then.
+def felt_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.ndarray:
+    """Mean rates of the gyro between the images' stamps, for each of `OFFSETS` by which these may be late.
 
     Args:
         turns: stamp before, stamp after [s], mean rate between in C [rad/s], shape (n, 5).
@@ -150,18 +170,38 @@ def clock_offset(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> t
         gyro_C: angular rate in the axes of C [rad/s], shape (m, 3).
 
     Returns:
-        Stamp minus IMU time [s], by the axis where the rates are most alike, and its 1 sigma: the rates' difference over their slope.
+        Shape (k, n, 3) [rad/s].
     """
     integral = np.vstack([np.zeros(3), np.cumsum(0.5 * (gyro_C[1:] + gyro_C[:-1]) * np.diff(stamps)[:, None], axis=0)])
-    begin, end, rate = turns[:, 0], turns[:, 1], turns[:, 2:]
-    offsets, best = np.arange(-REACH, REACH + 1e-9, 0.002), (0.0, np.inf)
-    for axis in range(3):
-        found = []
-        for offset in offsets:
-            felt = np.interp(end - offset, stamps, integral[:, axis]) - np.interp(begin - offset, stamps, integral[:, axis])
-            felt /= end - begin
-            slope = float(np.abs(np.gradient(felt, 0.5 * (begin + end))).mean())
-            found.append((float((rate[:, axis] - felt).std()) / max(slope, 1e-9) / np.sqrt(len(rate) / CORRELATED), float(offset)))
-        sigma, offset = min(found)
-        best = min(best, (offset, sigma), key=lambda pair: pair[1])
-    return best
+    begin, end = (interpolated((turns[:, k] - OFFSETS[:, None]).ravel(), stamps, integral).reshape(len(OFFSETS), -1, 3) for k in (0, 1))
+    return (end - begin) / (turns[:, 1] - turns[:, 0])[:, None]
+
+
+def mounting(rate: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rotation that best turns the camera's rates into the gyro's, at the best offset, and the share of the rates that it does not explain.
+
+    The share is infinite where they turn about one axis only. For the arguments see `clock_offset`.
+    """
+    rate, felt = rate - rate.mean(axis=0), felt - felt.mean(axis=1, keepdims=True)
+    size = np.linalg.svd(rate, compute_uv=False)
+    if size[1] < TURNED * np.sqrt(len(rate)):
+        return np.eye(3), np.inf
+    found = [(R := so3.nearest(one.T @ rate), float(np.linalg.norm(one - rate @ R.T) / np.linalg.norm(rate))) for one in felt]
+    return min(found, key=lambda pair: pair[1])
+
+
+def clock_offset(rate: np.ndarray, felt: np.ndarray, times: np.ndarray) -> tuple[float, float]:
+    """By how much the images' stamps are late against the gyro's, and how alike the turns are then.
+
+    Args:
+        rate: of the camera [rad/s], shape (n, 3).
+        felt: of the gyro at each offset, as `felt_rates` gives them, shape (k, n, 3).
+        times: of the rates [s], shape (n,).
+
+    Returns:
+        Stamp minus IMU time [s], by the axis where the rates are most alike, and its 1 sigma: the rates' difference over their slope.
+    """
+    slope = np.abs(np.gradient(felt, times, axis=1)).mean(axis=1)
+    sigma = (rate - felt).std(axis=1) / np.maximum(slope, 1e-9) / np.sqrt(len(rate) / CORRELATED)
+    k, axis = np.unravel_index(np.argmin(sigma), sigma.shape)
+    return float(OFFSETS[k]), float(sigma[k, axis])
