@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from perch_eval.recordings import command
 from perch_eval.recordings.asl import AslRecording
 from perch_eval.recordings.bag import BagRecording
-from perch_eval.recordings.trajectory import read_trajectory
+from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
 
 
@@ -73,6 +74,33 @@ def test_a_bag_that_broke_off_is_read_as_far_as_it_goes_with_its_truth_on_a_topi
     assert seen["vio"]["ate_rmse_m"] < 0.015 and seen["vio"]["path_m"] > 0.5
     vio, true = read_trajectory(tmp_path / "out" / "vio.tum"), read_trajectory(tmp_path / "out" / "truth.tum")
     assert true.stamps[0] == photo_flight.START and len(vio) > 50  # to the nanosecond
+
+
+def test_a_truth_on_another_clock_costs_the_comparison_alone(files, tmp_path, capsys, monkeypatch):
+    (tmp_path / "far.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    events = AslRecording.events
+    monkeypatch.setattr(AslRecording, "events", lambda self: islice(events(self), 700))
+    assert perceive(files / "asl", "--truth", tmp_path / "far.tum", "--out", tmp_path / "out", "--without", "target_localizer", "powerline_mapper") == 0
+    assert "not compared: the truth" in capsys.readouterr().out and "path_m" in report(tmp_path / "out")["vio"]
+
+
+def test_truth_of_markers_is_taken_to_the_imu(files, tmp_path):
+    """As `vicon0` of EuRoC: poses of the markers, and in `sensor.yaml` where they are on the body."""
+    recording = AslRecording(files / "asl", None)
+    imu, source = read_truth(recording, None), recording.truth.parent
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", [100.0, 20.0, -40.0], degrees=True).as_matrix(), (0.07, -0.03, -0.12)
+    markers = imu.turned(Rotation.from_matrix(T[:3, :3]).as_quat(), T[:3, 3])
+    shutil.copytree(files / "asl", tmp_path / "asl")
+    shutil.rmtree(tmp_path / "asl" / source.relative_to(files / "asl"))
+    folder = tmp_path / "asl" / "mav0" / "vicon0"
+    folder.mkdir()
+    rows = [f"{s},{','.join(map(str, p))},{q[3]},{q[0]},{q[1]},{q[2]}" for s, p, q in zip(markers.stamps, markers.p, markers.q)]
+    (folder / "data.csv").write_text("\n".join(rows))
+    (folder / "sensor.yaml").write_text(f"T_BS: {{rows: 4, cols: 4, data: {T.ravel().tolist()}}}\n")
+    again = read_truth(AslRecording(tmp_path / "asl", None), None)
+    np.testing.assert_allclose(again.p, imu.p, atol=1e-9)
+    np.testing.assert_allclose(np.abs(np.sum(again.q * imu.q, axis=1)), 1.0, atol=1e-9)
 
 
 def test_a_folder_of_images(flight, tmp_path):

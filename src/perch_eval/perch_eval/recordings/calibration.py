@@ -68,11 +68,9 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         "cameras": {}
     }
     imu = root / "imu0" / "sensor.yaml"
-    T_BI = np.eye(4)
+    T_BI = in_body(imu)
     if imu.is_file():
-        content = _mapping(imu)
-        T_BI = _transform(str(imu), "T_BS", content.get("T_BS", np.eye(4).tolist()))
-        out["imu"] = _imu(str(imu), content, R_BI)
+        out["imu"] = _imu(str(imu), _mapping(imu), R_BI)
     for file in sorted(root.glob("cam*/sensor.yaml")):
         c, source = _mapping(file), str(file)
         T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
@@ -80,6 +78,16 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         camera["rate"] = c.get("rate_hz", 20)
         out["cameras"][file.parent.name] = camera
     return config.from_mapping(Sensors, out, str(root))
+
+
+def in_body(file: Path) -> np.ndarray:
+    """T_BS of a `sensor.yaml`, shape (4, 4); the unit matrix where it has none.
+
+    Raises:
+        ConfigError: it cannot be read, or is no rigid transform.
+    """
+    content = _mapping(file) if file.is_file() else {}
+    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist()))
 
 
 def to_yaml(sensors: Sensors, comment: str = "") -> str:

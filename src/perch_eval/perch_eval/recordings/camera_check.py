@@ -74,8 +74,11 @@ def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarr
     if len(imu_stamps):
         if not (np.diff(stamps) > 0).all():
             report.say(f"{about} stamps", f"{int((np.diff(stamps) <= 0).sum())} are not newer than the one before", warning=True)
-        if len(stamps) > 2:
-            check_rhythm(report, about, np.unique(stamps), least=5.0, wanted=10.0, told=None)
+        different = np.unique(stamps)
+        if len(different) > 2:
+            check_rhythm(report, about, different, least=5.0, wanted=10.0, told=None)
+        elif len(stamps) > 2:
+            report.say(f"{about} stamps", "all are the same: the driver does not stamp", fails=True)
         outside = float(((stamps < imu_stamps[0]) | (stamps > imu_stamps[-1])).mean())
         if outside > 0.02:
             gap = 1e-9 * max(imu_stamps[0] - stamps[0], stamps[-1] - imu_stamps[-1])

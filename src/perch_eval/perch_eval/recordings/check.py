@@ -50,6 +50,6 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
         check_camera(report, name, looker, times, sensors)
     if sensors is None:
         report.say("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
-    elif len(times) > 10 and sensors.imu is not None:
+    elif len(times) > 10 and np.ptp(times) > 0 and sensors.imu is not None:
         check_clocks(report, recording, times, imu, sensors, sensors.imu.R_BI)
     return report

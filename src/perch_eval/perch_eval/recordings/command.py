@@ -31,7 +31,7 @@ from perch_eval.recordings.drawing import Gallery, Shown
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Choice, Perception
 from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
-from perch_eval.recordings.recording import Recording
+from perch_eval.recordings.recording import Recording, RecordingError
 from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
 from perch_perception.images import ImageError
 from perch_perception.line_mapping import LineDetectionConfig
@@ -180,11 +180,15 @@ def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Tra
         told.figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
         told.rows.append(("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
         if truth is not None:
-            compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
-            against = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth)
-            told.figures["vio"] |= compared.figures()
-            told.figures["estimator"] = against.figures()
-            told.rows += [*_evaluation_rows("VIO", compared), *_evaluation_rows("estimator", against)[:2]]
+            try:
+                compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
+                told.figures["vio"] |= compared.figures()
+                told.rows += _evaluation_rows("VIO", compared)
+                against = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth)
+                told.figures["estimator"] = against.figures()
+                told.rows += _evaluation_rows("estimator", against)[:2]
+            except RecordingError as error:
+                told.rows.append(("not compared", str(error)))
         told.plots["The path"] = report.path_figure(vio, compared)
         if compared is not None:
             index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 OK, WARNING, FAILS = "ok", "warning", "fails"
+MOST = 10_000.0  # rate of a sensor [Hz]
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Report:
 
 
 def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> tuple[float, float]:
-    """Rate [Hz] and jitter (1 sigma of an interval, in periods) of ascending stamps."""
+    """Rate [Hz] and jitter (1 sigma of an interval, in periods) of ascending stamps, three or more."""
     intervals = 1e-9 * np.diff(stamps)
     reach = min(9, len(intervals))  # stamps may come in batches
     period = float(np.median(stamps[reach:] - stamps[:-reach])) * 1e-9 / reach
@@ -48,9 +49,10 @@ def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, w
     wrong = told is not None and not 0.8 < rate / told < 1.25
     report.say(f"{about} rate",
                f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {told:g} Hz in the sensor file" if wrong else "") +
-               (f": at least {wanted:g} Hz are wanted" if rate < wanted else ""),
+               (f": at least {wanted:g} Hz are wanted" if rate < wanted else "") +
+               (": stamps are not in nanoseconds" if rate > MOST else ""),
                warning=rate < wanted or wrong,
-               fails=rate < least)
+               fails=not least <= rate <= MOST)
     report.say(f"{about} jitter",
                f"{1e3 * jitter * period:.2f} ms (1 sigma), {100 * jitter:.0f} % of the period" +
                (": stamps are taken on arrival, or in batches; stamp where the sensor is sampled" if jitter > 0.1 else ""),

@@ -14,11 +14,14 @@ STILL_SIGMA = (0.3, 2.0)  # 1 sigma within a window: rotors that idle shake the 
 
 
 def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSensor | None) -> None:
-    order = np.diff(stamps) > 0
+    order, shared = np.diff(stamps) > 0, float(np.mean(np.diff(stamps) == 0))
     if not order.all():
         report.say("imu stamps", f"{int((~order).sum())} of {len(stamps)} are not newer than the one before", warning=True)
         keep = np.concatenate([[True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]])
         stamps, imu = stamps[keep], imu[keep]
+    if len(stamps) < 3:
+        report.say("imu stamps", "all are the same: the driver does not stamp", fails=True)
+        return
     rate, jitter = check_rhythm(report, "imu", stamps, least=50.0, wanted=100.0, told=sensor.rate if sensor else None)
     if not np.isfinite(imu).all():
         report.say("imu values", "some are not finite", fails=True)
@@ -37,21 +40,25 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
         clipped = (np.abs(gyro) >= 0.99 * sensor.gyro_range).any(axis=1) | (np.abs(accel) >= 0.99 * sensor.accel_range).any(axis=1)
         if clipped.any():
             report.say("imu range", f"{int(clipped.sum())} samples are at the range of the sensor", warning=True)
-    first, last = longest_still(stamps, imu)
-    duration = 1e-9 * float(stamps[last] - stamps[first]) if last > first else 0.0
+    rests = [(1e-9 * float(stamps[last] - stamps[first]), first, last) for first, last in stretches_at_rest(stamps, imu)]
+    duration, first, last = max(rests, default=(0.0, 0, 0))
     report.figures["still_s"] = duration
-    at_start = last > first and stamps[first] - stamps[0] < 0.5e9
+    at_start = max((still for still, begin, _ in rests if stamps[begin] - stamps[0] < 0.5e9), default=0.0)
     if duration < 0.5:
         report.say("rest", "never still for half a second: VIO has to start in motion, and the biases are learnt on the way", warning=True)
         return
     report.say("rest",
                f"still for {duration:.1f} s from {1e-9 * (stamps[first] - stamps[0]):.1f} s on" +
-               ("" if at_start else ": not at the start, so that VIO begins in motion"),
-               warning=not at_start)
+               (": not at the start, so that VIO begins in motion" if at_start < 0.5 else
+                f", for {at_start:.1f} s at the start" if at_start < duration else ""),
+               warning=at_start < 0.5)
     bias = gyro[first:last].mean(axis=0)
     report.figures |= {"gyro_bias": bias.tolist(), "force_at_rest": float(np.linalg.norm(accel[first:last].mean(axis=0)))}
     report.say("gyro bias", f"{np.linalg.norm(bias):.4f} rad/s at rest", warning=bool(np.linalg.norm(bias) > 0.2))
-    _check_noise(report, imu[first:last], rate, sensor)
+    if shared > 0.01:
+        report.say("noise", f"not judged: {100 * shared:.0f} % of the samples have the stamp of the one before")
+    else:
+        _check_noise(report, imu[first:last], rate, sensor)
 
 
 def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor | None) -> None:
@@ -86,8 +93,8 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
                    warning=density[name] > 2.0 * told)
 
 
-def longest_still(stamps: np.ndarray, imu: np.ndarray) -> tuple[int, int]:
-    """The longest stretch at rest.
+def stretches_at_rest(stamps: np.ndarray, imu: np.ndarray) -> list[tuple[int, int]]:
+    """The stretches at rest, one after the other.
 
     At rest the mean over a window stays what it was. A bias, however large, does not count, nor does the shaking of idling rotors.
 
@@ -96,22 +103,23 @@ def longest_still(stamps: np.ndarray, imu: np.ndarray) -> tuple[int, int]:
         imu: angular rate [rad/s] and specific force [m/s^2], shape (n, 6).
 
     Returns:
-        Index of its first sample, and of the one after its last; equal where there is none.
+        Index of the first sample of each, and of the one after its last.
     """
     edges = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], round(STILL_WINDOW * 1e9)))
     parts = [imu[a:b] for a, b in zip(edges[:-1], edges[1:])]
     if len(parts) < 2:
-        return 0, 0
+        return []
     limit, shaking = np.repeat(STILL_MEAN, 3), np.repeat(STILL_SIGMA, 3)
     quiet = np.array([len(part) > 3 and bool((part.std(axis=0) < shaking).all()) for part in parts])
     means = np.array([part.mean(axis=0) if len(part) else np.full(6, np.nan) for part in parts])
-    best, begin = (0, 0), 0
+    found, begin = [], 0
     for k in range(len(parts) + 1):
         same = k < len(parts) and quiet[k] and (k == begin or bool((np.abs(means[k] - means[begin:k].mean(axis=0)) < limit).all()))
         if not same:
-            best = max(best, (begin, k), key=lambda span: span[1] - span[0])
+            if k > begin:
+                found.append((int(edges[begin]), int(edges[k])))
             begin = k if k < len(parts) and quiet[k] else k + 1
-    return int(edges[best[0]]), int(edges[best[1]])
+    return found
 
 
 def allan_deviation(samples: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:

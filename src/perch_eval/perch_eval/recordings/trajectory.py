@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from perch_core import so3
 from perch_eval.recordings.asl import table
 from perch_eval.recordings.bag import BagRecording
+from perch_eval.recordings.calibration import in_body
 from perch_eval.recordings.recording import Recording, RecordingError
 
 MAX_GAP = 0.15  # poses further apart than this are not interpolated [s]
@@ -51,9 +52,9 @@ class Trajectory:
         """Some of its poses, by index or mask."""
         return Trajectory(self.stamps[rows], self.p[rows], self.q[rows])
 
-    def turned(self, q: np.ndarray) -> Trajectory:
-        """Of other axes in the same body: each attitude times q, xyzw."""
-        return Trajectory(self.stamps, self.p, so3.quat_multiply(self.q, q))
+    def turned(self, q: np.ndarray, p: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> Trajectory:
+        """Of other axes in the same body: of attitude q, xyzw, and at p [m] in these."""
+        return Trajectory(self.stamps, self.p + so3.quat_rotate(self.q, np.asarray(p)), so3.quat_multiply(self.q, q))
 
     def at(self, stamps: np.ndarray) -> tuple[Trajectory, np.ndarray]:
         """Interpolated poses.
@@ -98,7 +99,11 @@ def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
         RecordingError: it cannot be read.
     """
     if given is None:
-        return None if recording.truth is None else read_trajectory(recording.truth)
+        file = recording.truth
+        if file is None:
+            return None
+        T_SI = np.linalg.inv(in_body(file.with_name("sensor.yaml"))) @ in_body(file.parent.with_name("imu0") / "sensor.yaml")
+        return read_trajectory(file).turned(so3.quat_from_matrix(T_SI[:3, :3]), T_SI[:3, 3])
     if Path(given).is_file():
         return read_trajectory(Path(given))
     if isinstance(recording, BagRecording) and given.startswith("/"):
