@@ -455,6 +455,9 @@ def test_below_the_place_of_the_take_off_a_disturbance_is_air():
     flight.follow(flight.path(flight.plant.p, (0, 0, 0.5), 1.5), id=6)
     flight.step(3.0)
     assert flight.state is State.HOVERING and flight.plant.p[2] == pytest.approx(0.5, abs=0.03)
+    flight.order(Command.HOVER)
+    flight.step(0.5)
+    assert flight.state is State.HOVERING, "the ground is not there"
 
 
 def test_abort_brakes_to_a_hover():

@@ -23,7 +23,7 @@ from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
 from perch_control.senses import Senses
-from perch_control.supervisor import LOW, Supervisor, committed
+from perch_control.supervisor import Supervisor, committed
 from perch_control.thrust_belief import ThrustBelief
 
 _SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
@@ -207,7 +207,7 @@ class FlightController:
     def _stopped(self, x: FlightState, reason: str) -> FlightState:
         """Brake to a hover in which nothing waits to be flown; where that would touch the ground, land."""
         self._schedule.drop()
-        if x.belief[2] - x.ground < LOW:
+        if x.low:
             return landing(x, f"landing: {reason}", self.settings.land_speed)
         return stopped(x, reason)
 

@@ -16,6 +16,7 @@ from perch_control.reference import Setpoint, Source
 from perch_control.rotor_lag import RotorEstimate
 
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
+_LOW = 0.25           # what ends nearer to the ground lands: a hover would touch it [m]
 AIRBORNE = 0.1        # so far above where it was armed, the ground no longer carries the vehicle [m]
 _AWAY = 2.0           # radii of the body from the place of a contact at which nothing there holds the vehicle
 
@@ -89,6 +90,11 @@ class FlightState(NamedTuple):
     def at_ground(self) -> bool:
         """The ground may carry the vehicle: it has not left it yet, or is on the way down to it."""
         return not (self.airborne and self.mode in (State.TRACKING, State.HOVERING)) and self.belief[2] - self.ground < AIRBORNE
+
+    @property
+    def low(self) -> bool:
+        """The ground on which it was armed is too near for a hover; what is further below is not on it."""
+        return abs(self.belief[2] - self.ground) < _LOW
 
     @property
     def elapsed(self) -> float:

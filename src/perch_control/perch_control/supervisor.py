@@ -23,7 +23,6 @@ _MISSED_SPEED = 1.0  # faster than this after the planned contact: it was missed
 _GROUND_GAP = 0.12   # the descending reference is so far below the vehicle ... [m]
 _GROUND_SPEED = 0.1  # ... not moving faster than this up or down ... [m/s]
 _GROUND_TIME = 0.25  # ... for so long: on the ground [s]
-LOW = 0.25           # what ends nearer to the ground lands: a hover would touch it [m]
 _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
 
 
@@ -97,7 +96,7 @@ class Supervisor:
         if source.finished:
             if source.lands:
                 return landing(x, "landing after the recovery", self.settings.land_speed)
-            if x.belief[2] - x.ground < LOW:
+            if x.low:
                 return landing(x, "landing: the recovery ended at the ground", self.settings.land_speed)
             return settled(x, "recovered: hovering")
         if x.elapsed > TIMEOUT:
