@@ -92,10 +92,17 @@ def test_the_command(files, tmp_path, capsys):
     for arguments, words in ((["euroc", str(files)], "mav0"), (["kalibr", str(files / "mine.yaml")], "no cam0"),
                              (["kalibr", str(tmp_path / "none.yaml")], "cannot be read"),
                              (["euroc", str(files / "asl"), "--rename", "left=down"], "--rename"),
+                             (["euroc", str(files / "asl"), "--rename", "cam0=down", "cam0=front"], "two to one"),
                              (["euroc", str(files / "asl"), "--imu-orientation", "0", "0", "0", "0"], "--imu-orientation")):
         assert sensors_command.main(["import", *arguments]) == 2
         said = capsys.readouterr().err.strip().splitlines()
         assert len(said) == 1 and words in said[0], said
+
+
+def test_two_cameras_do_not_get_one_name():
+    args = sensors_command.parser().parse_args(["import", "kalibr", "chain.yaml", "--rename", "down=one", "front=one"])
+    with pytest.raises(ConfigError, match="one name to two cameras"):
+        sensors_command._renamed(load_sensors("snapdragon"), args)
 
 
 @pytest.mark.parametrize("old, new, words", [

@@ -58,6 +58,15 @@ def test_a_node_is_no_witness_of_itself_and_routine_names_nobody():
     assert named(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has been silent for 3 s")])[0] == 1.5
 
 
+@pytest.mark.parametrize("node, words, counts", [
+    ("vehicle", "the simulation has stopped at its maximum", False), ("vehicle", "no IMU for 0.2 s", True),
+    ("vehicle", "imu/data_raw: not used", True), ("mission", "no adhesion: hovering at the end of trajectory 3", False),
+    ("mission", "the mission was restarted: the goal is lost", True), ("target_localizer", "looking for the target (no tags seen)", False),
+    ("vio_model", "previous plan refused: no time", False), ("vio_model", "/vio_model was restarted", True)])
+def test_other_words_name_nobody(node, words, counts):
+    assert (named(CASE._replace(node=node), 100.0, [], [(101.0, words)]) is not None) is counts
+
+
 def test_disturbances():
     def passed(fault: str) -> list[int]:
         one = Disturbance()

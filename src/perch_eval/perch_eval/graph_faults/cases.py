@@ -38,17 +38,19 @@ SAFE = ("hovering", "landed", "perched", "motors off")
 NAMED = 5.0  # wall-clock time from the fault within which it is named [s]
 
 WORDS = {
-    "vehicle": r"imu",
-    "vio_model": r"vio",
+    "vehicle": r"\bimu\b|imu/data_raw",
+    "vio_model": r"\bvio",
     "estimator": r"estimator|odometry",
     "target_localizer": r"target",
     "perching_planner": r"plan_perch|planner",
     "controller": r"controller|motor_command|disarmed",
-    "mission": r"mission|trajectory|order",
+    "mission": r"\bmission\b",
 }
 """What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
 _TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|"
                       r"restarted|back)\b", re.IGNORECASE)
+_ROUTINE = re.compile(r"looking for the target|waiting for the estimator$")
+"""What the mission tells of every flight."""
 _LINE = re.compile(r"\[(?P<level>[A-Z]+)\] \[(?P<time>\d{9,}\.\d+)\] \[(?P<node>[\w.]+)\]: (?P<text>.*)")
 
 
@@ -129,7 +131,7 @@ def named(case: Case, struck: float, lines: Iterable[str], said: Iterable[tuple[
     """
     words = re.compile(WORDS[case.node], re.IGNORECASE)
     found = [(time - struck, f"pilot: {text}") for time, text in said
-             if time >= struck and words.search(text) and _TROUBLE.search(text)]
+             if time >= struck and words.search(text) and _TROUBLE.search(text) and not _ROUTINE.match(text)]
     for line in filter(None, map(_LINE.match, lines)):
         after, text = float(line["time"]) - struck, line["text"]
         if line["node"] != case.node and after >= 0.0 and words.search(text) and (_TROUBLE.search(text) or line["level"] != "INFO"):

@@ -93,6 +93,8 @@ def _renamed(sensors, args: argparse.Namespace):
     for old, new in names.items():
         if old not in sensors.cameras or not new.isidentifier():
             raise ConfigError("--rename", f"{old}={new}", f"is not OLD=NEW with one of {', '.join(sensors.cameras)}")
+    if len({names.get(name, name) for name in sensors.cameras}) < len(sensors.cameras) or len(names) < len(args.rename):
+        raise ConfigError("--rename", " ".join(args.rename), "gives one name to two cameras, or two to one")
     cameras = {names.get(name, name): camera for name, camera in sensors.cameras.items()}
     return replace(sensors, cameras=cameras, name=args.name or sensors.name)
 
