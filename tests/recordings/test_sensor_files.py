@@ -109,7 +109,8 @@ def test_two_cameras_do_not_get_one_name():
     ("camera_model: pinhole", "camera_model: omni", "camera_model"),
     ("distortion_model: radtan", "distortion_model: fov", "distortion_model"),
     ("resolution: [512, 384]", "resolution: [512]", "resolution"), ("T_cam_imu", "T_other", "T_cam_imu"),
-    ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: late", "timeshift_cam_imu"), ("[300.0,", "[-300.0,", "focal"),
+    ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: late", "timeshift_cam_imu"),
+    ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: 5.0", "timeshift_cam_imu: 5 s is outside"), ("[300.0,", "[-300.0,", "focal"),
     ("0.000000000000000, 1.000000000000000]", "0.000000000000000, 2.000000000000000]", "rigid")])
 def test_calibrations_that_are_none_are_refused(tmp_path, old, new, words):
     chain, _ = photo_flight.kalibr(tmp_path)

@@ -193,7 +193,7 @@ def test_the_vehicle_is_that_of_the_recording_or_of_its_report(reported, tmp_pat
 @pytest.mark.parametrize("options, words", [
     (["--from", "90"], "the flight lasts"),
     (["--fps", "0"], "--fps 0 is not a number > 0"),
-    (["--out", "x.avi"], "neither .gif nor .mp4"),
+    (["--out", "x.avi"], "none of .gif, .mp4 and .png"),
     (["--speed", "inf"], "--speed inf is not a number > 0"),
     (["--vehicle", "zeppelin"], "zeppelin"),
 ])

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from perch_core import so3
 from perch_eval.flight import States
@@ -14,6 +15,7 @@ from perch_eval.flight_view import ESTIMATE, LIMIT, PAD, TRUTH, WANTED, FlightVi
 from perch_eval.metrics import thrust_history, tilt_degrees, touch_of
 
 RUNNING = 1  # state in perch_msgs/EstimatorStatus
+ARROW = 0.2  # length of a thrust direction [m]
 BEFORE, AFTER = 0.3, 0.7  # shown around the perch [s]
 
 
@@ -55,10 +57,10 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
             keep = (line.t >= low) & (line.t <= high)
             axis.plot(line.t[keep], line.y[keep], line.style, color=line.colour, lw=line.width, label=line.label or None)
         for bound in bounds:
-            axis.axhline(bound, color=LIMIT, lw=0.8, ls="--")
-        for time, colour, style in _marks(views):
+            axis.axhline(bound, color=LIMIT, lw=0.8, ls="--", label="bounds" if bound == bounds[0] else None)
+        for time, colour, style, name in _marks(views):
             if low <= time <= high:
-                axis.axvline(time, color=colour, lw=0.8, ls=style)
+                axis.axvline(time, color=colour, lw=0.8, ls=style, label=name or None)
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     if grid[0, 0].get_legend_handles_labels()[1]:
@@ -73,12 +75,12 @@ def _zero(views: Views, view: FlightView) -> float:
     return 0.0 if len(views) == 1 else view.start
 
 
-def _marks(views: Views) -> list[tuple[float, str, str]]:
-    """Time [s], colour and style of vertical lines: the perch begins, and the contact; of several flights the end of each."""
+def _marks(views: Views) -> list[tuple[float, str, str, str]]:
+    """Time [s], colour, style and label of vertical lines: the perch begins, and the contact; of several flights the end of each."""
     if len(views) > 1:
-        return [(view.end - view.start, view.colour, ":") for view in views]
+        return [(view.end - view.start, view.colour, ":", "") for view in views]
     touch = touch_of(views[0].flight)
-    return [(views[0].start, "0.7", "-"), *([(touch[0], LIMIT, "--")] if touch is not None else [])]
+    return [(views[0].start, "0.7", "-", "perch begins"), *([(touch[0], "k", "-.", "contact")] if touch is not None else [])]
 
 
 def _states(views: Views, pick: Callable[[States], np.ndarray], estimate: bool = True) -> list[Line]:
@@ -139,7 +141,7 @@ def error_figure(view: FlightView) -> Figure | None:
     t, error = np.array([t for t, _ in shown]), estimate.p - view.truth.at(estimate.t).p
     return panels([view], [(f"error {name}, 3 sigma [cm]", [
         Line(estimate.t, 100 * error[:, i], TRUTH, "estimate - truth", width=1.0),
-        *(Line(t, sign * 300 * sigma[:, i], LIMIT, style="--", width=0.7) for sign in (-1, 1))]) for i, name in enumerate("xyz")], 3, 2.8,
+        *(Line(t, sign * 300 * sigma[:, i], LIMIT, label, "--", 0.7) for sign, label in ((-1, "3 sigma"), (1, "")))]) for i, name in enumerate("xyz")], 3, 2.8,
         span=(float(began), float(estimate.t[-1])))
 
 
@@ -172,11 +174,14 @@ def path_figure(*views: FlightView) -> Figure:
             if states is not None:
                 keep = (states.t >= view.start - BEFORE) & (states.t <= view.end + 0.3)
                 axis.plot(states.p[keep, :2] @ along, states.p[keep, 2], color=colour, lw=width, label=label)
-        p, b3 = view.truth.p[keep], so3.quat_rotate(view.truth.q[keep], np.array([0.0, 0.0, 1.0]))
-        every = slice(None, None, max(1, len(p) // 28))
-        axis.quiver(p[every, :2] @ along, p[every, 2], b3[every, :2] @ along, b3[every, 2], width=0.004, scale=14,
+        p, b3 = (v[::max(1, keep.sum() // 28)] for v in (
+            view.truth.p[keep], ARROW * so3.quat_rotate(view.truth.q[keep], np.array([0.0, 0.0, 1.0]))))
+        axis.quiver(p[:, :2] @ along, p[:, 2], b3[:, :2] @ along, b3[:, 2], width=0.004, angles="xy", scale_units="xy", scale=1.0,
                     color=ESTIMATE if len(views) == 1 else view.colour, label=f"{name}b3")
+        axis.update_datalim(np.stack([(p + b3)[:, :2] @ along, (p + b3)[:, 2]], axis=1))
     axis.set_aspect("equal", adjustable="datalim")
+    for k, ends in enumerate(views[0].cables):  # drawn as far as the path is shown
+        axis.add_artist(Line2D(ends[:, :2] @ along, ends[:, 2], color="k", marker="o", ms=5, label="" if k else "cable"))
     axis.set(xlabel="along the perch [m]", ylabel="z [m]")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)

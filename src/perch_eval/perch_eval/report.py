@@ -132,7 +132,7 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
     if contact := report.get("contact"):
         rows.append(("contact", f"{contact['state']} at {contact['time']:.3f} s: {contact['normal_speed_m_s']:.2f} m/s normal, "
                                 f"{contact['tangential_speed_m_s']:.2f} m/s tangential, tilt error {contact['tilt_error_deg']:.1f} deg, "
-                                f"{100 * contact['offset_m']:.1f} cm from the centre {contact['reason']}".rstrip()))
+                                f"{100 * contact['offset_m']:.1f} cm from the perch point {contact['reason']}".rstrip()))
     if report["recording_damage"]:
         rows.append(("recording", f"cut off or damaged ({report['recording_damage']}): the figures are of what can be read"))
     for kind in ("tracking", "estimation"):
@@ -179,5 +179,5 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
         section("What the cameras saw", clip(flight), "No images were recorded."),
         *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
-        section("Durations that the nodes measured", table(timings)), section("Diagnostics of the last second", table(last_diagnostics(flight))),
+        section("Times that the nodes measured", table(timings)), section("Diagnostics of the last second", table(last_diagnostics(flight))),
         heading=Html(f'{text(title)}: <span class="{good}">{text(report["outcome"])}</span>'))

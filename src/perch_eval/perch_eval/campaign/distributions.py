@@ -30,6 +30,10 @@ class Distribution:
     low: float = -np.inf
     high: float = np.inf
 
+    def __str__(self) -> str:
+        limits = f", within [{self.low:g}, {self.high:g}]" if np.isfinite([self.low, self.high]).any() else ""
+        return f"{self.kind} {list(self.values)}{limits}"
+
     def draw(self, rng: np.random.Generator) -> Any:
         """One value; a grid is not drawn but gone through."""
         if self.kind == "choice":

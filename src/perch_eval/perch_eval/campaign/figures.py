@@ -104,6 +104,11 @@ def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]
         edges = np.linspace(min(0.0, min(everything)), max(top, 1e-9), 25)
         axes.hist([np.minimum(group, edges[-1]) for group in groups], bins=edges, stacked=True, color=[GOOD, BAD],
                   label=["perched", "failed"])
-        axes.axvline(float(np.median(everything)), color="k", lw=0.8, ls="--")
+        axes.axvline(float(np.median(everything)), color="k", lw=0.8, ls="--", label="median")
+        axes.yaxis.get_major_locator().set_params(integer=True)
+        if max(everything) > edges[-1]:
+            axes.set_title(f"{title}; last bar: and above", fontsize=9)
     figure.axes[0].legend(fontsize=8)
+    for k in range(rows):
+        figure.axes[columns * k].set_ylabel("flights")
     return figure

@@ -51,7 +51,7 @@ def _facts(campaign: Campaign, found: Sequence[RunResult], rate: Rate) -> str:
         ("engine", campaign.engine + (f", cameras: vio {campaign.sensing.vio}, target {campaign.sensing.target}"
                                       if campaign.engine == "in_process" else "")),
         ("time of the workers", f"{wall:.0f} s, {wall / max(len(found), 1):.1f} s per flight"),
-        ("varied", "; ".join(f"{name}: {d.kind} {list(d.values)}" for name, d in campaign.vary.items()) or "the seed"),
+        ("varied", "; ".join(f"{name}: {d}" for name, d in campaign.vary.items()) or "the seed"),
         ("settings", f"SHA-256 {campaign.digest[:16]}")])
 
 

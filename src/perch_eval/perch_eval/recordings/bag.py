@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
@@ -45,7 +46,7 @@ class BagRecording(Recording):
             self._broke_off = self.damage = make_whole(path, self._readable)
         with self._open() as reader:
             kinds = {c.topic: c.msgtype for c in reader.connections}
-            counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+            self._counts = counts = {topic: info.msgcount for topic, info in reader.topics.items()}
         if self._broke_off and not counts:
             raise RecordingError(f"{path}: cannot be read: {self._broke_off}")
         pictures = {topic for topic, kind in kinds.items() if kind in IMAGES}
@@ -71,7 +72,7 @@ class BagRecording(Recording):
         sources = {topic: name for name, topic in self._cameras.items()}
         if self._imu:
             sources[self._imu] = IMU
-        unusable: list[str] = []
+        unusable: Counter[tuple[str, str]] = Counter()
         self.damage = self._broke_off
         with self._open() as reader:
             messages = reader.messages([c for c in reader.connections if c.topic in sources])
@@ -82,14 +83,14 @@ class BagRecording(Recording):
                 except StopIteration:
                     break
                 except PerchError as error:
-                    unusable.append(f"{connection.topic}: {error}")
+                    unusable[connection.topic, str(error)] += 1
                     continue
                 except Exception as error:  # whatever the libraries make of a damaged file
                     self.damage = f"{type(error).__name__}: {error}"
                     break
                 yield Event(sources[connection.topic], arrived, value)
-        if unusable:
-            self.damage = f"{len(unusable)} messages cannot be used, the first: {unusable[0]}" + (f"; {self.damage}" if self.damage else "")
+        words = [f"{n} of {self._counts[topic]} messages of {topic} cannot be used: {error}" for (topic, error), n in unusable.most_common(1)]
+        self.damage = "; ".join(filter(None, [*words, self.damage]))
 
     def poses(self, topic: str) -> list[tuple[Any, ...]]:
         """(stamp [ns], x, y, z [m], qx, qy, qz, qw) of each message of a topic.

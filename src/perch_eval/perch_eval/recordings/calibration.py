@@ -118,7 +118,10 @@ def _kalibr_camera(source: str, key: str, c: Any, R_BI: np.ndarray) -> dict[str,
     T_CI = _transform(source, f"{key}.T_cam_imu", c["T_cam_imu"])
     out = _camera(source, f"{key}.", c, c.get("distortion_coeffs", []), np.linalg.inv(T_CI), R_BI)
     # Kalibr: t_imu = t_cam + timeshift
-    out["stamp_offset"] = -_number(source, f"{key}.timeshift_cam_imu", c.get("timeshift_cam_imu", 0.0))
+    shift = _number(source, f"{key}.timeshift_cam_imu", c.get("timeshift_cam_imu", 0.0))
+    if abs(shift) > 0.5:
+        raise ConfigError(source, f"{key}.timeshift_cam_imu", f"{shift:g} s is outside [-0.5, 0.5] s")
+    out["stamp_offset"] = -shift
     out["topic"] = str(c.get("rostopic", ""))
     return out
 

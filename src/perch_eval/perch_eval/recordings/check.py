@@ -32,7 +32,7 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
         else:
             lookers[event.source].take(event.value, event.arrived)
     if recording.damage:
-        report.say("recording", f"cannot be read to its end: {recording.damage}", warning=True)
+        report.say("recording", recording.damage, warning=True)
     if not stamps:
         report.say("imu", "there is no IMU: only single images can be looked at", warning=True)
     imu = np.array(samples).reshape(-1, 6)

@@ -195,7 +195,7 @@ def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Tra
             told.plots["Error and covariance"] = report.error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
         told.plots["Biases"] = report.bias_figure(perception)
     if frames:
-        told.plots["Tracks"] = report.frames_figure(frames)
+        told.plots["Tracks over time"] = report.frames_figure(frames)
     told.pictures["Tracks"] = perception.vio.gallery.shown
 
 

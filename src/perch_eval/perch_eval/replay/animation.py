@@ -115,9 +115,9 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path) -> 
         PerchError: another ending, or OpenCV has no encoder for MP4.
     """
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
-    if path.suffix not in writers:
-        raise PerchError(f"{path}: the ending is neither .gif nor .mp4")
-    writers[path.suffix](path, fps, counted(_frames(scene, times), len(times), what="frames"))
+    if path.suffix.lower() not in writers:
+        raise PerchError(f"{path}: the ending is none of .gif, .mp4 and .png")
+    writers[path.suffix.lower()](path, fps, counted(_frames(scene, times), len(times), what="frames"))
 
 
 def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:
