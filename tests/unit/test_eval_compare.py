@@ -12,26 +12,9 @@ from unit.recorded_flights import flown, record
 
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison
-from perch_eval.flight import Flight
 from perch_eval.margins import limits, margins
 from perch_eval.report import build_report
 from perch_sim.scenario import load_scenario
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    """The file and the flight of its values."""
-    channels, path = flown(), tmp_path_factory.mktemp("replay") / "flight.mcap"
-    record(path, channels)
-    return path, Flight(channels)
-
-
-@pytest.fixture(scope="module")
-def reported(recorded, tmp_path_factory):
-    """The folder of a flight with its report, and what the report gave."""
-    folder = tmp_path_factory.mktemp("reported")
-    shutil.copy(recorded[0], folder)
-    return folder, build_report(folder, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
 
 
 def test_margins_are_distances_to_the_limits_of_vehicle_and_material(recorded):

@@ -29,25 +29,7 @@ from perch_eval.page import Html, section, table
 from perch_eval.replay import command
 from perch_eval.replay.command import main
 from perch_eval.replay.stroboscope import stroboscope
-from perch_eval.report import build_report
 from perch_eval.ros.recorded_flight import RecordedFlight
-from perch_sim.scenario import load_scenario
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    """The file and the flight of its values."""
-    channels, path = flown(), tmp_path_factory.mktemp("replay") / "flight.mcap"
-    record(path, channels)
-    return path, Flight(channels)
-
-
-@pytest.fixture(scope="module")
-def reported(recorded, tmp_path_factory):
-    """The folder of a flight with its report, and what the report gave."""
-    folder = tmp_path_factory.mktemp("reported")
-    shutil.copy(recorded[0], folder)
-    return folder, build_report(folder, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
 
 
 def test_a_recording_is_the_flight_that_was_flown(recorded):
