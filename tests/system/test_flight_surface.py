@@ -90,7 +90,7 @@ def test_the_recording_opens_as_ros_2_messages(flight):
 def test_the_page_is_complete(flight):
     report, folder = flight
     page = (folder / "report.html").read_text()
-    for title in ("Timeline", "Tracking and estimation", "Body rates", "Thrust against its bounds", "What the cameras saw", "Rates", "Durations"):
+    for title in ("Timeline", "Tracking and estimation", "Body rates", "Thrust against its bounds", "What the cameras saw", "Rates", "Times"):
         assert f"<h2>{title}" in page
     assert page.count("data:image/png;base64,") == 5 and page.count("data:image/webp;base64,") == 1
     assert report["flight_hash"][:16] in page and "attached to pad" in page
