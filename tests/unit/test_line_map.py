@@ -143,7 +143,7 @@ def test_the_width_of_a_wire_before_another_counts_only_where_it_is_its_own(heig
     near, far = WireCurve(np.array([1.0, 0.0, 0.0]), along), WireCurve(np.array([2.0, 0.0, height]), along)
     tracks = [SimpleNamespace(estimate=WireEstimate(w, sigma**2 * np.eye(5), np.ones(4, bool), np.zeros(3), 0.03), extent=(-2.0, 2.0))
               for w in (near, far)]
-    assert meets_another(tracks, 0, observe(np.random.default_rng(0), near, seen_from, radius=width)) is (meets and width > 0.0)
+    assert meets_another(tracks, tracks[0], observe(np.random.default_rng(0), near, seen_from, radius=width)) is (meets and width > 0.0)
 
 
 def test_the_doubt_of_the_cameras_mount_is_counted_once():

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from perch_core.covariance import largest_sigma
 from perch_perception.line_mapping.detection import LEAST_WIDTH, SIGMA
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import WireEstimate
@@ -49,7 +50,7 @@ def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, se
             return np.inf
     middle = float(s[len(s) // 2])
     distance = float(np.linalg.norm(curve.at(middle) - seen.p_WC))
-    unsure = _sigma(estimate, middle) / max(distance, 0.1)
+    unsure = largest_sigma(estimate.point_covariance(middle)) / max(distance, 0.1)
     return float(np.sqrt(np.mean(against.angles**2))) / (np.radians(MAPPED_GATE) + 2.0 * unsure)
 
 
@@ -81,38 +82,34 @@ def _thin(seen: LineObservation) -> float:
     return LEAST_WIDTH / SIGMA * seen.sigma
 
 
-def meets_another(tracks: Sequence[Track], owner: int, seen: LineObservation) -> bool:
+def meets_another(tracks: Sequence[Track], owner: Track, seen: LineObservation) -> bool:
     """Whether another mapped wire may stick out beside the one that was seen: its width is then that of both.
 
     Args:
         tracks: all wires.
-        owner: index of the wire that was seen.
+        owner: the wire that was seen.
         seen: the sighting.
     """
-    own = tracks[owner].estimate
+    own = owner.estimate
     if own is None or seen.width <= 0.0:
         return False
     centre = seen.p_WC[None]
     s = own.curve.nearest(centre, seen.middle[None])
     to = own.curve.at(s) - centre
     distance = float(np.linalg.norm(to))
-    for k, track in enumerate(tracks):
+    for track in tracks:
         other = track.estimate
-        if k == owner or other is None or track.extent is None:
+        if track is owner or other is None or track.extent is None:
             continue
         against = other.curve.offsets(centre, to / distance)
         if against.ahead[0] <= 0.0 or not track.extent[0] - REACH < against.s[0] < track.extent[1] + REACH:
             continue
         apart, half, its = abs(float(against.angles[0])), 0.5 * own.width_from(seen.p_WC), 0.5 * other.width_from(seen.p_WC)
-        unsure = np.hypot(_sigma(own, float(s[0])) / distance, _sigma(other, float(against.s[0])) / float(against.ahead[0]))
+        unsure = np.hypot(largest_sigma(own.point_covariance(float(s[0]))) / distance,
+                          largest_sigma(other.point_covariance(float(against.s[0]))) / float(against.ahead[0]))
         if half - its - unsure < apart < half + its + unsure + _thin(seen):  # neither hidden behind it nor apart from it
             return True
     return False
-
-
-def _sigma(estimate: WireEstimate, s: float) -> float:
-    """1 sigma of the point at s, where it is known worst [m]."""
-    return float(np.sqrt(np.linalg.eigvalsh(estimate.point_covariance(s))[-1]))
 
 
 def associate(tracks: Sequence[Track], seen: Sequence[LineObservation]) -> list[int | None]:

@@ -233,15 +233,14 @@ def _sighting(piece, pixels, edges, rays, spread, camera) -> LineSighting:
 def _width(edges: np.ndarray, camera: Camera) -> float:
     """Angle between the planes that touch a wire on both sides [rad], from its edges in the image (n, 2, 2).
 
-    Seen askew the wire's direction is not that of its image, so the planes are fitted each to its side. 0 where half of the edges
-    are not seen, or the wire is too thin to tell.
+    Seen askew the wire's direction is not that of its image, so the planes are fitted each to its side. 0 where the edges are not
+    known (nan), or the wire is too thin to tell.
     """
-    seen = np.all(np.isfinite(edges), axis=(1, 2))
-    if 2 * seen.sum() <= len(seen):
+    if np.isnan(edges).any():
         return 0.0
     normals = []
     for side in (0, 1):
-        rays = camera.unproject(edges[seen, side])
+        rays = camera.unproject(edges[:, side])
         normal = np.linalg.eigh(rays.T @ rays)[1][:, 0]
         off = np.abs(rays @ normal)
         rays = rays[off <= 3.0 * np.median(off)]  # where another wire crosses, the edge is that one's

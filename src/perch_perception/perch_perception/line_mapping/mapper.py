@@ -85,7 +85,7 @@ class LineMapper:
             if owner < 0:
                 self._tracks.append(_Track(self._next_id, [one], one))
                 self._next_id += 1
-            elif self._extend(self._tracks[owner], replace(one, width=0.0) if meets_another(self._tracks, owner, one) else one):
+            elif self._extend(self._tracks[owner], one):
                 changed.add(owner)
         for index in sorted(changed):
             self._triangulate(self._tracks[index])
@@ -130,7 +130,7 @@ class LineMapper:
         elsewhere = float(one.middle @ before.middle) < np.cos(np.radians(TURN))
         if not moved and not elsewhere:
             return False
-        track.observations.append(one)
+        track.observations.append(replace(one, width=0.0) if meets_another(self._tracks, track, one) else one)
         if len(track.observations) > MOST_OBSERVATIONS:
             track.observations = _thinned(track.observations)
         return True
