@@ -54,6 +54,15 @@ def test_gripper_misses_outside_each_tolerance(case, word):
     assert not plant.hold.active
 
 
+def test_a_gripper_that_goes_no_deeper_grips_though_the_cable_comes_nearer_from_the_side():
+    """At rest along b3, 3 cm off, and drifting with 0.1 m/s towards the middle of the claw."""
+    R_WB = so3.exp(np.array([0.0, -np.radians(80.0), 0.0]))
+    plant = Plant(SCENARIO, VEHICLE, 1, 0)
+    plant.place(POINT + (VEHICLE.perch_offset + 0.02) * R_WB[:, 2] + 0.02 * R_WB[:, 0], so3.quat_from_matrix(R_WB),
+                0.01 * R_WB[:, 2] - 0.1 * R_WB[:, 0], np.zeros(3), OFF)
+    assert [e.state for e in plant.advance(OFF).contacts] == [ContactState.ATTACHED]
+
+
 def test_a_pass_beyond_reach_is_no_contact():
     assert not [e for e in approach(pitch_deg=0.0, beside=0.5)[1] if e.body == "cable 0"]
 

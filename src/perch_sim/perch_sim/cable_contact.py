@@ -1,8 +1,8 @@
 """Contact with cables: when the gripper closes, and what a cable in the rotors does.
 
-The gripper sits `perch_offset` below the centre of mass and points along -b3; it turns freely about its axis. It closes
-as soon as the cable is in the claw, or comes no nearer, while all tolerances of the scenario hold: position, tilt and
-speed of the gripper against the cable. Tilt is how far b3 is from being square to the cable: the pitch about it is free.
+The gripper sits `perch_offset` below the centre of mass and opens along -b3; it turns freely about its axis. It closes
+as soon as the cable is in the claw, or goes no deeper into it, while all tolerances of the scenario hold: position, tilt
+and speed of the gripper against the cable. Tilt is how far b3 is from being square to the cable: the pitch about it is free.
 A cable that leaves the gripper's reach again without that was missed, and the event tells how it was when nearest.
 """
 
@@ -87,7 +87,6 @@ class CableMonitor:
         self._lines = [CableLine(cable) for cable in cables]
         self._grip, self._offset, self._radii = grip, gripper_offset, np.array(radii, float)
         self._reach = float(self._radii.max())
-        self._before = [math.inf] * len(cables)   # distance one update ago
         self._nearest: list[Contact | None] = [None] * len(cables)  # of this pass
         self._attachment: Attachment | None = None
         self._open = False  # let go, and not yet out of reach of what was held
@@ -121,7 +120,6 @@ class CableMonitor:
                 events += self._within_reach(time, k, x, R_WB, gripper_W, near)
             else:
                 events += self._missed(k)
-            self._before[k] = near.distance
             if self._attachment is not None:
                 break
             # No point of the ellipsoid is further from the gripper than its greatest radius and the gripper's offset.
@@ -143,7 +141,7 @@ class CableMonitor:
         event = self._event(time, ContactState.BOUNCED, k, x, R_WB, near, "")
         speed = math.hypot(event.normal_speed, event.tangential_speed)
         refusal = grip_refusal(near.distance, event.tilt_error, speed, self._grip)
-        if not refusal and (near.distance < TOUCH or near.distance >= self._before[k]):
+        if not refusal and (near.distance < TOUCH or event.normal_speed <= 0.0):
             square = R_WB[:, 2] - (R_WB[:, 2] @ near.direction) * near.direction
             self._attachment = Attachment(time, -1, gripper_W, near.point_W, x[3:7], square / np.linalg.norm(square), np.zeros(3))
             self.hold, self._nearest[k] = self._attachment.hold(time), None

@@ -43,7 +43,7 @@ def flown(start, speed, table, gains, limits, narrow, window, lead, period, vehi
         part = min(max((duration - k * period - lead) / window, 0.0), 1.0)
         cone = narrow + part * (limits[1] - narrow)
         command = control_step(state, reference, speed, command, none, gains,
-                               (limits[0], cone, limits[2], limits[3], limits[4], limits[5]), lead, vehicle)[0]
+                               (limits[0], cone, limits[2], limits[3], limits[4]), lead, vehicle)[0]
         f = thrusts(approached(speed, command, middle), coefficient)
         felt = drag_compensation(state[6:10], state[3:6], vehicle[4], none)
         state = predicted(state, f, felt, period, mass, J, vehicle[2])

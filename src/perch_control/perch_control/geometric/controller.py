@@ -28,7 +28,6 @@ CONTACT_MISS = 0.02       # a contact trajectory is refused where the law misses
 CONTACT_SPEED_MISS = 0.05  # the same for the velocity [m/s]
 THRUST_FLOOR = 0.8        # specific thrust below which a direction is noise [m/s^2]
 ACCELERATION_MAX = 250.0  # bound of the commanded angular acceleration: what the rotors of snapdragon.yaml can do [rad/s^2]
-FEEDBACK_RATE = 0.0       # share of the feedback's own derivative in the commanded rates: an estimated velocity is too noisy for it
 
 
 def packed_vehicle(vehicle: Vehicle) -> tuple:
@@ -91,7 +90,7 @@ class GeometricController(Law):
         return ControlOutput(*out[:6])
 
     def _limits(self, cone: float) -> tuple[float, ...]:
-        return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX, FEEDBACK_RATE)
+        return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX)
 
     def believe(self, vehicle: Vehicle) -> None:
         """Fly a vehicle that differs from the one at the start in its thrust."""

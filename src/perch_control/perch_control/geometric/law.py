@@ -1,9 +1,7 @@
 """One step of geometric tracking control on SE(3), scalar by scalar. [M:eq2, M:eq12, M:eq13]
 
 The commanded attitude follows from the force f that position feedback and feed-forward demand; the commanded body rates
-and angular accelerations are those with which the reference's force turns, or a share (1: all) of those that follow from
-f' and f'' with the derivatives of the feedback, so that the attitude loop is fed forward with what the position loop is
-about to demand.
+and angular accelerations are those with which the reference's force turns.
 
 All arguments and results are tuples of floats (see `vector3`); accelerations and forces are per unit of mass.
 """
@@ -20,12 +18,8 @@ from perch_core.vehicle import GRAVITY
 
 @compiled
 def position_feedback(e_p, e_v, k_p, k_v, bound):
-    """Acceleration demanded by the errors, bounded, and whether the bound acts. [M:eq2]"""
-    fb = axpy(-1.0, times(k_p, e_p), scale(-1.0, times(k_v, e_v)))
-    n = norm(fb)
-    if n > bound:
-        return scale(bound / n, fb), True
-    return fb, False
+    """Acceleration demanded by the errors, bounded. [M:eq2]"""
+    return limited(axpy(-1.0, times(k_p, e_p), scale(-1.0, times(k_v, e_v))), bound)
 
 
 @compiled
@@ -44,7 +38,7 @@ def force_about(a_ref, feedback, axis, tilt_tangent, floor):
         floor: least part of f along the axis [m/s^2].
 
     Returns:
-        f (3), its part along the axis [m/s^2], whether the cone acts.
+        f (3), its part along the axis [m/s^2].
     """
     total = (a_ref[0] + feedback[0], a_ref[1] + feedback[1], a_ref[2] + feedback[2] + GRAVITY)
     along = dot(total, axis)
@@ -53,8 +47,8 @@ def force_about(a_ref, feedback, axis, tilt_tangent, floor):
     limit = tilt_tangent * min(along / GRAVITY, 1.0)
     width, limit = norm(across), limit * along
     if width > limit:
-        return axpy(along, axis, scale(limit / width, across)), along, True
-    return axpy(along, axis, across), along, False
+        across = scale(limit / width, across)
+    return axpy(along, axis, across), along
 
 
 @compiled
@@ -99,18 +93,17 @@ def moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, dw_extra):
 
 
 @compiled
-def geometric_step(state, reference, thrust, extra, gains, limits, J):
+def geometric_step(state, reference, extra, gains, limits, J):
     """Wanted specific thrust and moment. [defines M:eq2] [M:eq12, M:eq13]
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
         reference: p, v, a, j, s in W, then b2_des and b3 (zero: follows from the force) with their first two derivatives,
             33 floats.
-        thrust: specific thrust that acts now [m/s^2], for the derivative of the feedback.
         extra: acceleration in W and angular acceleration in B that make up for known disturbances, 6 floats.
         gains: k_p, k_v, k_R, k_w, 12 floats.
         limits: bound of the position feedback [m/s^2], tangent of its cone, floor of the specific force [m/s^2],
-            bounds of commanded rates [rad/s] and accelerations [rad/s^2], share of the feedback's own rate, 6 floats.
+            bounds of commanded rates [rad/s] and accelerations [rad/s^2], 5 floats.
         J: principal moments of inertia [kg m^2], 3 floats.
 
     Returns:
@@ -132,19 +125,11 @@ def geometric_step(state, reference, thrust, extra, gains, limits, J):
     elif not carried:  # in free fall: no direction, and no rotation
         axis = B3
     e_p, e_v = axpy(-1.0, p_r, p), axpy(-1.0, v_r, v)
-    feedback, bounded = position_feedback(e_p, e_v, k_p, k_v, limits[0])
-    f, along, cut = force_about(a_r, axpy(1.0, feedback, extra[0:3]), axis, limits[1], limits[2])
+    feedback = position_feedback(e_p, e_v, k_p, k_v, limits[0])
+    f, along = force_about(a_r, axpy(1.0, feedback, extra[0:3]), axis, limits[1], limits[2])
 
     # f turns as the reference's does, however much thrust the feedback adds or takes away.
     df, ddf = scale(along, daxis), scale(along, ddaxis)
-    if limits[5] > 0.0 and specific > limits[2] and not (carried or bounded or cut):
-        # e_p' = e_v; e_v' = a - a_r with the thrust that acts; e_v'' along the same lines.
-        e_a = axpy(thrust, B3, scale(-1.0, (a_r[0] + extra[0], a_r[1] + extra[1], a_r[2] + GRAVITY + extra[2])))
-        db3 = axpy(w[1], B1, scale(-w[0], B2))
-        e_j = axpy(thrust, db3, scale(-1.0, jerk))
-        whole = axpy(-1.0, times(k_p, e_v), axpy(-1.0, times(k_v, e_a), jerk))
-        whole2 = axpy(-1.0, times(k_p, e_a), axpy(-1.0, times(k_v, e_j), snap))
-        df, ddf = axpy(limits[5], axpy(-1.0, df, whole), df), axpy(limits[5], axpy(-1.0, ddf, whole2), ddf)
 
     n = cross(h, f)
     if dot(n, n) < 1e-4 * dot(f, f):  # b2_des within 0.6 degrees of the thrust: keep the present heading instead

@@ -113,10 +113,9 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
     f_mid = thrusts(approached(speed, command, half), coefficient)
     felt = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
     ahead = predicted(state, f_mid, felt, lead, mass, J, vehicle[2])
-    specific = (f_mid[0] + f_mid[1] + f_mid[2] + f_mid[3]) / mass
     # The wanted velocity, not the measured one: its noise would come back as thrust.
     extra = drag_compensation(ahead[6:10], reference[3:6], vehicle[4], extra)
-    thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, specific, extra, gains, limits, J)
+    thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, extra, gains, limits, J)
     wrench = (mass * thrust, M[0], M[1], M[2])
     out, f = rotors_for(wrench, speed, vehicle, lead)
     return out, wrench, f, q_C, w_C, dw_C, ahead
