@@ -39,7 +39,7 @@ class Mission:
         self.clock = self.node.create_publisher(topics.message_type("/clock"), "/clock", topics.topic("/clock").qos.publish)
         self.diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", topics.topic("/diagnostics").qos.publish)
         self.goal, self.finish, self.cancelled = None, threading.Event(), threading.Event()
-        self.error_code, self.time = 0, 1.0
+        self.error_code, self.time, self.obeys = 0, 1.0, True
         self.passes, self.begins, self.ended = threading.Event(), threading.Event(), threading.Event()
         self.server = ActionServer(self.node, Perch, "perch", self._execute, cancel_callback=self._cancel, callback_group=group)
         self.node.create_service(PlanPerch, "plan_perch", lambda request, response: response, callback_group=group)
@@ -61,7 +61,8 @@ class Mission:
 
     def _cancel(self, _):
         self.cancelled.set()
-        self.finish.set()
+        if self.obeys:
+            self.finish.set()
         return CancelResponse.ACCEPT
 
     def _execute(self, handle):
@@ -198,6 +199,24 @@ def test_a_flight_past_its_time_limit_is_cancelled(mission, pilot):
     mission.passes.set()
     result = pilot.fly(dataclasses.replace(SCENARIO, time_limit=1.5))
     assert mission.cancelled.is_set() and result.outcome == "timeout"
+
+
+def test_a_mission_that_does_not_end_a_cancelled_goal_ends_the_wait(mission, pilot, monkeypatch):
+    monkeypatch.setattr(client_module, "CANCEL_PATIENCE", 1.0)
+    mission.obeys = False
+    mission.passes.set()
+    with pytest.raises(PerchError, match="has not ended the goal in 1 s since it was cancelled"):
+        pilot.fly(dataclasses.replace(SCENARIO, time_limit=1.5))
+    mission.finish.set()
+    mission.ended.wait(60.0)
+
+
+def test_a_mission_that_is_restarted_before_it_answers_has_lost_the_goal(mission, pilot, monkeypatch):
+    found = iter([{b"first"}])
+    monkeypatch.setattr(pilot, "_servers", lambda: next(found, {b"second"}))
+    monkeypatch.setattr(pilot._client, "send_goal_async", lambda *_, **__: rclpy.task.Future())
+    with pytest.raises(PerchError, match="the mission was restarted: the goal is lost"):
+        pilot.fly(SCENARIO, stall=1000.0)
 
 
 def test_ctrl_c_ends_the_wait(mission, pilot):

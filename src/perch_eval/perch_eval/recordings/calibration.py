@@ -68,9 +68,9 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         "cameras": {}
     }
     imu = root / "imu0" / "sensor.yaml"
-    T_BI = in_body(imu)
+    T_BI, content = _placed(imu)
     if imu.is_file():
-        out["imu"] = _imu(str(imu), _mapping(imu), R_BI)
+        out["imu"] = _imu(str(imu), content, R_BI)
     for file in sorted(root.glob("cam*/sensor.yaml")):
         c, source = _mapping(file), str(file)
         T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
@@ -86,8 +86,13 @@ def in_body(file: Path) -> np.ndarray:
     Raises:
         ConfigError: it cannot be read, or is no rigid transform.
     """
+    return _placed(file)[0]
+
+
+def _placed(file: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """T_BS of a `sensor.yaml`, and what it says; a file that is not there says nothing."""
     content = _mapping(file) if file.is_file() else {}
-    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist()))
+    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist())), content
 
 
 def to_yaml(sensors: Sensors, comment: str = "") -> str:

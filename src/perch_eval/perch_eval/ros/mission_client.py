@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerli
 """Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
 STALL = 60.0            # without progress or an answer of the mission [s]
 START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
+CANCEL_PATIENCE = 60.0  # simulation time that the mission has to end a cancelled goal: to leave a perch, or to descend [s]
 LOOK = 0.5              # between looks whether the mission that took the goal is still there [s]
 NAMED = 5.0             # time that stands still for so long is explained [s]
 SILENT = 3.0            # a node of which `/diagnostics` has brought nothing for so long is named [s]
@@ -130,7 +132,7 @@ class MissionClient(GraphNode):
             stall: wall-clock time without progress of simulation time after which the flight has failed [s].
 
         Raises:
-            PerchError: the mission does not answer, refuses the goal, or simulation time stands still.
+            PerchError: the mission does not answer, refuses the goal, is gone, or does not end a cancelled one; simulation time stands still.
         """
         seen = ("", "")
 
@@ -146,14 +148,19 @@ class MissionClient(GraphNode):
             if node in scenario.nodes:
                 offered = partial(self.node.count_services, self.node.resolve_service_name(service))
                 self._spin_until(offered, check, START_PATIENCE, f"{node} does not offer {service}")
-        progress = _Progress(self._time)
+        progress, servers = _Progress(self._time), self._servers()
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
-        self._spin_until(sent.done, check, stall, "the mission does not answer to the goal")
+
+        def answered() -> bool:
+            self._look_around(servers, scenario.nodes)
+            return bool(sent.done())
+
+        self._spin_until(answered, check, stall, "the mission does not answer to the goal")
         handle = sent.result()
         if not handle.accepted:
             raise PerchError("the mission refused the goal: it is flying another one")
         result = handle.get_result_async()
-        cancelled, servers = False, self._servers()
+        cancelled = math.inf
         while not result.done():
             self.spin(0.05)
             check()
@@ -165,13 +172,15 @@ class MissionClient(GraphNode):
                 on_phase(self._time, "waiting", f"simulation time stands still: {self._whom()}")
             if still > (stall if self._time > 0.0 else START_PATIENCE):
                 raise PerchError(f"simulation time has stood still at {self._time:.3f} s for {still:.0f} s: {self._whom()}")
-            if self._time - progress.start > scenario.time_limit and not cancelled:
-                cancelled = True
+            if self._time - cancelled > CANCEL_PATIENCE:
+                raise PerchError(f"the mission has not ended the goal in {CANCEL_PATIENCE:g} s since it was cancelled")
+            if self._time - progress.start > scenario.time_limit and cancelled == math.inf:
+                cancelled = self._time
                 on_phase(self._time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
                 handle.cancel_goal_async()
         answer = result.result().result
         outcome = outcome_of(answer.error_code, scenario)
-        if cancelled and outcome == "cancelled":
+        if cancelled < math.inf and outcome == "cancelled":
             outcome = "timeout"
         return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - progress.began, progress.start)
 
