@@ -64,8 +64,8 @@ ANIMATED = ("powerline",)
 
 
 def _apply(mapping: dict, changes: list[str]) -> None:
-    """Put `key=value` pairs into the section `settings`."""
-    from perch_core.config import parse_yaml
+    """Put `key=value` pairs into the section `settings`; dots lead into groups."""
+    from perch_core.config import flattened, nested, parse_yaml
     from perch_core.errors import ConfigError
 
     for change in changes:
@@ -75,7 +75,7 @@ def _apply(mapping: dict, changes: list[str]) -> None:
         settings = mapping.get("settings") or {}
         if not isinstance(settings, dict):
             return  # refused with the rest of the file
-        mapping["settings"] = {**settings, key: parse_yaml(value, f"--set: {change}")}
+        mapping["settings"] = nested(flattened(settings) | {key: parse_yaml(value, f"--set: {change}")})
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from perch_setup import ROOT, command_parser, enter
 
 EXAMPLES = """examples:
   python3 scripts/run_node.py vehicle
-  python3 scripts/run_node.py controller --ros-args -r __ns:=/quad1 -p type:=nmpc
+  python3 scripts/run_node.py controller --ros-args -r __ns:=/quad1 -p controller.type:=nmpc
   python3 scripts/run_node.py betaflight --ros-args -p vehicle:=my_vehicle.yaml -p link:=/dev/ttyACM0@115200
   python3 scripts/run_node.py estimator --no-config --ros-args --params-file my.yaml
 """

@@ -29,7 +29,7 @@ Values beyond these limits are refused by every node, in one form:
 
 Not finite is outside every range. What depends on the present is judged by the node that knows it: stamps (far from the newest ones of
 their stream), frames, what a vehicle can do, where and when a trajectory begins. A planner has no clock: its plan begins when the request
-says, and the controller refuses a trajectory that begins more than 60 s ahead, or longer ago than `start_late`.
+says, and the controller refuses a trajectory that begins more than 60 s ahead, or more than 0.5 s ago.
 """
 
 

@@ -31,7 +31,7 @@ class PowerlineMapperConfig:
     camera: str = config.text("front", doc="camera of the vehicle, colour for red wires; its images are on camera_<name>/image_raw")
     images: str = images_parameter()
     extrinsics: str = extrinsics_parameter()
-    rate: float = config.quantity(10.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
+    rate: float = config.quantity(15.0, unit="Hz", above=0.0, high=60.0, doc="images used per second")
     detection: LineDetectionConfig = config.part(LineDetectionConfig)
     mapper: MapperConfig = config.part(MapperConfig)
 

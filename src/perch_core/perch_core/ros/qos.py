@@ -1,9 +1,9 @@
 """The QoS profiles of the graph, by purpose.
 
-Publishers are reliable: a reliable publisher serves best-effort subscribers too. Subscribers to sensors and states are best
-effort, so that camera drivers, which publish best effort, are heard as well, and the newest is worth more than the complete;
-those to orders are reliable. What a late subscriber must know (facts, the newest map) is transient local; orders are not: a
-restarted controller must not carry out an old one.
+Publishers are reliable: a reliable publisher serves best-effort subscribers too. Subscribers to sensors, images and the
+clock are best effort, so that drivers, which publish best effort, are heard as well, and the newest is worth more than
+the complete; those to statuses, results of perception and orders are reliable. What a late subscriber must know (facts,
+the newest map) is transient local; orders are not: a restarted controller must not carry out an old one.
 """
 
 from typing import NamedTuple
