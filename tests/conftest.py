@@ -56,7 +56,13 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """`quick` are unit tests of files that neither fly, draw nor start anything, but those that are marked `slow`."""
+    """`quick` are unit tests of files that neither fly, draw nor start anything, but those that are marked `slow`.
+
+    A test for each of no files or rows at all, which pytest would skip, is an error: what it looked for has moved.
+    """
+    empty = [item.nodeid for item in items for mark in item.iter_markers("skip") if "empty parameter set" in str(mark.kwargs.get("reason"))]
+    if empty:
+        raise pytest.UsageError(f"no parameters: {', '.join(empty)}")
     for item in items:
         if is_quick(item.path) and item.get_closest_marker("slow") is None:
             item.add_marker("quick")
