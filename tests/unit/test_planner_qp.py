@@ -89,25 +89,26 @@ def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
 
 def test_solvers_find_the_same_minimum():
     made, rows, _, _ = program(Contact(problem(80.0), PerchSettings(), VEHICLE.perch_offset), np.array([1.2, 0.5]))
-    first, *others = (solved(made, rows, name) for name in solvers.SOLVERS)
-    for other in others:
-        assert other == pytest.approx(first, abs=1e-5)
+    assert set(solvers.SOLVERS) == {"daqp", "osqp"}
+    assert solved(made, rows, "osqp") == pytest.approx(solved(made, rows, "daqp"), abs=1e-5)
 
 
 def test_a_program_that_starts_at_the_multipliers_of_another_has_the_same_minimum():
     """Also where these are of rows that do not matter any more, and where the program has no solution."""
-    rng = np.random.default_rng(1)
+    rng, solvable = np.random.default_rng(1), 0
     for _ in range(50):
         rows = rng.normal(size=(30, 12))
         rows /= np.linalg.norm(rows, axis=1)[:, None]
         lower = rng.uniform(-1.0, 0.4, 30)
-        cold = solvers.least_norm(rows, lower, lower + 0.5)
-        warm = solvers.least_norm(rows, lower, lower + 0.5, dual=rng.normal(size=30) * (rng.random(30) < 0.3))
+        cold = solvers.least_norm(rows, lower, lower + 1.5)
+        warm = solvers.least_norm(rows, lower, lower + 1.5, dual=rng.normal(size=30) * (rng.random(30) < 0.3))
         assert warm.solved == cold.solved
         if cold.solved:
             assert np.abs(warm.w - cold.w).max() < 1e-9
-            again = solvers.least_norm(rows, lower, lower + 0.5, dual=cold.dual)
-            assert np.array_equal(np.sign(again.dual), np.sign(cold.dual))
+            again = solvers.least_norm(rows, lower, lower + 1.5, dual=cold.dual)
+            assert np.array_equal(np.sign(again.dual), np.sign(cold.dual)) and cold.dual.any()
+            solvable += 1
+    assert 20 < solvable < 50, "both kinds are met"
 
 
 def test_multipliers_follow_the_keys_of_their_rows():
