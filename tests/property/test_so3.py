@@ -1,7 +1,7 @@
 """Rotations against scipy and against finite differences."""
 
 import numpy as np
-from hypothesis import given, strategies as st
+from hypothesis import assume, given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from perch_core import so3
@@ -18,22 +18,22 @@ def rotvec(axis, angle):
 def test_exp_and_log_agree_with_scipy(axis, angle):
     phi = rotvec(axis, angle)
     R = Rotation.from_rotvec(phi)
-    assert np.allclose(so3.exp(phi), R.as_matrix(), atol=1e-12)
-    assert np.allclose(so3.log(R.as_matrix()), phi, atol=1e-7)
-    assert np.allclose(so3.quat_exp(phi), R.as_quat(canonical=True), atol=1e-12)
+    assert np.allclose(so3.exp(phi), R.as_matrix(), rtol=0.0, atol=1e-12)
+    assert np.allclose(so3.log(R.as_matrix()), phi, rtol=0.0, atol=1e-7)
+    assert np.allclose(so3.quat_exp(phi), R.as_quat(canonical=True), rtol=0.0, atol=1e-12)
 
 
 @given(axes, st.sampled_from([0.0, 1e-12, 1e-9, 1e-7, 9e-7, 1.1e-6, 1e-4, 9e-3, 1.1e-2]))
 def test_small_angles_keep_precision(axis, angle):
     phi = rotvec(axis, angle)
     assert np.allclose(so3.quat_log(so3.quat_exp(phi)), phi, rtol=1e-9, atol=1e-16)
-    assert np.allclose(so3.exp(phi), Rotation.from_rotvec(phi).as_matrix(), atol=1e-15)
+    assert np.allclose(so3.exp(phi), Rotation.from_rotvec(phi).as_matrix(), rtol=0.0, atol=1e-15)
 
 
 @given(axes)
 def test_half_turns(axis):
     R = Rotation.from_rotvec(rotvec(axis, np.pi)).as_matrix()
-    assert np.allclose(so3.exp(so3.log(R)), R, atol=1e-7)
+    assert np.allclose(so3.exp(so3.log(R)), R, rtol=0.0, atol=1e-7)
 
 
 @given(axes, angles, axes, angles)
@@ -41,16 +41,24 @@ def test_quaternions_compose_like_matrices(a, alpha, b, beta):
     qa, qb = so3.quat_exp(rotvec(a, alpha)), so3.quat_exp(rotvec(b, beta))
     v = np.array([0.3, -1.2, 2.0])
     Ra, Rb = so3.quat_to_matrix(qa), so3.quat_to_matrix(qb)
-    assert np.allclose(so3.quat_to_matrix(so3.quat_multiply(qa, qb)), Ra @ Rb, atol=1e-12)
-    assert np.allclose(so3.quat_rotate(qa, v), Ra @ v, atol=1e-12)
-    assert np.allclose(so3.quat_multiply(qa, so3.quat_conjugate(qa)), [0, 0, 0, 1], atol=1e-12)
-    assert np.allclose(so3.quat_slerp(qa, qb, 1.0) @ qb, np.sign(so3.quat_slerp(qa, qb, 1.0) @ qb), atol=1e-7)
+    assert np.allclose(so3.quat_to_matrix(so3.quat_multiply(qa, qb)), Ra @ Rb, rtol=0.0, atol=1e-12)
+    assert np.allclose(so3.quat_rotate(qa, v), Ra @ v, rtol=0.0, atol=1e-12)
+    assert np.allclose(so3.quat_multiply(qa, so3.quat_conjugate(qa)), [0, 0, 0, 1], rtol=0.0, atol=1e-12)
+
+
+@given(axes, angles, axes, angles, st.floats(0.0, 1.0))
+def test_between_two_rotations_is_an_even_turn_the_shorter_way(a, alpha, b, beta, share):
+    qa, qb = so3.quat_exp(rotvec(a, alpha)), so3.quat_exp(rotvec(b, beta))
+    turn = (Rotation.from_quat(qa).inv() * Rotation.from_quat(qb)).as_rotvec()
+    assume(np.linalg.norm(turn) < np.pi - 1e-3)  # both ways are as short
+    left = Rotation.from_quat(so3.quat_slerp(qa, qb, share)).inv() * Rotation.from_quat(qa) * Rotation.from_rotvec(share * turn)
+    assert left.magnitude() < 1e-7
 
 
 def test_hat_is_the_cross_product():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 5, 3))
-    assert np.allclose(np.einsum("nij,nj->ni", so3.hat(a), b), np.cross(a, b))
+    assert np.allclose(np.einsum("nij,nj->ni", so3.hat(a), b), np.cross(a, b), rtol=0.0, atol=1e-14)
 
 
 def test_yaw_survives_a_pitch_to_90_degrees():
