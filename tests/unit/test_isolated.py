@@ -156,6 +156,7 @@ def test_jobs_may_come_while_the_runner_looks_through_those_that_wait(jobs: Modu
     first = submit(runner, jobs.double, 1, limit=0.2)
     with pytest.raises(JobStopped):
         first.result(timeout=30)
+    assert len(answers) == 20, "they came while it looked"
     for answer in answers:
         with pytest.raises(JobStopped):
             answer.result(timeout=30)

@@ -77,9 +77,9 @@ def test_a_parameter_file_of_another_form_is_refused(folder, content):
         read_parameters("vehicle")
 
 
-def test_every_parameter_file_of_the_repository_can_be_read():
-    for node in NODES:
-        read_parameters(node)
+@pytest.mark.parametrize("file", sorted(config.config_dir().glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_parameter_file_of_the_repository_is_of_a_node_and_can_be_read(file):
+    assert file.stem in NODES and read_parameters(file.stem)
 
 
 def test_chosen_nodes():

@@ -63,9 +63,15 @@ def test_a_moving_pad_is_told_a_hundred_times_a_second():
 
 
 def test_nothing_is_made_for_nobody():
-    flown = SimulatedVehicle(VehicleParameters(cameras="none"))
-    assert not flown.truth.wanted
-    flown.advance()
+    flown, asked = SimulatedVehicle(VehicleParameters(cameras="none")), {"imu": True, "truth": False, "rotors": False}
+    made = {name: [] for name in asked}
+    for name, wanted in asked.items():
+        emitter = getattr(flown, name)
+        emitter.receivers.append(made[name].append)
+        emitter.asked = lambda wanted=wanted: wanted
+    for _ in range(10):
+        flown.advance()
+    assert {name: len(values) for name, values in made.items()} == {"imu": 10, "truth": 0, "rotors": 0}
 
 
 @pytest.mark.parametrize("speeds, words", [((1.0, float("nan"), 1.0, 1.0), "not finite"), ((500.0,) * 3, "3 entries, needs 4")])
