@@ -215,7 +215,7 @@ def test_a_path_too_straight_to_align_attitudes_by_says_nothing_of_them():
 def test_truth_of_an_imu_that_is_turned_in_the_body_is_turned_with_it():
     truth, q_BI = circle(), np.array([0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
     told = truth.turned(q_BI)  # attitudes of the IMU
-    assert np.degrees(np.abs(evaluate(truth, told).turn).max()) > 80.0 or evaluate(truth, told).final > 0.5
+    assert evaluate(truth, told).final > 0.5  # the heading of the start does not count, and with it the path is turned
     e = evaluate(truth, told.turned(q_BI * [-1, -1, -1, 1]))
     assert e.final < 1e-6 and np.degrees(np.abs(e.turn).max()) < 1e-5
 

@@ -280,7 +280,9 @@ def test_the_layout_shows_what_is_served():
 
 
 def test_every_scenario_has_a_scene_that_can_be_sent():
-    for file in sorted((config.config_dir() / "scenarios").glob("*.yaml")):
+    files = sorted((config.config_dir() / "scenarios").glob("*.yaml"))
+    assert files
+    for file in files:
         scenario = load_scenario(file)
         state = OdometryState(0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, ZERO, ZERO)
         found = world_markers(scenario) + vehicle_markers(load_vehicle(scenario.vehicle), state, "hovering")

@@ -135,9 +135,8 @@ def test_the_ground_tells_nothing_and_breaks_nothing():
 
 def test_the_same_frames_give_the_same_bits():
     short = until(2.2)
-    a, b = flights.run_vio(short), flights.run_vio(short)
-    assert all(x.result.estimate.p_WB.tobytes() == y.result.estimate.p_WB.tobytes()
-               for x, y in zip(a, b) if x.result.estimate is not None)
+    a, b = ([step.result.estimate and step.result.estimate.p_WB.tobytes() for step in flights.run_vio(short)] for _ in range(2))
+    assert a == b and sum(place is not None for place in a) > 20
 
 
 def test_starts_in_motion():
