@@ -83,7 +83,7 @@ def test_a_node_that_was_dropped_as_it_hung_comes_back_and_answers_to_its_goal(t
 
 
 def test_in_real_time_every_flight_ends_safely_and_the_next_begins(tmp_path):
-    """Deadlines are not judged here: on a busy machine a goal may end otherwise, but it ends, and the vehicle is at rest."""
+    """Deadlines are not judged here: on a busy machine a goal may end otherwise, but it ends, the vehicle is at rest, and its time passes."""
     safe = (ControllerStatus.DISARMED, ControllerStatus.HOVERING, ControllerStatus.FAILED)  # the last one: motors off, and it says why
     with rig(tmp_path, ("vio_model", "estimator", "mission", "controller"), lockstep=False, scenario=BLIND + "mission: {search_timeout: 3.0}\n") as flight:
         for names in (("vio_model", "mission"), ("estimator", "controller")):
@@ -99,3 +99,5 @@ def test_in_real_time_every_flight_ends_safely_and_the_next_begins(tmp_path):
             flight.listen(2.0)  # what is left of the one that was killed in the graph may take part in the next goal's discovery
             rests = flight.on_floor if "controller" in names else flight.at_rest  # its motors are off
             flight.until(lambda: rests() and flight.controller in safe, f"after {names} were killed, and {result}")
+            now = flight.pilot.time
+            flight.until(lambda: flight.pilot.time > now, f"the vehicle hangs after {names} were killed")
