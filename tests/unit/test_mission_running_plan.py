@@ -105,8 +105,7 @@ def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
     (START + 0.1, 5.1, GOAL), (START + LENGTH - 0.6, 5.26, GOAL),
     (START + 0.1, 5.26, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
 def test_no_new_perch_for_centimetres_nor_at_the_end_nor_unasked(time, x, goal):
-    query = running().query(time, AT_REST, target(10.0, x=x), goal)
-    assert query is None or query.recovery
+    assert running().query(time, AT_REST, target(10.0, x=x), goal).recovery
 
 
 def test_a_target_known_worse_than_the_planned_one_is_not_followed():
@@ -120,6 +119,7 @@ def test_a_target_known_worse_than_the_planned_one_is_not_followed():
 def test_the_plan_moves_with_the_wire(time):
     plan = running()
     way_out = plan.query(time, AT_REST, None, GOAL)
+    assert (way_out is not None) == (time == START + 0.1), "near its end the plan has its own"
     following = plan.moved(time, target(10.0, x=5.03), GOAL)
     assert following.plan.end == pytest.approx(plan.plan.end) and following.target.p_WS[0] == 5.03
     assert time - 0.02 < following.plan.start_time <= time, "the rest of it"
