@@ -439,7 +439,7 @@ def test_a_parameter_leaves_alone_what_the_service_has_chosen():
     assert component.flight.law_name == "nmpc+l1"
 
 
-def test_l1_works_at_every_rate_that_is_flown():
+def test_l1_finds_a_heavier_vehicle_at_the_slowest_rate_that_is_flown():
     flight = Flight(30.0, parameters(adaptive=True), Disturbances(mass_factor=1.1)).take_off()
     assert flight.component.flight.compensator.disturbance[2] < -0.3
 

@@ -64,14 +64,6 @@ def test_python_runs(text, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.split()[0] in ("perched", "missed")
 
 
-def test_links_lead_somewhere():
-    root = Path(__file__).resolve().parents[2]
-    for guide in GUIDES:
-        for link in re.findall(r"\]\(([^)#]+)\)", guide.read_text()):
-            target = (guide.parent / link).resolve()
-            assert target.exists() or target.is_relative_to(root / "docs" / "results"), f"{guide.name}: {link}"
-
-
 def test_stacks_that_start_in_the_same_second_have_logs_of_their_own(monkeypatch):
     monkeypatch.setattr(start_stack.time, "strftime", lambda _: "20260101-120000")
     folders = []

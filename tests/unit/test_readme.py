@@ -119,11 +119,6 @@ def test_every_scenario_is_named():
     assert named == {file.stem for file in (ROOT / "config" / "scenarios").glob("*.yaml")}
 
 
-def test_links_lead_somewhere():
-    for link in re.findall(r"\]\(([^)#:]+)\)", README):
-        assert (ROOT / link).exists(), link
-
-
 # -- the graph -------------------------------------------------------------------------------------------------------
 
 @pytest.fixture(scope="module")
