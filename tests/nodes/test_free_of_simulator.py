@@ -11,7 +11,9 @@ from perch_core.vehicle import load_vehicle
 
 
 def test_the_plain_scripts_import_nothing_of_perch_but_messages():
-    for script in PLAIN.glob("*.py"):
+    scripts = sorted(PLAIN.glob("*.py"))
+    assert len(scripts) >= 4
+    for script in scripts:
         imported = set(re.findall(r"^\s*(?:from|import) (perch\w*)", script.read_text(), re.M))
         assert imported <= {"perch_msgs"}, script
 
@@ -30,8 +32,8 @@ def test_every_imu_sample_is_answered_with_odometry_and_a_motor_command(rate, co
     seen = plain("states.py", str(rate), str(count))
     check_chain(seen)
     assert len(seen["commands"]) >= count
-    assert not [kind for kind in seen["types"] if "Step" in kind or "Packet" in kind]
-    assert not {"vehicle", "vio_model"} & set(seen["nodes"])
+    assert seen["types"] and not [kind for kind in seen["types"] if "Step" in kind or "Packet" in kind]
+    assert {"estimator", "controller"} <= set(seen["nodes"]) and not {"vehicle", "vio_model"} & set(seen["nodes"])
 
 
 def test_time_may_be_that_of_a_clock_topic(graph):
@@ -62,6 +64,8 @@ def test_wires_are_mapped(graph):
 
 
 def test_planners_plan(graph):
-    for name, plan in plain("plans.py").items():
+    plans = plain("plans.py")
+    assert set(plans) == {"plan_perch", "plan_powerline"}
+    for name, plan in plans.items():
         assert plan["success"], (name, plan["message"])
         assert plan["parts"] > 0 and plan["proofs"] and all(plan["proofs"])
