@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracles.powerline_ipopt import Oracle
 
-from perch_core import config, so3
+from perch_core import so3
 from perch_core.rotor_model import P, Q, V
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem
@@ -32,10 +32,8 @@ def test_the_oracle_finds_what_is_planned() -> None:
     (134.596, 0.0585, (1.516, -0.078, 5.977), -0.4582, (0.246, 0.440, 0.291))])
 def test_a_perch_is_planned_where_a_soft_end_stays_off(pitch_deg: float, along: float, position: tuple, yaw: float, velocity: tuple) -> None:
     """Costs alone leave the end 4 and 7 cm off here; the oracle finds plans."""
-    shipped = config.read_yaml(config.config_dir() / "powerline_planner.yaml")["/**"]["ros__parameters"]["margins"]
-    settings = replace(SETUP.settings, margins=replace(SETUP.settings.margins, **shipped))
     start, line = REQUEST.start.copy(), SETUP.segments()[2]
     start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
     perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
     request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=True, with_recovery=False, deadline=10.0)
-    assert all(bound.holds for bound in PowerlinePlanner(VEHICLE, settings).plan(request).bounds)
+    assert all(bound.holds for bound in PowerlinePlanner(VEHICLE, SETUP.settings).plan(request).bounds)

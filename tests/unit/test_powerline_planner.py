@@ -61,14 +61,12 @@ def test_a_plan_is_found_where(planner: PowerlinePlanner, why: str, target: int,
     ("recovery", 120.42, -0.082, (1.279, -1.429, 5.275), 0.624, (0.428, 0.118, -0.305))])
 def test_clearance_in_the_open_is_eased_where_no_plan_has_what_is_shipped(what: str, pitch_deg: float, along: float, position: tuple, yaw: float,
                                                                           velocity: tuple) -> None:
-    shipped = config.read_yaml(config.config_dir() / "powerline_planner.yaml")["/**"]["ros__parameters"]["margins"]
     start = REQUEST.start.copy()
     start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
     line = SETUP.segments()[2]
     perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
-    settings = replace(SETUP.settings, margins=replace(SETUP.settings.margins, **shipped))
     request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=False, deadline=10.0)
-    plan = PowerlinePlanner(VEHICLE, settings).plan(request)
+    plan = PowerlinePlanner(VEHICLE, SETUP.settings).plan(request)
     assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), what
 
 
@@ -109,10 +107,9 @@ def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlan
     assert (1 + nearest) ** 2 > (1 + planner.settings.margins.leaving) / (1 - planner.settings.margins.leaving) - 0.02
 
 
-def test_the_wire_is_met_from_above_the_gripper_with_room_beside_the_rotors_until_shortly_before() -> None:
+def test_the_wire_is_met_from_above_the_gripper_with_room_beside_the_rotors_until_shortly_before(planner: PowerlinePlanner) -> None:
     """A map that is centimetres off must not bring the rotors to the wire before the gripper."""
-    settings = config.replace(SETUP.settings, margins=config.replace(SETUP.settings.margins, approaching=0.4))
-    perch = PowerlinePlanner(VEHICLE, settings).plan(replace(REQUEST, with_recovery=False)).perch
+    perch = planner.plan(replace(REQUEST, with_recovery=False)).perch
     open_air = perch.states[(perch.times < 0.87 * perch.duration)]
     nearest = float(scaled_clearance(open_air[:, P], open_air[:, Q], REQUEST.target(), VEHICLE.body_radii).min())
     assert (1 + nearest) ** 2 > 1.4 / 0.6 - 0.05
