@@ -154,24 +154,35 @@ class IsolatedRunner:
             if self._ready and self._tasks:
                 self._do(self._tasks.popleft())
                 continue
-            soonest = min((task.end for task in self._waiting()), default=inf)
-            pipes: list[socket.socket | Connection] = [self._woken] if self._pipe is None else [self._woken, self._pipe]
-            heard = wait(pipes, None if soonest == inf else max(0.0, soonest - time.monotonic()))
-            if self._woken in heard:
-                self._woken.recv(4096)
-            if self._pipe in heard:
+            if self._heard():
                 self._hear()
             if self._pipe is None and self._tasks and not self._closing:
                 self._start()  # the last start failed: once more for this job
-            for task in [task for task in self._waiting() if task.end <= time.monotonic()]:
-                with self._lock:
-                    self._tasks.remove(task)
-                _fail(task, self._late(task))
         self._end()
         for task in self._tasks:
             _fail(task, JobFailed(f"{task.name}: the runner was closed"))
         for end in (self._wake, self._woken):
             end.close()
+
+    def _heard(self, until: float = inf) -> bool:
+        """Wait for the supervisor, a call, or a time; jobs whose limit passes while they wait fail then.
+
+        Args:
+            until: on the monotonic clock [s].
+
+        Returns:
+            Whether there is something on the supervisor's pipe.
+        """
+        soonest = min([until, *(task.end for task in self._waiting())])
+        pipes: list[socket.socket | Connection] = [self._woken] if self._pipe is None else [self._woken, self._pipe]
+        heard = wait(pipes, None if soonest == inf else max(0.0, soonest - time.monotonic()))
+        if self._woken in heard:
+            self._woken.recv(4096)
+        for task in [task for task in self._waiting() if task.end <= time.monotonic()]:
+            with self._lock:
+                self._tasks.remove(task)
+            _fail(task, self._late(task))
+        return self._pipe in heard
 
     def _waiting(self) -> list[_Task]:
         """The jobs that wait; others may come meanwhile."""
@@ -227,8 +238,9 @@ class IsolatedRunner:
         assert self._pipe is not None
         try:
             self._pipe.send_bytes(_HEADER.pack(left) + task.payload)
-            if not self._pipe.poll(None if left == inf else left + _GRACE):
-                raise TimeoutError
+            while not self._heard(task.end + _GRACE):
+                if time.monotonic() >= task.end + _GRACE:
+                    raise TimeoutError
             kind, answer = _opened(self._pipe.recv_bytes())
         except TimeoutError:
             self._restart()

@@ -71,8 +71,7 @@ def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None
     """
     known = results.all()
     finished = {r.number for r in known}
-    tasks = [Task(run, campaign.mapping(run), campaign.engine, campaign.sensing)
-             for run in campaign.runs if run.number not in finished]
+    tasks = [Task.of(campaign, run) for run in campaign.runs if run.number not in finished]
     print(f"{campaign.name}: {len(tasks)} of {len(campaign.runs)} runs to fly on {campaign.engine}, "
           + (f"Dask {cluster}" if cluster else f"{jobs} process{'es' if jobs > 1 else ''}"), flush=True)
     flown = on_cluster(tasks, cluster) if cluster else in_pool(tasks, jobs)
@@ -87,8 +86,7 @@ def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
     for result in worst(found, campaign.keep_worst):
         folder = out / flight_folder(result.number)
         if not (folder / "report.html").exists() and campaign.engine in ENGINES:
-            run = by_number[result.number]
-            carry_out(Task(run, campaign.mapping(run), campaign.engine, campaign.sensing, str(folder)))
+            carry_out(Task.of(campaign, by_number[result.number], str(folder)))
 
 
 def summary(found: list[RunResult]) -> str:

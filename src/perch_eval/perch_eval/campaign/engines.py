@@ -20,7 +20,7 @@ from perch_core.registry import resolved
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.results import RunResult
-from perch_eval.campaign.specification import Run, scenario_of
+from perch_eval.campaign.specification import Campaign, Run, scenario_of
 from perch_eval.flight import Flight
 from perch_eval.in_process import Sensing, fly
 from perch_eval.metrics import figures, flight_metrics
@@ -44,6 +44,11 @@ class Task:
     engine: str
     sensing: Sensing
     keep: str = ""
+
+    @classmethod
+    def of(cls, campaign: Campaign, run: Run, keep: str = "") -> Task:
+        """A run of a campaign."""
+        return cls(run, campaign.mapping(run), campaign.engine, campaign.sensing, keep)
 
 
 def resolve(name: str) -> Callable[[Task], RunResult]:

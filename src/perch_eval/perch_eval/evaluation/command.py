@@ -18,7 +18,7 @@ EXAMPLES = """examples:
   python3 scripts/evaluate.py --seeds 20            20 seeds a condition
   python3 scripts/evaluate.py --full --jobs 2       100 seeds, and what goes beyond the papers; interrupted, the same command goes on
   python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_flights, p_inspection,
-                                                    p_cable, c_faults, c_comparison, c_way_out)
+                                                    p_cable, c_faults, c_comparison, c_way_out, c_contact, c_consistency)
 
 exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
 2 the caller's mistake, 130 interrupted"""
@@ -34,11 +34,12 @@ PARTS: dict[str, Part] = {
     "p_powerline": _part("powerline:powerline_sections"), "p_flights": _part("powerline:flown_sections"),
     "p_inspection": _part("inspection:inspection_sections"), "p_cable": _part("cable:cable_sections"),
     "c_faults": _part("control:fault_sections"), "c_comparison": _part("control:comparison_sections"),
-    "c_way_out": _part("ways_out:sections")}
-FLIGHTS = {"seeds": ("flights of each perch condition", 5, 100), "line-seeds": ("flights of each powerline scenario", 1, 10),
+    "c_way_out": _part("ways_out:sections"), "c_contact": _part("contact:contact_sections"),
+    "c_consistency": _part("consistency:consistency_sections")}
+FLIGHTS = {"seeds": ("flights of each perch condition", 5, 100), "line-seeds": ("flights of each powerline scenario", 1, 20),
            "layouts": ("random layouts of the inspection", 3, 20)}
 """Option -> what it counts, how many by default, and with --full."""
-BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out")
+BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out", "c_contact", "c_consistency")
 """Hundreds of flights of their own: with --full, or by name."""
 
 

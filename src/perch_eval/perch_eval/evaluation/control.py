@@ -26,13 +26,13 @@ ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 
 
 def fault_sections(effort: Effort) -> list[Section]:
-    """Every fault at random moments; writes `faults.md` and `faults.json`."""
+    """Every fault at random moments; writes `faults_in_flight.md` and its JSON."""
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
     flown = computed(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
     out = Section("c_faults", "Faults in flight",
                   f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
                   "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth. "
-                  "Every flight: faults.md.")
+                  "Every flight: faults_in_flight.md.")
     rows, bad = [], []
     for fault in FAULTS:
         own = [r for r in flown if r["fault"] == fault.name]
@@ -55,7 +55,7 @@ def fault_sections(effort: Effort) -> list[Section]:
                     f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. "
                     f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. "
                     + _searched(r) + " / ".join(r["events"]))
-    write_page(effort, "faults", [*text, *([] if bad else ["None."])], {"flights": flown})
+    write_page(effort, "faults_in_flight", [*text, *([] if bad else ["None."])], {"flights": flown})
     out.data = {"flights": flown}
     return [out]
 

@@ -55,7 +55,7 @@ def machine() -> str:
 
 def _page(sections: Sequence[Section], duration: float) -> list[str]:
     found = counts(sections)
-    lines = ["# Results", f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
+    lines = ["# Results", "", f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
              f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail, {found.get(VACUOUS, 0)} are vacuous (nothing occurred that they are "
              f"about); {found.get('better', 0)} further values are better than the paper's, {found.get('worse', 0)} worse; "
              f"{found.get(MISSING, 0)} rows are not available.", "",

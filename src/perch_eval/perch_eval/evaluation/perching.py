@@ -43,18 +43,18 @@ PEAK_RATE, PEAK_ACCELERATION = 600.0, 10.0  # [deg/s], [m/s^2]
 
 def perching_sections(effort: Effort) -> list[Section]:
     """Tables II and III, Fig. 5 and 6, and the proof that the engine flies what the real nodes fly."""
-    found = _flights(effort)
-    groups = {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
+    groups = perches(effort)
     return [_errors(effort, groups), _successes(effort, groups), *_figures(effort, groups), _engines()]
 
 
-def _flights(effort: Effort) -> list[RunResult]:
-    """Every flight of every condition; finished ones of the same code are not flown again."""
+def perches(effort: Effort) -> dict[str, list[RunResult]]:
+    """The flights of each condition; finished ones of the same code are not flown again."""
     tasks = []
     for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in (*CONDITIONS, AGGRESSIVE)):
         mapping = scenario_mapping(name)
         tasks.append(Task(Run(number, seed, {"scenario": name}), mapping, "in_process", SENSING))
-    return flown(effort, "flights", tasks)
+    found = flown(effort, "flights", tasks)
+    return {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
 
 
 def _words(name: str) -> str:
