@@ -1,0 +1,277 @@
+"""Perception on public recordings, each scored against what its repository says of it; part of `python3 bench/recordings.py`.
+
+Every function takes the folder of a recording and returns figures for JSON: lengths in m, angles in deg, errors of corners in px.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from perch_core import so3
+from perch_core.camera import Camera, camera_of
+from perch_core.camera_mount import CameraMount
+from perch_core.errors import PerchError
+from perch_core.sensors import CalibrationSigmas
+from perch_core.tag_board import Tag, TagBoard, TagGrid, load_board
+from perch_eval.recordings import command
+from perch_eval.recordings.opening import pictures_in
+from perch_eval.recordings.pictures_seen import Seen, find_tags, guessed_mount, look
+from perch_eval.recordings.recording import picture
+from perch_perception.line_mapping import LineDetectionConfig, LineSighting
+from perch_perception.tags import BoardLocalizer
+from scipy.io import loadmat
+from scipy.optimize import minimize
+
+Tags = list[tuple[int, np.ndarray]]
+"""Number and corners (TL, TR, BR, BL) [px], (4, 2), of each tag."""
+Figures = dict[str, Any]
+NEAR = 8.0    # a found wire is where the reference has one within this, and the other way round [px]
+WIDTH = 1000  # to which photographs of the AprilGrid are scaled [px]
+INCH = 0.0254  # side of the clipboard's tags; nobody says it, and errors are given as shares of the distance [m]
+ROWS, COLUMNS = 6, 5  # of the clipboard's tags
+TURNED = 180.0  # OpenCV's markers against AprilTag's own [deg]
+PAD = load_board("pad_four_tags")
+
+
+# -- recordings with an IMU ------------------------------------------------------------------------------------------
+
+
+def flown(recording: Path, *options: str) -> tuple[Figures, str]:
+    """What `scripts/perceive.py` writes of a recording: `report.json`, without times and words, and `report.html`."""
+    with tempfile.TemporaryDirectory() as out:
+        if command.main([str(recording), "--out", out, *options]):
+            raise PerchError(f"{recording}: perceive.py failed")
+        report, page = json.loads((Path(out) / "report.json").read_text()), (Path(out) / "report.html").read_text()
+    kept = {key: report[key] for key in ("images", "frames", "restarts", "vio", "estimator", "target", "powerlines")}
+    return kept | {"gyro_bias": report["sensors"]["gyro_bias"]}, page
+
+
+def euroc(recording: Path, truth: Path) -> Figures:
+    """A EuRoC folder against a truth on file."""
+    return flown(recording, "--truth", str(truth))[0]
+
+
+def photographed_floor(tests: Path, out: Path) -> Figures:
+    """Nine seconds of `photo_flight`; its plots of path and error go to `out`."""
+    sys.path.insert(0, str(tests))
+    import photo_flight
+
+    with tempfile.TemporaryDirectory() as folder:
+        found, page = flown(photo_flight.write_asl(photo_flight.make(9.0), Path(folder) / "floor"))
+    for title, name in (("The path", "floor_path"), ("Error and covariance", "floor_error")):
+        png = page.partition(f"<h2>{title}</h2>")[2].partition("base64,")[2].partition('"')[0]
+        (out / f"{name}.png").write_bytes(base64.b64decode(png))
+    return found
+
+
+# -- tags ------------------------------------------------------------------------------------------------------------
+
+
+def seen(path: Path, mount: CameraMount | None = None, board: TagBoard = PAD) -> Seen:
+    """What perceive.py sees in a photograph; without a mount its camera is not calibrated."""
+    image = picture(path, 0, "camera", None)
+    mounted = mount or guessed_mount("camera", image.width, image.height)
+    return look(image, mounted, board, LineDetectionConfig(appearance="plain"), mount is not None)
+
+
+@cache  # its second detector in a process crashes as it is destroyed
+def pupil() -> Callable[..., list[Any]] | None:
+    """The search of pupil-apriltags (`pip install pupil-apriltags`) in grey images at full resolution; None: it is not installed."""
+    if not find_spec("pupil_apriltags"):
+        return None
+    from pupil_apriltags import Detector
+
+    return Detector(families="tag36h11", quad_decimate=1.0).detect
+
+
+def ours_of(corners: np.ndarray) -> np.ndarray:
+    """AprilTag's corners (lb, rb, rt, lt), (4, 2), which it counts from the first pixel's corner, in our order and pixels."""
+    return corners[[1, 0, 3, 2]] - 0.5
+
+
+def by_both(photographs: list[Path]) -> Iterator[tuple[str, list[Tags], int]]:
+    """Who, the tags in each photograph, and how many arcs of wires are found in all; pupil-apriltags looks for none."""
+    views = [seen(path) for path in photographs]
+    yield "ours", [list(view.tags) for view in views], sum(len(view.wires) for view in views)
+    if (search := pupil()) is not None:
+        found = [search(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in photographs]
+        yield "pupil", [[(tag.tag_id, ours_of(tag.corners)) for tag in tags] for tags in found], 0
+
+
+def nasa(folder: Path) -> Figures:
+    """Photographs beside texts with a line for each tag, `number, (x y), (x y), (x y), (x y)`, as AprilTag detected it unrefined."""
+    photographs, out = sorted(folder.glob("*.jpg")), Figures()
+    reference = [[_line(row) for row in path.with_suffix(".txt").read_text().splitlines()] for path in photographs]
+    for who, found, arcs in by_both(photographs):
+        errors = [error for tags, true in zip(found, reference) for error in _errors(tags, true)]
+        out[who] = {"reference": sum(map(len, reference)), "found": len(errors), "others": sum(map(len, found)) - len(errors),
+                    "corner_px_median": float(np.median(errors)), "corner_px_p90": float(np.percentile(errors, 90)), "arcs": arcs}
+    return out
+
+
+def _line(row: str) -> tuple[int, np.ndarray]:
+    number, *corners = map(float, re.findall(r"[-\d.]+", row))
+    return int(number), ours_of(np.reshape(corners, (4, 2)))
+
+
+def _errors(found: Tags, reference: Tags) -> Iterator[np.ndarray]:
+    """Errors of the corners [px], (4,), of each reference tag that has one of its number within half its side."""
+    for number, corners in reference:
+        near = min((c for n, c in found if n == number), key=lambda c: np.linalg.norm((c - corners).mean(axis=0)), default=None)
+        if near is not None and np.linalg.norm((near - corners).mean(axis=0)) < 0.5 * np.linalg.norm(corners[1] - corners[0]):
+            yield np.linalg.norm(near - corners, axis=1)
+
+
+def rooms(folder: Path) -> Figures:
+    """Photographs whose tags are listed in `groundtruth.txt`: a file and its numbers on each line. There are no wires in them."""
+    lines = [line.split() for line in (folder / "groundtruth.txt").read_text().splitlines()]
+    listed, out = [set(map(int, numbers)) for _, *numbers in lines], Figures()
+    for who, found, arcs in by_both([folder / name for name, *_ in lines]):
+        right = sum(len(true & {number for number, _ in tags}) for tags, true in zip(found, listed))
+        out[who] = {"photographs": len(lines), "reference": sum(map(len, listed)), "found": right,
+                    "false": sum(map(len, found)) - right, "arcs": arcs}
+    return out
+
+
+def rotation(folder: Path) -> Figures:
+    """One tag on a turntable: the turn between each photograph's pose and that at 0 deg, against the angle in the file's name."""
+    about = yaml.safe_load((folder / "test_info.yaml").read_text())["rotation_test"]
+    K, side = np.reshape(about["K"], (3, 3)), about["tag_size"]
+    mount = CameraMount("camera", camera_of("", about["width"], about["height"], K, np.zeros(0)), np.zeros(3), np.eye(3))
+    board = TagBoard((2 * side, 2 * side), (Tag(76, (0.0, 0.0), side),))
+    photographs = {int(re.findall(r"-?\d+", name)[-1]): folder / name for name in about["files"]}
+    views = {angle: seen(path, mount, board) for angle, path in photographs.items()}
+    out = {"ours": _turns({angle: view.board.R_CS for angle, view in views.items() if view.board is not None})
+           | {"photographs": len(views), "arcs": sum(len(view.wires) for view in views.values())}}
+    if (search := pupil()) is not None:
+        lens = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        found = {angle: search(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), True, lens, side) for angle, path in photographs.items()}
+        out["pupil"] = _turns({angle: tags[0].pose_R for angle, tags in found.items() if tags})
+    return out
+
+
+def _turns(attitudes: dict[int, np.ndarray]) -> Figures:
+    """By how much the turn since 0 deg is wrong, of attitudes (3, 3) by angle [deg]."""
+    off = [abs(np.degrees(np.linalg.norm(so3.log(R @ attitudes[0].T))) - abs(angle)) for angle, R in attitudes.items() if angle]
+    return {"poses": len(attitudes), "error_deg_mean": float(np.mean(off)), "error_deg_max": float(np.max(off))}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """By OpenCV, from views of a board: residual [px], lens, and poses (p_CS, R_CS) of the board in each view."""
+
+    rms: float
+    camera: Camera
+    poses: list[tuple[np.ndarray, np.ndarray]]
+
+
+def calibrated(views: list[Tags], board: TagBoard, size: tuple[int, int]) -> Calibration:
+    """The lens (radial-tangential, four coefficients) of views of all a board's tags that are seen; `size`: width, height [px]."""
+    points = [np.concatenate([board.corners_S[board.ids.index(n)] for n, _ in view]).astype(np.float32) for view in views]
+    pixels = [np.concatenate([corners for _, corners in view]).astype(np.float32) for view in views]
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+    rms, K, lens, turns, places = cv2.calibrateCamera(points, pixels, size, guessed_mount("camera", *size).camera.K, None, flags=flags)
+    poses = [(place.ravel(), cv2.Rodrigues(turn)[0]) for turn, place in zip(turns, places)]
+    return Calibration(rms, camera_of("plumb_bob", *size, K, lens.ravel()[:5]), poses)
+
+
+def aprilgrid(folder: Path) -> Figures:
+    """Photographs of Kalibr's grid: the tags in each, and how well one lens explains all of them."""
+    board = TagBoard((0.75, 0.75), border=2, corner_squares=True, grid=TagGrid(6, 6, 0.088, 0.3, rotation=TURNED))
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pictures_in(folder)]
+    images = [cv2.resize(g, (WIDTH, round(WIDTH / g.shape[1] * g.shape[0])), interpolation=cv2.INTER_AREA) for g in images]
+    size = images[0].shape[::-1]
+    views = [find_tags(image, guessed_mount("camera", *size).camera, board) for image in images]
+    known = [[tag for tag in view if tag[0] in board.ids] for view in views]
+    return {"tags": [len(view) for view in known], "false": sum(map(len, views)) - sum(map(len, known)),
+            "residual_px": calibrated(known, board, size).rms}
+
+
+def clipboard_board(steps: np.ndarray, numbers: list[int]) -> TagBoard:
+    """Some of the sheet's tags; `steps`: from row to row and from column to column, in sides of a tag, shape (2,)."""
+    centres = {n: INCH * np.array(steps) * (ROWS // 2 - n // COLUMNS, COLUMNS // 2 - n % COLUMNS) for n in numbers}
+    return TagBoard((0.5, 0.5), tuple(Tag(n, tuple(centre.tolist()), INCH, TURNED) for n, centre in centres.items()))
+
+
+def clipboard(folder: Path) -> Figures:
+    """Poses of eight boards of six tags in each image, drawn with a fixed seed, against the calibration by all tags in all images."""
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pictures_in(folder)]
+    size, everything, rng = images[0].shape[::-1], list(range(ROWS * COLUMNS)), np.random.default_rng(0)
+    views = [find_tags(image, guessed_mount("camera", *size).camera, PAD) for image in images]
+    steps = minimize(lambda x: calibrated(views, clipboard_board(x, everything), size).rms, (1.57, 1.57), method="Nelder-Mead",
+                     options={"xatol": 1e-4, "fatol": 1e-4}).x
+    reference = calibrated(views, clipboard_board(steps, everything), size)
+    mount, tried, places, turns, nees = CameraMount("camera", reference.camera, np.zeros(3), np.eye(3)), 0, [], [], []
+    for image, view, (p_CS, R_CS) in zip(images, views, reference.poses):
+        for _ in range(8):
+            board = clipboard_board(steps, rng.choice([number for number, _ in view], 6, replace=False).tolist())
+            pose, tried = BoardLocalizer(board, mount).process(image, 0.0).board, tried + 1
+            if pose is not None:
+                error = np.concatenate([pose.p_CS - p_CS, so3.log(pose.R_CS @ R_CS.T)])
+                by_lens = pose.by_intrinsics * CalibrationSigmas().lens
+                places.append(np.linalg.norm(error[:3]) / np.linalg.norm(p_CS))
+                turns.append(np.degrees(np.linalg.norm(error[3:])))
+                nees.append(error @ np.linalg.solve(pose.covariance + by_lens @ by_lens.T, error) / 6)
+    return {"boards": tried, "poses": len(places), "position_percent_rms": 100 * _rms(places), "attitude_deg_rms": _rms(turns),
+            "nees_mean": float(np.mean(nees)), "nees_median": float(np.median(nees)), "reference_px": reference.rms}
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# -- wires -----------------------------------------------------------------------------------------------------------
+
+
+def street(folder: Path) -> Figures:
+    """Photographs of wires that nobody has traced."""
+    views = [seen(path) for path in pictures_in(folder)]
+    return {"photographs": len(views), "arcs": sum(len(view.wires) for view in views)}
+
+
+def traced(folder: Path) -> Figures:
+    """Photographs in `test` whose wires' edges are traced in `test_gt`: precision and recall by length [%], within NEAR."""
+    lengths = np.array([_lengths(path, folder / "test_gt" / f"{path.stem}.mat") for path in pictures_in(folder / "test")], float)
+
+    def shares(rows: np.ndarray) -> np.ndarray:
+        right, found, covered, wires = rows.sum(axis=0)
+        return 100.0 * np.array([right / found, covered / wires])
+
+    of_all = shares(lengths)
+    change = np.max([np.abs(shares(np.delete(lengths, np.s_[k::6], axis=0)) - of_all) for k in range(6)], axis=0)
+    return {"photographs": len(lengths), "precision": of_all[0], "recall": of_all[1],
+            "precision_without_a_sixth": change[0], "recall_without_a_sixth": change[1]}
+
+
+def _lengths(photograph: Path, reference: Path) -> tuple[int, int, int, int]:
+    """Of one photograph [px]: found and right, found, traced and found, traced."""
+    view, edges = seen(photograph), loadmat(str(reference))["groundTruth"][0, 0]["Boundaries"][0, 0] > 0
+    found = np.zeros(edges.shape, np.uint8)
+    for wire in view.wires:
+        cv2.polylines(found, [np.round(_arc(wire, view.mount.camera)).astype(np.int32)], False, 1)
+    right = (found > 0) & (_distance(edges) <= NEAR)
+    return int(right.sum()), int(found.sum()), int((edges & (_distance(found > 0) <= NEAR)).sum()), int(edges.sum())
+
+
+def _arc(wire: LineSighting, camera: Camera) -> np.ndarray:
+    """Pixels along an arc from one visible end to the other, shape (9, 2)."""
+    first, last = sorted(wire.ends_C, key=lambda end: np.linalg.norm(end - wire.rays_C[0]))
+    return camera.project(np.vstack([first, wire.rays_C, last]))[0]
+
+
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Of each pixel from the nearest one of a mask [px]; infinite where it is empty."""
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) if mask.any() else np.full(mask.shape, np.inf)
