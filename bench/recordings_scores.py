@@ -29,7 +29,7 @@ from perch_core.tag_board import Tag, TagBoard, TagGrid, load_board
 from perch_eval.recordings import command
 from perch_eval.recordings.opening import pictures_in
 from perch_eval.recordings.pictures_seen import Seen, find_tags, guessed_mount, look
-from perch_eval.recordings.recording import picture
+from perch_eval.recordings.recording import decoded, picture
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting
 from perch_perception.tags import BoardLocalizer
 from scipy.io import loadmat
@@ -67,7 +67,7 @@ def euroc(recording: Path, truth: Path) -> Figures:
 def photographed_floor(tests: Path, out: Path) -> Figures:
     """Nine seconds of `photo_flight`; its plots of path and error go to `out`."""
     sys.path.insert(0, str(tests))
-    import photo_flight
+    import photo_flight  # type: ignore[import-not-found]
 
     with tempfile.TemporaryDirectory() as folder:
         found, page = flown(photo_flight.write_asl(photo_flight.make(9.0), Path(folder) / "floor"))
@@ -78,6 +78,14 @@ def photographed_floor(tests: Path, out: Path) -> Figures:
 
 
 # -- tags ------------------------------------------------------------------------------------------------------------
+
+
+def grey(path: Path) -> np.ndarray:
+    """Pixels of a photograph, uint8, shape (height, width)."""
+    pixels = decoded(path, cv2.IMREAD_GRAYSCALE)
+    if pixels is None:
+        raise PerchError(f"{path}: is no image that can be read")
+    return pixels
 
 
 def seen(path: Path, mount: CameraMount | None = None, board: TagBoard = PAD) -> Seen:
@@ -92,7 +100,7 @@ def pupil() -> Callable[..., list[Any]] | None:
     """The search of pupil-apriltags (`pip install pupil-apriltags`) in grey images at full resolution; None: it is not installed."""
     if not find_spec("pupil_apriltags"):
         return None
-    from pupil_apriltags import Detector
+    from pupil_apriltags import Detector  # type: ignore[import-not-found,import-untyped]
 
     return Detector(families="tag36h11", quad_decimate=1.0).detect
 
@@ -107,7 +115,7 @@ def by_both(photographs: list[Path]) -> Iterator[tuple[str, list[Tags], int]]:
     views = [seen(path) for path in photographs]
     yield "ours", [list(view.tags) for view in views], sum(len(view.wires) for view in views)
     if (search := pupil()) is not None:
-        found = [search(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in photographs]
+        found = [search(grey(path)) for path in photographs]
         yield "pupil", [[(tag.tag_id, ours_of(tag.corners)) for tag in tags] for tags in found], 0
 
 
@@ -158,7 +166,7 @@ def rotation(folder: Path) -> Figures:
            | {"photographs": len(views), "arcs": sum(len(view.wires) for view in views.values())}}
     if (search := pupil()) is not None:
         lens = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        found = {angle: search(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), True, lens, side) for angle, path in photographs.items()}
+        found = {angle: search(grey(path), True, lens, side) for angle, path in photographs.items()}
         out["pupil"] = _turns({angle: tags[0].pose_R for angle, tags in found.items() if tags})
     return out
 
@@ -185,13 +193,13 @@ def calibrated(views: list[Tags], board: TagBoard, size: tuple[int, int]) -> Cal
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     rms, K, lens, turns, places = cv2.calibrateCamera(points, pixels, size, guessed_mount("camera", *size).camera.K, None, flags=flags)
     poses = [(place.ravel(), cv2.Rodrigues(turn)[0]) for turn, place in zip(turns, places)]
-    return Calibration(rms, camera_of("plumb_bob", *size, K, lens.ravel()[:5]), poses)
+    return Calibration(rms, camera_of("plumb_bob", *size, K.astype(float), lens.astype(float).ravel()[:5]), poses)
 
 
 def aprilgrid(folder: Path) -> Figures:
     """Photographs of Kalibr's grid: the tags in each, and how well one lens explains all of them."""
     board = TagBoard((0.75, 0.75), border=2, corner_squares=True, grid=TagGrid(6, 6, 0.088, 0.3, rotation=TURNED))
-    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pictures_in(folder)]
+    images = [grey(path) for path in pictures_in(folder)]
     images = [cv2.resize(g, (WIDTH, round(WIDTH / g.shape[1] * g.shape[0])), interpolation=cv2.INTER_AREA) for g in images]
     size = images[0].shape[::-1]
     views = [find_tags(image, guessed_mount("camera", *size).camera, board) for image in images]
@@ -208,7 +216,7 @@ def clipboard_board(steps: np.ndarray, numbers: list[int]) -> TagBoard:
 
 def clipboard(folder: Path) -> Figures:
     """Poses of eight boards of six tags in each image, drawn with a fixed seed, against the calibration by all tags in all images."""
-    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in pictures_in(folder)]
+    images = [grey(path) for path in pictures_in(folder)]
     size, everything, rng = images[0].shape[::-1], list(range(ROWS * COLUMNS)), np.random.default_rng(0)
     views = [find_tags(image, guessed_mount("camera", *size).camera, PAD) for image in images]
     steps = minimize(lambda x: calibrated(views, clipboard_board(x, everything), size).rms, (1.57, 1.57), method="Nelder-Mead",
@@ -222,8 +230,8 @@ def clipboard(folder: Path) -> Figures:
             if pose is not None:
                 error = np.concatenate([pose.p_CS - p_CS, so3.log(pose.R_CS @ R_CS.T)])
                 by_lens = pose.by_intrinsics * CalibrationSigmas().lens
-                places.append(np.linalg.norm(error[:3]) / np.linalg.norm(p_CS))
-                turns.append(np.degrees(np.linalg.norm(error[3:])))
+                places.append(float(np.linalg.norm(error[:3]) / np.linalg.norm(p_CS)))
+                turns.append(float(np.degrees(np.linalg.norm(error[3:]))))
                 nees.append(error @ np.linalg.solve(pose.covariance + by_lens @ by_lens.T, error) / 6)
     return {"boards": tried, "poses": len(places), "position_percent_rms": 100 * _rms(places), "attitude_deg_rms": _rms(turns),
             "nees_mean": float(np.mean(nees)), "nees_median": float(np.median(nees)), "reference_px": reference.rms}
