@@ -1,0 +1,74 @@
+"""Scores of public recordings, on references made here; the page without any recording, and that of the figures in docs/results."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import recordings_scores as scores
+from perch_core import so3
+from scipy.io import savemat
+
+ROOT = Path(__file__).resolve().parents[2]
+SQUARE = np.array([[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]])
+
+
+def test_a_tag_is_found_where_one_of_its_number_is_within_half_its_side():
+    reference = [(0, SQUARE), (0, SQUARE + 100.0), (1, SQUARE + 200.0)]
+    found = [(0, SQUARE + (0.3, 0.4)), (0, SQUARE + (100.0, 111.0)), (2, SQUARE + 200.0)]
+    errors = list(scores._errors(found, reference))
+    assert len(errors) == 1 and errors[0] == pytest.approx(0.5)
+
+
+def test_apriltags_corners_are_in_our_order_and_pixels():
+    """AprilTag's (lb, rb, rt, lt) are OpenCV's (TR, TL, BL, BR), and it counts pixels from the first one's corner."""
+    lb, rb, rt, lt = SQUARE
+    assert scores.ours_of(np.array([lb, rb, rt, lt])) == pytest.approx(np.array([rb, lb, lt, rt]) - 0.5)
+
+
+def test_a_turn_is_wrong_by_what_it_differs_from_the_file_name():
+    turned = {angle: so3.exp(np.radians([0.0, 0.0, angle + off])) for angle, off in ((0, 0.0), (10, 1.0), (-20, 3.0))}
+    assert scores._turns(turned) == pytest.approx({"poses": 3, "error_deg_mean": 2.0, "error_deg_max": 3.0})
+
+
+def test_precision_and_recall_of_wires_are_by_length(tmp_path):
+    """Two wires across the image, of which one is traced, and one traced where there is none."""
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test_gt").mkdir()
+    image, edges = np.full((360, 540), 200, np.uint8), np.zeros((360, 540), np.uint8)
+    for row in (100, 200):
+        cv2.line(image, (0, row), (539, row + 20), 60, 3, cv2.LINE_AA)
+    cv2.line(edges, (0, 98), (539, 118), 1)
+    cv2.line(edges, (0, 300), (539, 300), 1)
+    cv2.imwrite(str(tmp_path / "test" / "1.png"), image)
+    inner = np.empty((1, 1), object)
+    inner[0, 0] = {"Boundaries": edges}
+    savemat(tmp_path / "test_gt" / "1.mat", {"groundTruth": inner})
+    right, found, covered, traced = scores._lengths(tmp_path / "test" / "1.png", tmp_path / "test_gt" / "1.mat")
+    assert right / found == pytest.approx(0.5, abs=0.02) and covered / traced == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """`bench/recordings.py`; as `recordings` the tests know another package."""
+    spec = importlib.util.spec_from_file_location("bench_recordings", ROOT / "bench" / "recordings.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # dataclasses look for it there
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_page_without_recordings_says_so(bench):
+    page = "\n".join(bench.page({}, "a command"))
+    assert page.count(bench.MISSING) == 16 and all(recording.title in page for recording in bench.RECORDINGS.values())
+
+
+def test_the_page_is_that_of_its_figures(bench):
+    folder = ROOT / "docs" / "results" / "recordings"
+    page = "\n".join(bench.page(json.loads((folder / "results.json").read_text())["recordings"], "a command"))
+    assert page.partition(bench.INTRODUCTION)[2] == (folder / "README.md").read_text().rstrip("\n").partition(bench.INTRODUCTION)[2]
