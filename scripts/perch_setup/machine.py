@@ -10,10 +10,10 @@ import sys
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Mapping, Sequence
+from typing import Mapping, Optional, Sequence
 
 from .errors import SetupError
-from .layout import REQUIREMENTS, ROS_PREFIX
+from .layout import REQUIREMENTS, ROOT, ROS_PREFIX
 
 PYTHONS = ((3, 11), (3, 12))
 DISTRIBUTION = "jazzy"
@@ -50,9 +50,15 @@ def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
         environment: environment variables of the calling shell.
 
     Raises:
-        SetupError: where another ROS distribution than Jazzy is sourced.
+        SetupError: where another ROS distribution than Jazzy is sourced, or a Jazzy that is not there.
     """
     distribution = environment.get("ROS_DISTRO", "")
+    if distribution == DISTRIBUTION and _sourced_prefix(environment) is None:
+        raise SetupError(
+            f"ROS_DISTRO is {DISTRIBUTION} in this shell, but no folder of AMENT_PREFIX_PATH has rclpy: run "
+            f"'source /opt/ros/{DISTRIBUTION}/setup.bash' (apt package ros-{DISTRIBUTION}-ros-base), or 'unset ROS_DISTRO' "
+            "and perch brings its own ROS"
+        )
     if distribution == DISTRIBUTION:
         return INSTALLED
     if distribution:
@@ -69,9 +75,16 @@ def remember(chosen: Platform, environment: Mapping[str, str] = os.environ) -> N
     if chosen.uses_wheels:
         ROS_PREFIX.unlink(missing_ok=True)
         return
-    for prefix in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if Path(prefix, "share", "rclpy").exists():
-            ROS_PREFIX.write_text(prefix)
+    prefix = _sourced_prefix(environment)
+    if prefix is not None:
+        ROS_PREFIX.write_text(str(prefix))
+
+
+def _sourced_prefix(environment: Mapping[str, str]) -> Optional[Path]:
+    """The ROS installation that is sourced, the lowest underlay; ours from wheels is none."""
+    prefixes = [Path(prefix) for prefix in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    found = [prefix for prefix in prefixes if (prefix / "share" / "rclpy").exists() and ROOT not in prefix.parents]
+    return found[-1] if found else None
 
 
 def _remembered_installation() -> bool:

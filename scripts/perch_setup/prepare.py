@@ -58,9 +58,14 @@ def _install(wanted: Platform, done: dict[str, str]) -> None:
     if done.get("environment") == environment and virtualenv.usable():
         return
     identity = f"{wanted.ros} in {ROOT}"
-    fresh = done.get("identity", identity) != identity or not virtualenv.usable()
+    earlier = done.get("identity", identity)
+    fresh = earlier != identity or not virtualenv.usable()
     if fresh:
         check_python(wanted)
+    if earlier != identity:
+        print(f"perch set-up: this checkout was set up with ROS from {earlier}, and is now with ROS from {identity}: paths are written into "
+              "the virtual environment and the build, so both are made anew. Packages come from pip's cache where they are in it.",
+              file=sys.stderr)
     done.pop("environment", None)
     for extra in EXTRAS if fresh else ():
         done.pop(f"extra {extra}", None)

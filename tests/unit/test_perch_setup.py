@@ -49,9 +49,30 @@ def repository(tmp_path, monkeypatch) -> Path:
 
 def test_wheels_without_ros_and_the_installation_where_jazzy_is_sourced(monkeypatch, tmp_path):
     monkeypatch.setattr(machine, "ROS_PREFIX", tmp_path / "ros_prefix")
+    (tmp_path / "opt" / "share" / "rclpy").mkdir(parents=True)
     assert detect_platform({}) is WHEELS
-    assert detect_platform({"ROS_DISTRO": "jazzy"}) is INSTALLED
+    assert detect_platform({"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": f"{ROOT}/.venv:{tmp_path}/opt"}) is INSTALLED
     assert WHEELS.locks != INSTALLED.locks
+
+
+@pytest.mark.parametrize("prefixes", ["", "/nowhere", f"{ROOT}/.venv"])
+def test_a_distribution_that_is_named_and_not_there_replaces_nothing(prefixes):
+    with pytest.raises(SetupError, match="no folder of AMENT_PREFIX_PATH has rclpy.*unset ROS_DISTRO") as error:
+        detect_platform({"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": prefixes})
+    assert error.value.exit_code == 2 and "\n" not in str(error.value)
+
+
+def test_a_checkout_that_was_moved_says_why_it_is_set_up_again(repository, monkeypatch, capsys):
+    installed = []
+    monkeypatch.setattr(prepare, "ROOT", repository)
+    monkeypatch.setattr(prepare.stamps, "environment_stamp", lambda wanted: "stamp")
+    monkeypatch.setattr(prepare.virtualenv, "usable", lambda: True)
+    monkeypatch.setattr(prepare.virtualenv, "install", lambda wanted, fresh: installed.append(fresh))
+    monkeypatch.setattr(prepare, "remember", lambda wanted: None)
+    prepare._install(WHEELS, {"identity": "wheels in /old/place"})
+    assert installed == [True] and f"wheels in /old/place, and is now with ROS from wheels in {repository}" in capsys.readouterr().err
+    prepare._install(WHEELS, {"identity": f"wheels in {repository}"})
+    assert installed == [True, False] and capsys.readouterr().err == ""
 
 
 def test_a_workspace_stays_with_its_installation_in_shells_where_nothing_is_sourced(monkeypatch, tmp_path):
