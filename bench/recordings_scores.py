@@ -126,7 +126,8 @@ def nasa(folder: Path) -> Figures:
     for who, found, arcs in by_both(photographs):
         errors = [error for tags, true in zip(found, reference) for error in _errors(tags, true)]
         out[who] = {"photographs": len(photographs), "reference": sum(map(len, reference)), "found": len(errors),
-                    "others": sum(map(len, found)) - len(errors), "corner_px_median": float(np.median(errors)), "corner_px_p90": float(np.percentile(errors, 90)), "arcs": arcs}
+                    "others": sum(map(len, found)) - len(errors), "corner_px_median": float(np.median(errors)),
+                    "corner_px_p90": float(np.percentile(errors, 90)), "arcs": arcs}
     return out
 
 
