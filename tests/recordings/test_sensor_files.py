@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perch_core.errors import ConfigError
-from perch_core.sensors import CameraSensor, load_sensors
+from perch_core.sensors import CalibrationSigmas, CameraSensor, load_sensors
 from perch_core.values import CameraModel, ImuSample
 from perch_core.vehicle import load_vehicle
 from perch_eval.recordings import sensors_command
@@ -18,7 +18,9 @@ from perch_perception.estimator_component import StateEstimator
 from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
 from perch_perception.powerline_mapper import PowerlineMapper, PowerlineMapperConfig
+from perch_perception.sensor_file import calibration_sigmas, imu_noise
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
+from perch_perception.ukf.config import ImuNoise
 from perch_perception.vio_component import VioComponent, VioComponentConfig
 from recordings import photo_flight
 
@@ -29,6 +31,12 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_what_is_shipped_can_be_read(file):
     sensors = load_sensors(file.stem)
     assert sensors.name == file.stem and sensors.imu is not None and sensors.mounts
+
+
+def test_without_a_file_the_filters_know_what_the_first_vehicles_file_says():
+    assert imu_noise("snapdragon", ImuNoise(accel_noise_density=9.0)) == ImuNoise()
+    for camera in ("down", "front"):
+        assert calibration_sigmas("snapdragon", camera, CalibrationSigmas(focal=0.04)) == CalibrationSigmas()
 
 
 def test_kalibr_says_the_same(tmp_path):

@@ -10,7 +10,6 @@ from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim import seeding
-from perch_sim.calibration import true_mount
 from perch_sim.camera_timing import CameraTiming
 from perch_sim.imu import Imu
 from perch_sim.motors import MotorCommandError, Motors
@@ -73,16 +72,6 @@ def test_frames_keep_their_rate_and_arrive_after_read_out_and_transport():
         assert 9_300_000 + 5_000_000 <= f.arrival - f.end <= 9_300_000 + 10_000_000
     delays = np.array([f.arrival - f.end for f in frames]) * 1e-6
     assert delays.std() == pytest.approx(5 / np.sqrt(12), rel=0.1)
-
-
-def test_calibration_errors_are_of_the_promised_size():
-    true = [true_mount(MOUNT, seeding.stream(seed, "calibration_down")) for seed in range(400)]
-    focal = np.array([t.camera.fx / MOUNT.camera.fx - 1 for t in true])
-    turn = np.array([np.linalg.norm(so3.log(MOUNT.R_BC.T @ t.R_BC)) for t in true])
-    time = np.array([t.stamp_offset - MOUNT.stamp_offset for t in true])
-    assert focal.std() == pytest.approx(0.003, rel=0.15) and abs(focal).max() <= 0.0061
-    assert np.degrees(np.sqrt((turn**2).mean())) == pytest.approx(0.5, rel=0.15)
-    assert time.std() == pytest.approx(0.002, rel=0.15)
 
 
 def test_history_interpolates_a_turning_climb():

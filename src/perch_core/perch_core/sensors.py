@@ -93,7 +93,7 @@ class ImuSensor:
     accel_bias_walk: float = quantity(unit="m/s^2/sqrt(s)", above=0.0, high=10.0)
     gyro_bias_walk: float = quantity(unit="rad/s/sqrt(s)", above=0.0, high=1.0)
     accel_bias: float = quantity(0.2, unit="m/s^2", above=0.0, high=10.0, doc="1 sigma of the turn-on bias")
-    gyro_bias: float = quantity(0.05, unit="rad/s", above=0.0, high=1.0, doc="1 sigma of the turn-on bias")
+    gyro_bias: float = quantity(0.1, unit="rad/s", above=0.0, high=1.0, doc="1 sigma of the turn-on bias")
     accel_range: float = quantity(156.0, unit="m/s^2", above=0.0, high=1e4, doc="saturation of an axis")
     gyro_range: float = quantity(34.0, unit="rad/s", above=0.0, high=1e3, doc="saturation of an axis")
     integration: str = choice("instant", options=("mean", "instant"), doc=(

@@ -28,7 +28,7 @@ from perch_perception.ukf import Estimate, UkfConfig
 from perch_perception.vio import VioPoseEstimate, VioResult
 from perch_perception.vio.start import TOLD_SIGMA
 from perch_perception.vio_component import VioComponent, VioComponentConfig
-from perch_sim.calibration import true_mount
+from perch_sim.calibration import true_imu, true_mount
 from perch_sim.lockstep import Task
 from perch_sim.lockstep.batches import Arrival
 from perch_sim.rendering import Renderer, build_scene
@@ -98,7 +98,7 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
-    return Flight(motion, truth, read_imu(truth, vehicle.imu, rng), mount, tuple(frames), _told_wrong(seed), scenario.vehicle)
+    return Flight(motion, truth, read_imu(truth, true_imu(vehicle.imu, seed), rng), mount, tuple(frames), _told_wrong(seed), scenario.vehicle)
 
 
 def _told_wrong(seed: int) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""How the true cameras differ from what the vehicle's file, and so CameraInfo, says of them."""
+"""How the true sensors differ from what the vehicle's file, and so CameraInfo and the filters' noise, says of them.
+
+Nothing that is declared holds exactly: each error has a scale of its own in every flight, up to half as large again or as small as the
+declared one divided by that, and calibration errors have heavier tails than a normal distribution.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.camera_mount import CameraMount
+from perch_core.vehicle import ImuConfig
 from perch_sim import seeding
 from perch_sim.scenario import Scenario
 
@@ -17,6 +22,20 @@ FOCAL_ERROR = 0.003                # of each focal length [-]
 CENTRE_ERROR = 0.5                 # of the principal point [px]
 ATTITUDE_ERROR = np.radians(0.5)   # of the mounting attitude, all axes together [rad]
 TIME_ERROR = 0.002                 # of the stamp offset [s]
+SPREAD = 1.5                       # scales are log-uniform between 1 / SPREAD and SPREAD of these, and of what is declared of the IMU
+FREEDOM = 5                        # degrees of freedom of Student's t of a calibration error, scaled to unit variance
+LARGEST = 4.0                      # such an error over its sigma: a worse calibration shows in its residuals, and is repeated
+
+
+def _scales(rng: np.random.Generator, count: int) -> np.ndarray:
+    return SPREAD ** rng.uniform(-1.0, 1.0, count)
+
+
+def true_imu(imu: ImuConfig, seed: int) -> ImuConfig:
+    """The IMU of a flight as it really is: noise, bias walks and turn-on biases."""
+    names = ("accel_noise", "gyro_noise", "accel_bias_walk", "gyro_bias_walk", "accel_bias_init", "gyro_bias_init")
+    scales = _scales(seeding.stream(seed, "imu_scales"), len(names)).tolist()
+    return dataclasses.replace(imu, **{name: scale * getattr(imu, name) for name, scale in zip(names, scales)})
 
 
 def true_mounts(scenario: Scenario, mounts: Mapping[str, CameraMount], seed: int) -> dict[str, CameraMount]:
@@ -31,9 +50,9 @@ def true_mount(mount: CameraMount, rng: np.random.Generator) -> CameraMount:
 
     Args:
         mount: the camera as calibrated.
-        rng: the camera's own stream; each error is cut off at two sigma, as a worse calibration would be repeated.
+        rng: the camera's own stream.
     """
-    draw = np.clip(rng.standard_normal(8), -2.0, 2.0)
+    draw = np.clip(rng.standard_t(FREEDOM, 8) * np.sqrt(1 - 2 / FREEDOM), -LARGEST, LARGEST) * np.repeat(_scales(rng, 4), (2, 2, 3, 1))
     camera = dataclasses.replace(
         mount.camera,
         fx=mount.camera.fx * (1 + FOCAL_ERROR * draw[0]), fy=mount.camera.fy * (1 + FOCAL_ERROR * draw[1]),

@@ -11,6 +11,7 @@ from perch_core.errors import ConfigError
 from perch_core.values import NANOSECONDS, CameraModel, InertialState, OdometryState, nanoseconds, rotated
 from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
+from perch_sim.calibration import true_imu
 from perch_sim.imu import Imu
 from perch_sim.lockstep import START
 from perch_sim.state_history import StateHistory, TrueState
@@ -46,8 +47,9 @@ class ModelledVio(Component[VioModelParameters]):
             raise ConfigError("vio_model", "vehicle", f"{vehicle.name} has no camera {CAMERA!r}")
         self._offset = nanoseconds(vehicle.mounts[CAMERA].stamp_offset)
         self._model = VioModel(config, seeding.stream(config.seed, "vio_model"))
-        turn_on = Imu(vehicle.imu, seeding.stream(config.seed, "imu")).bias
-        self._biases = BiasModel(vehicle.imu, np.concatenate([turn_on[3:], turn_on[:3]]),
+        imu = true_imu(vehicle.imu, config.seed)
+        turn_on = Imu(imu, seeding.stream(config.seed, "imu")).bias
+        self._biases = BiasModel(imu, np.concatenate([turn_on[3:], turn_on[:3]]),
                                  seeding.stream(config.seed, "vio_model_biases"))
         self._latency = nanoseconds(config.latency)
         self._warned = False

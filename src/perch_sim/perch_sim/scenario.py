@@ -177,7 +177,7 @@ class Scenario:
     description: str = text("")
     mode: str = choice("surface", options=("surface", "powerline", "inspection"))
     vehicle: str = text("snapdragon")
-    realism: str = choice("default", options=("default", "ideal"), doc="default: calibration errors are drawn per seed")
+    realism: str = choice("default", options=("default", "ideal"), doc="default: calibration errors of the cameras are drawn per seed")
     start: Start = part(Start)
     target: Target = part(Target)
     world: World = part(World)

@@ -22,7 +22,7 @@ from perch_core.timing import CONTROL_PERIOD_NS
 from perch_core.values import Contact
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim import seeding
-from perch_sim.calibration import true_mounts
+from perch_sim.calibration import true_imu, true_mounts
 from perch_sim.camera_stream import CameraStream
 from perch_sim.camera_timing import CameraTiming
 from perch_sim.drawing import Drawing
@@ -71,7 +71,7 @@ class Simulation:
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, MOTOR_TIMEOUT), 0
         self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor, scenario.disturbance.voltage_factor)
-        self._imu = Imu(self.vehicle.imu, seeding.stream(seed, "imu"))
+        self._imu = Imu(true_imu(self.vehicle.imu, seed), seeding.stream(seed, "imu"))
         self._sample = ImuSample(np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
