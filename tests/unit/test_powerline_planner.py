@@ -19,11 +19,13 @@ from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, V
 from perch_core.values import AtEnd
 from perch_core.vehicle import load_vehicle
+from perch_planner.powerline import planner as planning
 from perch_planner.powerline import problem, service
 from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
+from perch_planner.powerline.relaxation import RELAXATIONS
 from perch_planner.powerline.report import write_report
-from perch_planner.powerline.request import PerchPose
+from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from system.scripts import call_script
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -161,6 +163,48 @@ def test_a_perch_that_no_trajectory_reaches_is_refused_with_what_is_violated(pla
     with pytest.raises(PlanningRefusal) as refusal:
         planner.plan(replace(REQUEST, lines=REQUEST.lines + cage, with_recovery=False))
     assert refusal.value.code == "infeasible"
+
+
+def near_the_ground(drop: float = 2.6) -> PowerlineRequest:
+    """Upside down under wires that hang lower than in the 80 deg problem [m]: the dive for it needs height."""
+    lines = tuple(Segment(line.centre - [0.0, 0.0, drop], line.direction, line.half_length, line.radius, line.id) for line in REQUEST.lines)
+    start = REQUEST.start.copy()
+    start[2] -= drop
+    perch = PerchPose.on_line(lines[0], lines[0].centre, np.pi, VEHICLE.wire_offset, start[P])
+    return replace(REQUEST, start=start, lines=lines, perch=perch, with_recovery=False, deadline=60.0)
+
+
+def test_a_perch_that_is_not_found_is_refused_with_the_limit_without_which_it_is(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "LAST_RESORT", np.inf)  # IPOPT takes seconds to find none either
+    with pytest.raises(PlanningRefusal, match=r"keeps the height limit; without it there is one: height in .* required \[0.8") as refusal:
+        planner.plan(near_the_ground())
+    assert (refusal.value.code, refusal.value.constraint) == ("infeasible", "height [P:eq14e]") and refusal.value.margin < 0.0
+    lower = PowerlinePlanner(VEHICLE, config.replace(planner.settings, height_min=0.2)).plan(near_the_ground())
+    assert 0.2 <= lower.perch.states[:, 2].min() < 0.8
+
+
+def test_a_refusal_says_that_no_limit_alone_is_the_cause(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "RELAXATIONS", RELAXATIONS[3:])
+    monkeypatch.setattr(planning, "ATTEMPTS", 3)
+    with pytest.raises(PlanningRefusal, match="none of these alone .*: thrust range of the rotors, body-rate limit") as refusal:
+        planner.plan(near_the_ground())
+    assert refusal.value.code == "infeasible"
+
+
+def test_no_cause_is_looked_for_after_the_deadline(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    solve, phases = planner.solver.solve, []
+    monkeypatch.setattr(planner.solver, "solve", lambda structure, numbers, phase: phases.append(phase) or solve(structure, numbers, phase))
+    with pytest.raises(PlanningRefusal, match="no time was left to look for the cause"):
+        planner.plan(replace(near_the_ground(), deadline=1e-3))
+    assert phases == ["sight"]
+
+
+def test_a_perch_found_without_a_limit_that_it_keeps_is_a_plan(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    solve = planner.solver.solve
+    monkeypatch.setattr(planner.solver, "solve", lambda structure, numbers, phase: replace(solve(structure, numbers, phase), converged=phase == "trial"))
+    perch = planner.plan(replace(REQUEST, with_recovery=False, deadline=60.0)).perch
+    assert all(bound.holds for bound in perch.bounds)
+    assert next(bound for bound in perch.bounds if bound.quantity == "height").lower_limit == planner.settings.height_min
 
 
 def test_the_report_holds_what_was_planned(planned: PlannedProblem, tmp_path: Path) -> None:

@@ -96,12 +96,13 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
             if not isinstance(found, JobStopped):
                 self._reply(request, reply, found)
             elif rest > _FALLBACK_LEAST:
-                again = replace(task, request=replace(task.request, solver="ipopt"))
+                again = replace(task, request=replace(task.request, solver="ipopt", deadline=rest))
                 self.work(Job(solve, (again,), partial(self._reply_late, request, reply, deadline), rest, isolated=True))
             else:
                 self._reply_late(request, reply, deadline, found)
 
-        self.work(Job(solve, (task,), then, FIRST_SHARE * deadline, isolated=True))
+        first = replace(task, request=replace(task.request, deadline=FIRST_SHARE * deadline))  # it must know when it will be stopped
+        self.work(Job(solve, (first,), then, FIRST_SHARE * deadline, isolated=True))
 
     def _reply_late(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], deadline: float, found: Any) -> None:
         if isinstance(found, JobStopped):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, STATES, THRUST
 from perch_core.so3 import quat_from_matrix
+from perch_core.values import Certificate
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import certify, certify_end
@@ -18,6 +21,7 @@ from perch_planner.powerline.flight import fly
 from perch_planner.powerline.formulation import OURS, Formulation, Weights
 from perch_planner.powerline.nlp import Numbers, Solution, Structure
 from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
+from perch_planner.powerline.relaxation import RELAXATIONS
 from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import Margins, PowerlineSettings
 from perch_planner.powerline.solving import PHASES, Solver, end_room, end_weights, run_weights, see_weights
@@ -26,6 +30,8 @@ from perch_planner.powerline.validation import check_request
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
 ATTEMPTS = 6  # solves of one manoeuvre: with a larger N, or from another guess and with another solver
+FIRST_GUESSES = 2  # of a perch, before the limits are tried one at a time, and then IPOPT
+LAST_RESORT = 7.0  # times of a first attempt that does not converge, which IPOPT's greatest number of iterations takes
 EASED = 0.75  # of `leaving` and `approaching`, after each solve that finds no plan to the end: they are wishes, unlike the limits
 RADIUS_REDUCTION = 0.02  # the paper's, for a recovery that starts at the wire: part of a wire's radius is safety [m]
 
@@ -75,6 +81,19 @@ class _Task:
     deadline: float
 
 
+class _NotConverged(PlanningRefusal):
+    """No manoeuvre was found, and nothing says which limit is the cause.
+
+    Attributes:
+        patience: time of the first attempt [s]; a trial without a limit, with half as many iterations, takes less.
+    """
+
+    def __init__(self, name: str, tried: str, patience: float) -> None:
+        super().__init__("infeasible", name, -1.0, f"no {name} was found: the solver did not converge from several guesses ({tried}); "
+                                                   "start farther away, higher, or choose another pitch")
+        self.patience = patience
+
+
 @dataclass
 class PowerlinePlanner:
     """Plans for one vehicle. Building it loads the compiled functions, and compiles them the first time on a machine."""
@@ -92,7 +111,7 @@ class PowerlinePlanner:
         """Build the solvers of the usual structures beforehand, so that the first plan is as fast as the others."""
         for perception, end in ((False, "perched"), (True, "perched"), (False, "hovering")):
             for phase in PHASES:
-                if perception or phase != "sight":  # nobody solves that one without perception costs
+                if phase != "trial" and (perception or phase != "sight"):  # nobody solves that one without perception costs
                     self.solver.problem(Structure(self.settings.intervals, lines, perception, end), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
@@ -101,18 +120,74 @@ class PowerlinePlanner:
         Raises:
             PlanningRefusal: bad request, or no trajectory within the limits was found.
         """
+        began = perf_counter()
         pose = check_request(request, self.vehicle, self.settings)
         request = replace(request, start=self._started(request.start))
         hover = request.start[P] if request.hover is None else np.asarray(request.hover, float)
         if pose is None:
             return PowerlinePlan(None, self._fly(self._recovery(request, request.start, hover)))
-        perch = self._fly(self._perch(request, pose))
+        perch = self._fly_perch(request, pose, began)
         if not request.with_recovery:
             return PowerlinePlan(perch, None)
         try:
             return PowerlinePlan(perch, self._fly(self._recovery(request, perch.states[-1], hover)))
         except PlanningRefusal as refusal:
             return PowerlinePlan(perch, None, str(refusal))
+
+    def _fly_perch(self, request: PowerlineRequest, pose: PerchPose, began: float) -> Manoeuvre:
+        """A perch; where the first guesses lead to none, the limits are tried first, and then IPOPT while there is time.
+
+        Raises:
+            PlanningRefusal: there is none; it names the limit without which there is one.
+        """
+        task = self._perch(request, pose)
+        until = began + task.deadline
+        try:
+            return self._fly(task, guesses=FIRST_GUESSES)
+        except _NotConverged as refusal:
+            found, patience = self._relaxed(request, pose, task, refusal, until), refusal.patience
+        if isinstance(found, Manoeuvre):
+            return found
+        left = until - perf_counter() - (LAST_RESORT * patience if found.constraint != task.name else 0.0)  # a cause must not be lost
+        if left <= 0.0:
+            raise found
+        try:
+            return self._fly(replace(task, solver="ipopt", deadline=left), first=FIRST_GUESSES)
+        except _NotConverged:
+            raise found from None
+
+    def _relaxed(self, request: PowerlineRequest, pose: PerchPose, task: _Task, refusal: _NotConverged, until: float) -> Manoeuvre | PlanningRefusal:
+        """A refusal that names the first limit without which a perch is soon found; that perch, where it keeps all limits."""
+        for relaxation in RELAXATIONS:
+            if perf_counter() + refusal.patience > until:
+                return PlanningRefusal(refusal.code, refusal.constraint, refusal.margin,
+                                       f"{refusal}; no time was left to look for the cause, allow more than {task.deadline:g} s")
+            other = copy.copy(self)
+            changed, other.settings, other.vehicle = relaxation.relaxed(replace(request, solver="fatrop"), self.settings, self.vehicle)
+            try:
+                found = other._fly(other._perch(changed, pose), "trial", guesses=1)
+            except PlanningRefusal:
+                continue
+            bounds = self._bounds(task, found.times, found.states, found.rates)
+            broken = {str(bound): bound.margin for bound in bounds if not bound.holds}
+            if found.duration > task.duration[1]:
+                broken[f"duration {found.duration:.2f} s, required at most {task.duration[1]:g} s"] = task.duration[1] - found.duration
+            if not broken:
+                return replace(found, bounds=bounds)
+            words, margin = next(iter(broken.items()))
+            return PlanningRefusal(refusal.code, relaxation.constraint, margin,
+                                   f"no perch was found that keeps the {relaxation.words}; without it there is one: {words}")
+        tried = ", ".join(relaxation.words for relaxation in RELAXATIONS)
+        return PlanningRefusal(refusal.code, refusal.constraint, refusal.margin, f"{refusal}; none of these alone is seen to be the cause: {tried}")
+
+    def _bounds(self, task: _Task, times: np.ndarray, states: np.ndarray, rates: np.ndarray) -> tuple[Certificate, ...]:
+        """Certificates of a flight: all limits and its end."""
+        return (*certify(self.vehicle, times, states, rates, task.known, self.settings.height_min, self._thrust_max(task), task.radius_reduction),
+                *certify_end(times, states, task.wanted, *task.accuracy))
+
+    def _thrust_max(self, task: _Task) -> float:
+        """Greatest thrust of a rotor that a plan may use [N]."""
+        return max(self.settings.thrust_share * self.vehicle.thrust_max, float(task.start[THRUST].max()))
 
     def _started(self, start: np.ndarray) -> np.ndarray:
         """A start with a unit quaternion, and thrusts that the rotors have: a state that was measured is off by a little."""
@@ -176,17 +251,24 @@ class PowerlinePlanner:
         return min((float(scaled_clearance(state[None, P], state[None, Q], line, self.vehicle.body_radii)[0]) for line in lines),
                    default=np.inf)
 
-    def _fly(self, task: _Task) -> Manoeuvre:
+    def _fly(self, task: _Task, cold: str = "sight", first: int = 0, guesses: int = ATTEMPTS) -> Manoeuvre:
         """Solve, fly and check until the check passes.
+
+        Args:
+            task: what to solve.
+            cold: phase that begins from a guess.
+            first: attempt to begin with.
+            guesses: attempts of which one at least must converge.
 
         Raises:
             PlanningRefusal: it does not.
         """
         s, vehicle = self.settings, self.vehicle
-        thrust_max = max(s.thrust_share * vehicle.thrust_max, float(task.start[THRUST].max()))
-        margins, wish, intervals, lines, solver_name = task.margins, 1.0, s.intervals, task.lines, task.solver
-        iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, "sight"
-        for attempt in range(ATTEMPTS):
+        thrust_max = self._thrust_max(task)
+        margins, wish, intervals, lines, solver_name = task.margins, EASED**first, s.intervals, task.lines, task.solver
+        iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, cold
+        patience = 0.0
+        for attempt in range(first, ATTEMPTS):
             if time > task.deadline:  # a refusal with its cause is worth more than being stopped
                 break
             states, inputs = previous if previous is not None else task.guess(attempt, intervals)
@@ -203,14 +285,16 @@ class PowerlinePlanner:
             structure = Structure(intervals, len(lines), task.perception, task.end, solver_name)
             found = self.solver.solve(structure, numbers, phase)
             iterations, time, cpu_time = iterations + found.iterations, time + found.time, cpu_time + found.cpu_time
+            patience = patience or time
             if not (found.converged and np.all(np.isfinite(found.states))):
-                previous, phase, wish = None, "sight", EASED * wish
+                if worst is None and attempt + 1 >= guesses:
+                    break
+                previous, phase, wish = None, cold, EASED * wish
                 solver_name = "ipopt" if attempt >= 1 else solver_name
                 continue
             rates = vehicle.thrust_rate_max * np.clip(found.inputs, -1.0, 1.0)
             times, flown, dense_rates = fly(self.solver.model, task.start, rates, found.duration)
-            bounds = (*certify(vehicle, times, flown, dense_rates, task.known, s.height_min, thrust_max, task.radius_reduction),
-                      *certify_end(times, flown, task.wanted, *task.accuracy))
+            bounds = self._bounds(task, times, flown, dense_rates)
             broken = [bound for bound in bounds if not bound.holds]
             if not broken:
                 return Manoeuvre(times, flown, dense_rates, bounds, intervals, solver_name, iterations, time, cpu_time,
@@ -225,9 +309,7 @@ class PowerlinePlanner:
             previous, phase = _resampled(found, intervals), "polish" if drifted else "solve"
         if worst is not None:
             raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {task.name} within the limits: {worst}")
-        raise PlanningRefusal("infeasible", task.name, -1.0,
-                              f"no {task.name} was found: the solver did not converge from several guesses ({found.status}); "
-                              "start farther away, higher, or choose another pitch")
+        raise _NotConverged(task.name, found.status, patience)
 
 
 def _share(clearance: float) -> float:

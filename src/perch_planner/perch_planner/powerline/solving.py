@@ -23,10 +23,12 @@ from perch_planner.powerline.settings import PerceptionWeights
 from perch_planner.powerline.stage_functions import StageFunctions, StageModel, stage_functions
 
 # Tolerance, first barrier parameter, push off active bounds: of a solve, of the approach to it with perception costs, and of
-# one that starts from the solution of the same problem, which is right but for the integrator's error.
+# one that starts from the solution of the same problem, which is right but for the integrator's error. A trial only looks for
+# a limit that stands in the way: a plan without that one is found soon, in 20 iterations or so.
 PHASES: dict[str, dict[str, Any]] = {
     "sight": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
     "solve": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 100},
+    "trial": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 50},
     "polish": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
 }
 IPOPT_ITERATIONS = 300  # the last resort may take as many
@@ -77,22 +79,23 @@ class Solver:
         Args:
             structure: which solver.
             numbers: the problem without defects.
-            start_phase: "sight" for a cold guess, "solve" for the solution of a similar problem, "polish" for one that
+            start_phase: "sight" for a cold guess, "trial" for one that is soon given up, "solve" for the solution of a similar problem, "polish" for one that
                 is right but for the integrator's error.
 
         Returns:
             The last phase's solution, with iterations and times of all; where the first phase diverges, its own.
         """
         iterations, time, cpu_time = 0, 0.0, 0.0
-        sight = start_phase == "sight" and structure.perception
+        cold = start_phase in ("sight", "trial")
+        sight = cold and structure.perception
         if sight:
             first = self.problem(structure, "sight").solve(numbers)
             iterations, time, cpu_time = first.iterations, first.time, first.cpu_time
             if not np.all(np.isfinite(first.states)):
                 return first
             numbers = replace(numbers, states=first.states, inputs=first.inputs)
-        last = self.problem(structure, "polish" if start_phase == "polish" else "solve")
-        if sight or start_phase != "sight":
+        last = self.problem(structure, "solve" if start_phase == "sight" else start_phase)
+        if sight or not cold:
             numbers = replace(numbers, defects=last.defects_of(numbers.states, numbers.inputs))
         found = last.solve(numbers)
         return replace(found, iterations=iterations + found.iterations, time=time + found.time,
