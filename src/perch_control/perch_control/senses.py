@@ -15,6 +15,9 @@ from perch_control.odometry_gate import OdometryGate, Verdict
 from perch_control.rotor_lag import thrusts
 from perch_control.smooth_position import SmoothPosition
 
+QUIET = 1.0
+"""Refusals of samples are events at most this often [s]: of two nodes that publish odometry, every other sample is refused."""
+
 
 class Senses:
     """Owns the gate of the odometry.
@@ -28,6 +31,7 @@ class Senses:
 
     def __init__(self) -> None:
         self.age, self.refused, self.imu_stamp = inf, "", -inf
+        self._quiet = -inf  # no refusal is an event until then [s]
         self.unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=500)
         self._gate, self._smooth = OdometryGate(), SmoothPosition()
 
@@ -59,7 +63,8 @@ class Senses:
             self.refused = ""
             self.unseen.clear()
             return x.sensed(now, self._smooth.of(now, sample, x.order), (now, sample), rotors)
-        if verdict.reason and not self.refused:
+        if verdict.reason and not self.refused and now >= self._quiet:
+            self._quiet = now + QUIET
             x = x._replace(events=(*x.events, f"refused: {verdict.reason}"))
         self.refused, belief = verdict.reason, x.belief
         if belief and x.flying:

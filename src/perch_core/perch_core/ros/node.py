@@ -77,20 +77,24 @@ def node(name: str, component: type[Component[Any]], deadline: str = "", lockste
 
 @contextmanager
 def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterator[dict[str, Any]]:
-    """Parameters that decide what the node is: their given values, read before there is one, from a node that lives until there is.
+    """Parameters that decide what the node is: their given values, read from a probe of its name that ends before there is the node.
 
-    Without another node its end would be that of the process's participant, and Fast DDS may wait for ever where a participant ends
-    while it discovers others.
+    Two nodes of a name are one in the graph, and what the node publishes would go from there with the probe. Until there is the node another
+    one lives: else the probe's end would be that of the process's participant, and Fast DDS may wait for ever where a participant ends while
+    it discovers others.
     """
-    probe = Node(name, enable_rosout=False, start_parameter_services=False, **{k: v for k, v in kwargs.items() if k != "wiring"})
+    plain = {"enable_rosout": False, "start_parameter_services": False}
+    keeper = Node(f"_{name}_starting", use_global_arguments=False, context=kwargs.get("context"), **plain)
     try:
+        probe = Node(name, **plain, **{k: v for k, v in kwargs.items() if k != "wiring"})
         given = {key: parameter.value for key, parameter in probe._parameter_overrides.items() if key in kinds}
+        probe.destroy_node()
         for key, value in given.items():
             if not isinstance(value, kinds[key]):
                 raise ConfigError(name, key, f"{value!r} is not of type {kinds[key].__name__}")
         yield given
     finally:
-        probe.destroy_node()
+        keeper.destroy_node()
 
 
 class StopSignal:
