@@ -16,7 +16,7 @@ TOP = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md
 """Pages of the site from the top of the repository, as docs/site_hooks.py has them."""
 PAGES = sorted(DOCS.rglob("*.md"))
 ALL = [*PAGES, *(ROOT / name for name in TOP)]
-GENERATED = {DOCS / "equations.md", DOCS / "limits.md", *(DOCS / "results").rglob("*.md")}
+GENERATED = {DOCS / "equations.md", *(DOCS / "results").rglob("*.md")}
 WIDTH = 120
 
 

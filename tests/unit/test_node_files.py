@@ -17,3 +17,20 @@ def test_its_values_are_the_defaults(name):
     shipped.pop("lockstep", None)  # of the host, not of the component
     defaults = config.flattened(dataclasses.asdict(component_class(name, {}).config_type()))
     assert shipped == {key: defaults[key] for key in shipped}
+
+
+@pytest.mark.parametrize("name", COMPONENTS)
+def test_each_parameter_says_what_it_is(name):
+    def silent(cls: type, prefix: str = "") -> list[str]:
+        out = []
+        for field in dataclasses.fields(cls):
+            default = field.default if field.default is not dataclasses.MISSING else None
+            if field.metadata.get("derived"):
+                continue
+            if dataclasses.is_dataclass(default):
+                out += silent(type(default), f"{prefix}{field.name}.")
+            elif not field.metadata.get("doc"):
+                out.append(prefix + field.name)
+        return out
+
+    assert not silent(component_class(name, {}).config_type)

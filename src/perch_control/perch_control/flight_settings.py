@@ -17,4 +17,4 @@ class FlightSettings:
     position_error_max: float = quantity(1.0, unit="m", above=0.0, doc="farther from the reference: recovery")
     silence_time: float = quantity(60.0, unit="s", above=0.0, doc="hovering without a new order for so long: land")
     odometry_timeout: float = quantity(0.05, unit="s", above=0.0, high=0.25, doc="without usable odometry for longer: descent without position")
-    land_speed: float = quantity(0.35, unit="m/s", low=0.1, high=2.0)
+    land_speed: float = quantity(0.35, unit="m/s", low=0.1, high=2.0, doc="downwards, while it lands")

@@ -1,4 +1,4 @@
-"""Which code a result is of: commit, and a digest of all sources and configuration.
+"""Which code a result is of: commit, and a digest of all sources, configuration and pinned libraries.
 
     python3 -m perch_eval.revision [PAGE...]      mark the pages of results that are of other code
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from perch_core.config import config_dir
 
-CODE = ("src", "config")
+CODE = ("src", "config", "requirements")
 OLDER = ", older than the code"
 _DIGEST = re.compile(r"\(digest ([0-9a-f]{12})\)")
 
@@ -35,7 +35,7 @@ def commit() -> str:
 
 
 def digest() -> str:
-    """SHA-256 over all files of src and config that git tracks, as they are in the working tree, 12 digits; empty outside a repository."""
+    """SHA-256 over all files of `CODE` that git tracks, as they are in the working tree, 12 digits; empty outside a repository."""
     total = hashlib.sha256()
     names = _git("ls-files", *CODE).splitlines()
     for name in names:

@@ -144,7 +144,7 @@ class Mission:
     """The goal of the Perch action that a demo sends."""
 
     takeoff_height: float = quantity(1.2, unit="m", above=0.0, high=10.0)
-    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0)
+    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0, doc="the target is looked for so long")
     replan: bool = quantity(False)
     attempts: int = quantity(1, low=1, high=10)
     perch_point: Vector3 = quantity((0.0, 0.0, 0.0), unit="m")

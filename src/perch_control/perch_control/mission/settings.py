@@ -20,7 +20,7 @@ class MissionSettings:
     transit_speed: float = quantity(0.8, unit="m/s", above=0.0, high=5.0, doc="mean speed of take-off and search moves")
     settle_time: ClassVar[float] = 0.6  # rest after a move before it counts as reached [s]
     settle_speed: ClassVar[float] = 0.15  # speed below which the vehicle rests [m/s]
-    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0)
+    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0, doc="the target is looked for so long, then the goal ends with NOT_FOUND")
     search_dwell: ClassVar[float] = 2.0  # look this long at each place of the pattern [s]
     target_settle: ClassVar[float] = 0.5  # observe the target this long before planning [s]
     target_position_sigma: float = quantity(0.06, unit="m", above=0.0, high=1.0,

@@ -32,7 +32,7 @@ class LineWeights:
 class NmpcSettings:
     """Horizon and weights (diagonals of the quadratic cost)."""
 
-    horizon: float = quantity(1.0, unit="s", above=0.05, high=5.0)
+    horizon: float = quantity(1.0, unit="s", above=0.05, high=5.0, doc="of the prediction, in N = 20 intervals")
     position: Vector3 = quantity((200.0, 200.0, 300.0), unit="1/m^2", low=0.0, doc="axes of W")
     velocity: Vector3 = quantity((8.0, 8.0, 10.0), unit="s^2/m^2", low=0.0, doc="axes of W")
     attitude: Vector3 = quantity((12.0, 12.0, 4.0), unit="1/rad^2", low=0.0, doc="axes of B")

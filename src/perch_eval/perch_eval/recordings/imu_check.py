@@ -89,7 +89,7 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
         told = getattr(sensor, f"{name}_noise_density")
         report.say(f"{name} noise",
                    f"{text}, {told:.1e} in the sensor file" +
-                   (": the filter will be surer than the sensor is" if density[name] > 2.0 * told else ""),
+                   (": the filter will trust the sensor too much" if density[name] > 2.0 * told else ""),
                    warning=density[name] > 2.0 * told)
 
 

@@ -27,12 +27,12 @@ class Margins:
     A plan whose 1 ms trajectory violates a limit is solved again with a larger N. [P:V-B]
     """
 
-    height: float = quantity(0.05, unit="m", low=0.0, high=1.0)
+    height: float = quantity(0.05, unit="m", low=0.0, high=1.0, doc="above height_min")
     clearance: float = quantity(0.2, low=0.0, high=0.5, doc="(d^2 - 1) / (d^2 + 1) of the scaled distance d")
     leaving: float = quantity(0.45, low=0.0, high=0.6, doc="the same for a recovery, from a quarter of its time on")
     approaching: float = quantity(0.4, low=0.0, high=0.6, doc="the same for a perch, until a tenth of its time before the end; less than clearance: none")
-    thrust: float = quantity(0.01, unit="N", low=0.0, high=5.0)
-    body_rate: float = quantity(0.2, unit="rad/s", low=0.0, high=5.0)
+    thrust: float = quantity(0.01, unit="N", low=0.0, high=5.0, doc="of each rotor, from both ends of its range")
+    body_rate: float = quantity(0.2, unit="rad/s", low=0.0, high=5.0, doc="below the largest body rate")
 
 
 @dataclass(frozen=True, kw_only=True)
