@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import typing
 
 import pytest
 from perch_core import config
@@ -22,13 +23,10 @@ def test_its_values_are_the_defaults(name):
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_each_parameter_says_what_it_is(name):
     def silent(cls: type, prefix: str = "") -> list[str]:
-        out = []
-        for field in dataclasses.fields(cls):
-            default = field.default if field.default is not dataclasses.MISSING else None
-            if field.metadata.get("derived"):
-                continue
-            if dataclasses.is_dataclass(default):
-                out += silent(type(default), f"{prefix}{field.name}.")
+        kinds, out = typing.get_type_hints(cls), []
+        for field in config.settable(cls):
+            if dataclasses.is_dataclass(kinds[field.name]):
+                out += silent(kinds[field.name], f"{prefix}{field.name}.")
             elif not field.metadata.get("doc"):
                 out.append(prefix + field.name)
         return out

@@ -50,6 +50,7 @@ def descriptor(item: Field[Any], kind: Any, read_only: bool) -> ParameterDescrip
     bound: Callable[[str], Any] = meta.get
     low, high, above = bound("low"), bound("high"), bound("above")
     optional = type(None) in typing.get_args(kind)
+    kind = next(part for part in typing.get_args(kind) if part is not type(None)) if optional else kind
     out = ParameterDescriptor(description=meta.get("doc", ""), read_only=read_only, dynamic_typing=optional)
     unit = f"[{meta['unit']}]" if meta.get("unit") else ""
     entries = kind not in (float, int) and _numeric(kind)
