@@ -198,6 +198,15 @@ def test_no_plan_is_longer_than_duration_max():
     assert caught.value.code == refusals.BOX and caught.value.margin < 0.0
 
 
+@pytest.mark.parametrize("distance", [0.05, 0.1])
+def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_that_it_takes(distance):
+    problem = PerchProblem(HOVER, surface(90.0), (Waypoint((1.7 - distance, 0.0, 1.5)),))
+    with pytest.raises(PerchRefusal, match="clearance") as caught:
+        plan(problem, PerchSettings(), VEHICLE)
+    assert -0.3 < caught.value.relaxed["clearance_min"] < 0.0
+    assert all(c.holds for c in plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE).certificates)
+
+
 @pytest.mark.parametrize("settings, names, words", [
     ({"body_rate_max": 1.0, "duration_max": 6.0}, {"body_rate_max"}, "body-rate limit"),  # the thrust leaves its range as often
     ({"thrust_max": 2.6, "duration_max": 8.0}, {"thrust_max"}, "thrust range"),

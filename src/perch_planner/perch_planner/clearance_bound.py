@@ -59,7 +59,7 @@ def prove_clearance(distances: Array, forces: Array, squares: Array, s3: Array, 
         (proved, segment, place): the proved clearance, or -inf and where it is doubtful; segment -1 where there is no doubt.
     """
     failed, place = -1, 0.0
-    for gap in (0.98 * sampled - 1e-3, 0.9 * sampled - 5e-3, limit):
+    for gap in (sampled - 0.02 * abs(sampled) - 1e-3, sampled - 0.1 * abs(sampled) - 5e-3, limit):
         if gap < limit:
             continue
         failed = -1
