@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -205,6 +206,12 @@ def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_t
         plan(problem, PerchSettings(), VEHICLE)
     assert -0.3 < caught.value.relaxed["clearance_min"] < 0.0
     assert all(c.holds for c in plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE).certificates)
+
+
+def test_settings_may_be_integers():
+    problem = PerchProblem(HOVER, surface(90.0))
+    planned = plan(problem, replace(PerchSettings(), clearance_min=0, thrust_max=4, duration_max=20), VEHICLE)
+    assert np.array_equal(planned.trajectory.coefficients, plan(problem, PerchSettings(thrust_max=4.0), VEHICLE).trajectory.coefficients)
 
 
 @pytest.mark.parametrize("settings, names, words", [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib.util import find_spec
 from math import atan2, hypot
@@ -151,6 +151,9 @@ class PerchParameters:
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
 
     def __post_init__(self) -> None:
+        for item in fields(self):
+            if item.type == "float":  # compiled kernels take no integers
+                object.__setattr__(self, item.name, float(getattr(self, item.name)))
         if self.impact_speed_max < self.impact_speed_min:
             raise ConfigError("", "impact_speed_max",
                               f"{self.impact_speed_max:g} is below impact_speed_min {self.impact_speed_min:g} m/s")
