@@ -192,13 +192,6 @@ def test_a_waypoint_too_near_to_the_surface_is_told_where_it_is_and_what_it_lack
     assert words in str(caught.value) and caught.value.margin == pytest.approx(margin)
 
 
-def test_no_plan_is_longer_than_duration_max():
-    waypoints = tuple(Waypoint((-8.0 * (k % 2), 3.0 * (k % 3), 1.4)) for k in range(60))
-    with pytest.raises(PerchRefusal, match="longer than duration_max 20 s") as caught:
-        plan(PerchProblem(HOVER, surface(90.0), waypoints), PerchSettings(), VEHICLE)
-    assert caught.value.code == refusals.BOX and caught.value.margin < 0.0
-
-
 @pytest.mark.parametrize("distance", [0.05, 0.1])
 def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_that_it_takes(distance):
     problem = PerchProblem(HOVER, surface(90.0), (Waypoint((1.7 - distance, 0.0, 1.5)),))
@@ -212,6 +205,32 @@ def test_settings_may_be_integers():
     problem = PerchProblem(HOVER, surface(90.0))
     planned = plan(problem, replace(PerchSettings(), clearance_min=0, thrust_max=4, duration_max=20), VEHICLE)
     assert np.array_equal(planned.trajectory.coefficients, plan(problem, PerchSettings(thrust_max=4.0), VEHICLE).trajectory.coefficients)
+
+
+def test_a_plan_longer_than_duration_max_is_refused_and_says_what_it_would_take():
+    waypoints = tuple(Waypoint((-8.0 * (k % 2), 3.0 * (k % 3), 1.4)) for k in range(60))
+    with pytest.raises(PerchRefusal, match="duration_max") as caught:
+        plan(PerchProblem(HOVER, surface(90.0), waypoints), PerchSettings(), VEHICLE)
+    assert caught.value.code == refusals.BOX and caught.value.margin < 0.0 and caught.value.relaxed["duration_max"] > 20.0
+
+
+@pytest.mark.parametrize("minimum_time", [False, True])
+def test_first_durations_beyond_duration_max_are_no_refusal(minimum_time):
+    """The first guess is longer than 1.2 s, the shortest plan is not."""
+    planned = checked(PerchProblem(HOVER, surface(90.0)), PerchSettings(duration_max=1.2, minimum_time=minimum_time))
+    assert planned.duration <= 1.2
+
+
+def test_durations_grow_to_duration_max_before_a_refusal():
+    problem, wanted = PerchProblem(HOVER, surface(90.0), segment_times=(0.5,)), PerchSettings()
+    grown = plan(problem, wanted, VEHICLE).duration
+    assert checked(problem, replace(wanted, duration_max=0.97 * grown)).duration <= 0.97 * grown
+
+
+def test_a_duration_max_without_room_for_the_tube_is_refused():
+    with pytest.raises(PerchRefusal) as caught:
+        plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(duration_max=0.2), VEHICLE)
+    assert set(caught.value.relaxed) == {"duration_max"}
 
 
 @pytest.mark.parametrize("settings, names, words", [

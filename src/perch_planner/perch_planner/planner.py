@@ -68,9 +68,6 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         raise relaxation.refusal(search, outcome)
     if settings.minimum_time:
         outcome = search.shortest(durations, outcome)
-    duration = float(outcome.durations.sum())
-    if duration > settings.duration_max:
-        raise refusals.too_long(settings, duration, certificates(outcome.results, limits, vehicle.mass), search.iterations)
     trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
     proofs = certificates(outcome.results, limits, vehicle.mass)
     return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))

@@ -124,11 +124,3 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
 def _place(distance: float) -> str:
     """A signed distance from the surface's plane [m] in words."""
     return f"{abs(distance):.3f} m {'in front of' if distance >= 0.0 else 'behind'} the surface's plane"
-
-
-def too_long(settings: PerchSettings, duration: float, certificates: tuple[Certificate, ...] = (), iterations: int = 0) -> PerchRefusal:
-    """The refusal of a plan that would take `duration` [s]; with certificates: of one that there is."""
-    return PerchRefusal(BOX, "duration_max", settings.duration_max - duration,
-                        f"a plan would take {duration:.2f} s, longer than duration_max {settings.duration_max:g} s; "
-                        "start nearer, ask for fewer waypoints, or raise duration_max", certificates, iterations,
-                        {"duration_max": duration} if certificates else None)

@@ -74,10 +74,14 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
     settings, vehicle = search.settings, search.vehicle
     asked = _asked(settings, Limits.of(settings, vehicle))
     proofs = certificates(best.results, Limits.of(settings, vehicle), vehicle.mass)
-    longest = max((attempt.duration for attempt in search.attempts), default=float(search.first.sum()))
+    longest = max((attempt.duration for attempt in search.attempts), default=0.0)
     tried = f"{search.iterations} programs up to {longest:.2f} s"
     least, most = vehicle.thrust_min, vehicle.thrust_max
     way = _Trials(search, asked).way()
+    if way is None and (guess := float(search.first.sum())) > settings.duration_max:
+        return PerchRefusal(refusals.BOX, "duration_max", settings.duration_max - guess,
+                            f"no plan within duration_max {settings.duration_max:g} s ({tried}), where the first guess is {guess:.2f} s, nor without "
+                            "limits; start nearer, ask for fewer waypoints, or raise duration_max", proofs, search.iterations)
     if way is None:
         return PerchRefusal(refusals.INFEASIBLE_WINDOW, "impact window and tube [M:eq14, M:eq15]", -inf,
                             f"no plan, even without the other limits ({tried}); widen the impact speeds or the tube", proofs,
@@ -125,12 +129,8 @@ class _Trials:
             return None
         settings = replace(self._search.settings, minimum_time=False, **changes)
         trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle), min(_EACH, self._left))
-        try:
-            _, outcome = trial.run()
-        except PerchRefusal:
-            return None
-        finally:
-            self._left -= trial.iterations
+        _, outcome = trial.run()
+        self._left -= trial.iterations
         return _used(trial.problem, outcome, trial.vehicle) if outcome.proved else None
 
     def _without(self, names: Iterable[str]) -> dict[str, float] | None:

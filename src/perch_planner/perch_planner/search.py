@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.vehicle import Vehicle
-from perch_planner import refusals
 from perch_planner.contact_constraints import Contact
 from perch_planner.cutting import turning_side
 from perch_planner.judgement import Judgement, Question
@@ -16,7 +15,7 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_h
 from perch_planner.rotor_thrusts import rotor_model
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
-    FINE, LAST_SEGMENT_MIN, allocate, lengthen_approach, split_finely, split_last, stretch_factor, with_last_segment)
+    FINE, LAST_SEGMENT_MIN, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
 ITERATIONS_MAX = 100  # quadratic programs of a search
@@ -156,15 +155,16 @@ class Search:
         """Lengthen until every limit is proved, or the time or the number of programs is used up. [M:IV-C.3]
 
         Where the thrust fails before the last waypoint everything becomes longer, else the approach, from the third on after all
-        divisions of it.
-
-        Raises:
-            PerchRefusal: the first durations are longer than `duration_max` already.
+        divisions of it. What is longer than `duration_max` is shortened to it, once, and tried with all divisions.
         """
-        durations, best, stretched, fails = self.first, None, 0, 0
-        if not self.settings.minimum_time and float(durations.sum()) > self.settings.duration_max:  # they only grow
-            raise refusals.too_long(self.settings, float(durations.sum()))
+        durations, best, stretched, fails, last = self.first, None, 0, 0, False
         while True:
+            if durations.sum() > self.settings.duration_max:
+                self.acted.add("duration_max")
+                within = None if last else shortened(durations, self.settings)
+                if within is None:
+                    return durations, best or Outcome(durations)
+                durations, last, fails = within, True, max(fails, _COARSE - 1)
             outcome = self.try_durations(divided(durations, fails), patient=stretched < _PATIENCE)
             if outcome.proved:
                 return durations, outcome
@@ -176,13 +176,9 @@ class Search:
                 grown = durations  # these, divided otherwise
             else:
                 grown, stretched = lengthen_approach(durations, _GROWTH[stretched >= _STEPS]), stretched + 1
-            grown = with_last_segment(grown, self.settings)
-            if grown.sum() > self.settings.duration_max:
-                self.acted.add("duration_max")
-                return durations, best
             if self.iterations >= self._iterations_max:
                 return durations, best
-            durations = grown
+            durations = with_last_segment(grown, self.settings)
 
     def fails_early(self, durations: np.ndarray, outcome: Outcome) -> bool:
         """Whether the thrust leaves its range before the last waypoint.

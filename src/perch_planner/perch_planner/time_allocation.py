@@ -20,6 +20,7 @@ PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 LAST_SEGMENT_MIN = 0.25   # [s]; a shorter rotation is often infeasible
+_ROUNDING = 1e-9           # [s] of sums
 
 
 @compiled
@@ -95,6 +96,17 @@ def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndar
     durations = durations.copy()
     durations[-1] = max(durations[-1], settings.tube_time, LAST_SEGMENT_MIN)
     return durations
+
+
+def shortened(durations: np.ndarray, settings: PerchSettings) -> np.ndarray | None:
+    """Longer durations shortened to `duration_max`, all by one factor but for the least last segment; None: there is no room for them."""
+    out = with_last_segment((settings.duration_max - _ROUNDING) / durations.sum() * durations, settings)
+    before, room = out[:-1], settings.duration_max - out[-1]
+    if room < SEGMENT_MIN * len(before):
+        return None
+    if len(before):
+        before *= (room - _ROUNDING) / before.sum()
+    return out
 
 
 @compiled
