@@ -87,7 +87,7 @@ def test_options_of_a_request_replace_the_parameters(ask: Asked) -> None:
 
 @pytest.mark.parametrize("inclination, height", [(60.0, 1.2), (90.0, 1.4), (180.0, 3.6)])
 def test_speed_and_slip_are_bounded_for_contacts_on_time_and_late(ask: Asked, inclination: float, height: float) -> None:
-    """Where no speed is within the window at both times, its middle is met on the average."""
+    """Where no speed is within the window at both times, that of the planned contact is, as near to the other as it can be."""
     pad = PerchSurface.from_inclination(np.array([1.7, 0.0, height]), math.radians(inclination))
     end = ask(request(pad)).trajectory
     x = end.sample(end.duration)
@@ -97,7 +97,7 @@ def test_speed_and_slip_are_bounded_for_contacts_on_time_and_late(ask: Asked, in
     if inclination < 100.0:
         assert 0.65 <= speeds.min() and speeds.max() <= 0.8
     else:
-        assert speeds.mean() == pytest.approx(0.725, abs=1e-6) and speeds[0] == pytest.approx(0.725 + 0.5 * 0.03 * (3.3 + 9.81), abs=2e-3)
+        assert 0.8 - 1e-6 <= speeds[0] <= 0.8 and speeds[1] == pytest.approx(0.8 - 0.03 * (3.3 + 9.81), abs=1e-6)
 
 
 def test_rotors_that_give_less_are_planned_for(ask: Asked) -> None:

@@ -37,7 +37,7 @@ def checked(problem: PerchProblem, settings: PerchSettings = PerchSettings()):
     kept = {c.quantity: c.holds for c in planned.certificates}
     need = requirements(problem, settings, VEHICLE)
     assert verify(planned.trajectory.durations, planned.trajectory.coefficients, need, step=5e-4) == []
-    assert set(kept) == {"thrust", "speed", "height", "clearance", "body_rate", "rotor_thrust"} and all(kept.values())
+    assert set(kept) == {"thrust", "speed", "height", "clearance", "body_rate", "rotor_thrust", "impact_speed"} and all(kept.values())
     return planned
 
 
@@ -88,6 +88,32 @@ def test_a_negative_rotor_margin_lets_a_plan_ask_for_more_and_its_certificate_sa
     limits = Limits.of(PerchSettings(rotor_margin=-0.5), VEHICLE)
     spread = VEHICLE.thrust_max - VEHICLE.thrust_min
     assert limits.rotor_thrust == pytest.approx((VEHICLE.thrust_min - 0.5 * spread, VEHICLE.thrust_max + 0.5 * spread))
+
+
+@pytest.mark.parametrize("inclination, settings, speed", [
+    (90.0, {"impact_acceleration": 7.0}, 0.8), (135.0, {}, 0.8), (180.0, {}, 0.8), (0.0, {"impact_acceleration": 4.0}, 0.65),
+    (90.0, {"impact_speed_min": 0.7, "impact_speed_max": 0.7}, 0.7)])
+def test_the_impact_window_holds_at_the_planned_contact_where_none_holds_for_a_late_one_too(inclination, settings, speed):
+    """[M:eq14] The plan is at the edge that is nearest to what the late contact asks for, and the certificate says so."""
+    target = surface(inclination)
+    planned = checked(PerchProblem(HOVER, target), PerchSettings(**settings))
+    impact = {c.quantity: c for c in planned.certificates}["impact_speed"]
+    assert impact.minimum == impact.maximum == pytest.approx(-planned.trajectory.sample(planned.duration).v @ target.normal, abs=1e-9)
+    assert impact.maximum == pytest.approx(speed, abs=1e-6) and impact.time_of_maximum == planned.duration
+    assert (impact.lower_limit, impact.upper_limit) == (settings.get("impact_speed_min", 0.65), settings.get("impact_speed_max", 0.8))
+
+
+def test_the_slip_at_the_planned_contact_is_bounded_where_that_of_a_late_one_cannot_be():
+    target = surface(90.0)
+    planned = checked(PerchProblem(HOVER, target), PerchSettings(contact_delay=0.1))  # in which a wall's slip changes by 0.98 m/s
+    assert np.linalg.norm(target.R_WS[:, :2].T @ planned.trajectory.sample(planned.duration).v) <= 0.3
+
+
+def test_the_impact_speed_of_a_certificate_is_relative_to_a_moving_pad():
+    target, velocity = surface(60.0), np.array([0.3, 0.1, 0.0])
+    planned = checked(PerchProblem(HOVER, target, target_velocity=velocity))
+    impact = {c.quantity: c for c in planned.certificates}["impact_speed"]
+    assert impact.maximum == pytest.approx((velocity - planned.trajectory.sample(planned.duration).v) @ target.normal, abs=1e-9)
 
 
 @pytest.mark.parametrize("heading", [-90.0, 90.0, 180.0])
@@ -201,12 +227,6 @@ def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_t
     assert all(c.holds for c in plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE).certificates)
 
 
-def test_settings_may_be_integers():
-    problem = PerchProblem(HOVER, surface(90.0))
-    planned = plan(problem, replace(PerchSettings(), clearance_min=0, thrust_max=4, duration_max=20), VEHICLE)
-    assert np.array_equal(planned.trajectory.coefficients, plan(problem, PerchSettings(thrust_max=4.0), VEHICLE).trajectory.coefficients)
-
-
 def test_a_plan_longer_than_duration_max_is_refused_and_says_what_it_would_take():
     waypoints = tuple(Waypoint((-8.0 * (k % 2), 3.0 * (k % 3), 1.4)) for k in range(60))
     with pytest.raises(PerchRefusal, match="duration_max") as caught:
@@ -231,6 +251,12 @@ def test_a_duration_max_without_room_for_the_tube_is_refused():
     with pytest.raises(PerchRefusal) as caught:
         plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(duration_max=0.2), VEHICLE)
     assert set(caught.value.relaxed) == {"duration_max"}
+
+
+def test_settings_may_be_integers():
+    problem = PerchProblem(HOVER, surface(90.0))
+    planned = plan(problem, replace(PerchSettings(), clearance_min=0, thrust_max=4, duration_max=20), VEHICLE)
+    assert np.array_equal(planned.trajectory.coefficients, plan(problem, PerchSettings(thrust_max=4.0), VEHICLE).trajectory.coefficients)
 
 
 @pytest.mark.parametrize("settings, names, words", [

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_core.arrays import Array
+from perch_core.jit import compiled
 from perch_core.values import Certificate
 from perch_planner import plan_checks
+from perch_planner.contact_constraints import INSET
 from perch_planner.problem import Limits
+from perch_planner.search import Outcome, Search
 
 
 def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Certificate, ...]:
@@ -28,3 +32,31 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
                                maximum=scale * maximum, time_of_minimum=at_minimum, time_of_maximum=at_maximum, method=method,
                                holds=bool(holds)))
     return tuple(out)
+
+
+@compiled
+def _impact(coefficients: Array, durations: Array, v_S: Array, s3: Array) -> tuple[float, float]:
+    """Speed along -s3 at the end of a plan, relative to the surface [m/s], and the time of the end [s]; arguments of `plan_checks.check`."""
+    last, speed = coefficients[-1], 0.0
+    degree = last.shape[1] - 1
+    for d in range(3):
+        speed -= s3[d] * (degree * (last[d, degree] - last[d, degree - 1]) / durations[-1] - v_S[d])
+    return speed, durations.sum()
+
+
+def perch_certificates(search: Search, outcome: Outcome) -> tuple[Certificate, ...]:
+    """The certificates of a perch: those of `certificates`, and the speed along -s3 at the planned contact, relative to the surface. [M:eq14]
+
+    Both bounds of the speed may be one value, which a plan meets to rounding: it may be `INSET` beyond them.
+
+    Args:
+        search: for the problem and its limits.
+        outcome: of durations, or the plan; where its limits were not checked, there are no certificates.
+    """
+    if not len(outcome.results):
+        return ()
+    least, most, question = search.settings.impact_speed_min, search.settings.impact_speed_max, search.question
+    speed, end = _impact(outcome.coefficients, outcome.durations, question.v_S, question.s3)
+    impact = Certificate(quantity="impact_speed", unit="m/s", lower_limit=least, upper_limit=most, minimum=speed, maximum=speed,
+                         time_of_minimum=end, time_of_maximum=end, method="bernstein", holds=least - INSET <= speed <= most + INSET)
+    return (*certificates(outcome.results, search.limits, search.vehicle.mass), impact)

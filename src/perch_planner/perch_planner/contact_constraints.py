@@ -14,7 +14,8 @@ from perch_planner.linear_bounds import BoundArrays
 from perch_planner.problem import PerchProblem, PerchSettings
 
 INSET = 1e-7
-"""Bounds are tightened by this [SI], so that a solver's residual (1e-9 of a row) cannot leave the true ones."""
+"""Bounds are tightened by this [SI]: more than the solvers leave of a row (1e-9 of its length with DAQP, 1e-8 with OSQP). What counts as
+solved (`solvers.FEASIBILITY`) may be more: the certificate of the impact speed is computed from the plan itself."""
 
 TUBE_STEP = 0.01    # dt of [M:eq15] [s]
 TUBE_SHARE = 0.1    # q of [M:eq15]
@@ -81,23 +82,29 @@ def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: floa
     """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]
 
     They hold for a contact on time and for one that comes late, after a change of the velocity by `later` [m/s], shape (3,).
-    Where no speed meets its bounds at both times, the middle of what the two ask for counts.
+    Where no velocity meets its bounds at both times, the change counts as far as they are wide: a contact on time is then at the
+    edge of its own bounds that is nearest to those of the late one.
     """
     count = 1 + len(_OCTAGON)
-    directions, lower, upper = np.empty((count, 3)), np.empty(count), np.empty(count)
+    directions, lower, upper, changes = np.empty((count, 3)), np.empty(count), np.empty(count), np.zeros(count)
     for k in range(count):
-        shift = change = 0.0
+        shift = 0.0
         for d in range(3):
             if k == 0:
                 directions[k, d] = -R_WS[d, 2]
             else:
                 directions[k, d] = _OCTAGON[k - 1, 0] * R_WS[d, 0] + _OCTAGON[k - 1, 1] * R_WS[d, 1]
             shift += directions[k, d] * velocity[d]
-            change += directions[k, d] * later[d]
-        lower[k] = shift + (least if k == 0 else -tangential) - min(change, 0.0)
-        upper[k] = shift + (most if k == 0 else tangential) - max(change, 0.0)
-        if lower[k] > upper[k]:
-            lower[k] = upper[k] = 0.5 * (lower[k] + upper[k])
+            changes[k] += directions[k, d] * later[d]
+        lower[k] = shift + (least if k == 0 else -tangential)
+        upper[k] = shift + (most if k == 0 else tangential)
+    slip = np.abs(changes[1:]).max()
+    for k in range(count):
+        low, high, change, largest = lower[k], upper[k], changes[k], abs(changes[0]) if k == 0 else slip
+        if largest > max(high - low, 0.0):
+            change *= (high - low) / largest
+        lower[k] = min(low - min(change, 0.0), high)
+        upper[k] = max(high - max(change, 0.0), low)
     return directions, lower, upper
 
 
@@ -200,6 +207,7 @@ class Contact:
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, perch_offset: float) -> None:
         start, R_WS = problem.start, problem.surface.R_WS
+        inset = min(INSET, 0.5 * (settings.impact_speed_max - settings.impact_speed_min))
         self.velocity = problem.target_velocity
         self.points = problem.points.copy()
         self.points[-1] += perch_offset * R_WS[:, 2]
@@ -208,5 +216,5 @@ class Contact:
         derivatives = tuple(map(np.array, zip(*fixed))) if fixed else _NO_DERIVATIVES
         self.problem = (self.points, start.v, start.a, start.j, *derivatives, R_WS, self.velocity, settings.impact_acceleration,
                         TUBE_SHARE, TUBE_FLOOR, settings.tube_time, TUBE_STEP, settings.contact_delay,
-                        settings.impact_speed_min + INSET, settings.impact_speed_max - INSET,
+                        settings.impact_speed_min + inset, settings.impact_speed_max - inset,
                         settings.tangential_speed_max * _INSCRIBED - INSET)

@@ -16,7 +16,7 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.values import Certificate
 from perch_core.vehicle import Vehicle
 from perch_planner import refusals, relaxation
-from perch_planner.certificates import certificates
+from perch_planner.certificates import perch_certificates
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.search import Attempt, Search
 
@@ -69,5 +69,4 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     if settings.minimum_time:
         outcome = search.shortest(durations, outcome)
     trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
-    proofs = certificates(outcome.results, limits, vehicle.mass)
-    return PerchPlan(trajectory, proofs, search.iterations, perf_counter() - begin, tuple(search.attempts))
+    return PerchPlan(trajectory, perch_certificates(search, outcome), search.iterations, perf_counter() - begin, tuple(search.attempts))

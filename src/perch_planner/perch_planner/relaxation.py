@@ -18,7 +18,7 @@ import numpy as np
 
 from perch_core.vehicle import Vehicle
 from perch_planner import plan_checks, refusals
-from perch_planner.certificates import certificates
+from perch_planner.certificates import perch_certificates
 from perch_planner.plan_checks import MAXIMUM, MINIMUM
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
@@ -73,7 +73,7 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
     """
     settings, vehicle = search.settings, search.vehicle
     asked = _asked(settings, Limits.of(settings, vehicle))
-    proofs = certificates(best.results, Limits.of(settings, vehicle), vehicle.mass)
+    proofs = perch_certificates(search, best)
     longest = max((attempt.duration for attempt in search.attempts), default=0.0)
     tried = f"{search.iterations} programs up to {longest:.2f} s"
     least, most = vehicle.thrust_min, vehicle.thrust_max
