@@ -5,7 +5,8 @@
 The control laws ask for rotor speeds as always. What moment M and thrust T the rotors of the model have a period later, with their own
 lag and limits, is what the loop is asked for, by the inverse of its model; so it has no more to do than rotors can:
 
-    w_cmd = w + rate_lag J^-1 (M - w x J w)      T_cmd = T_now + (T - T_now) / (1 - exp(-period / thrust_lag))
+    w_cmd = (w + rate_lag J^-1 (M - w x J w)) / rate_gain
+    T_cmd = (T_now + (T - T_now) / (1 - exp(-period / thrust_lag))) / thrust_gain
     q_cmd = q exp(attitude_lag (w_cmd - w_C)), for an attitude loop that asks for the rates w_C + error / attitude_lag
 
 all of it at the time at which the command acts. `InnerLoopEstimate` takes the place of `RotorEstimate`.

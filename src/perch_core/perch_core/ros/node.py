@@ -83,7 +83,7 @@ def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterato
     one lives: else the probe's end would be that of the process's participant, and Fast DDS may wait for ever where a participant ends while
     it discovers others.
     """
-    plain = {"enable_rosout": False, "start_parameter_services": False}
+    plain: dict[str, Any] = {"enable_rosout": False, "start_parameter_services": False}
     keeper = Node(f"_{name}_starting", use_global_arguments=False, context=kwargs.get("context"), **plain)
     try:
         probe = Node(name, **plain, **{k: v for k, v in kwargs.items() if k != "wiring"})

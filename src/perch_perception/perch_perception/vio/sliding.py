@@ -1,6 +1,6 @@
 """Tracks slide: what KLT follows is not a fixed point of the scene.
 
-A patch changes as the view of it does, and KLT's fit moves with it. Measured on rendered flights (docs/estimation.md), the error
+A patch changes as the view of it does, and KLT's fit moves with it. Measured on rendered flights (docs/ablations.md), the error
 of a track is hardly white (0.09 px); it walks, and stands still where the view does. Per frame, in each direction of the image,
 
     q = slide_turn^2 |d beta| + slide_zoom^2 |d ln distance|,
