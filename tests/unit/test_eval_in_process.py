@@ -22,7 +22,7 @@ def flown():
 
 
 def test_an_image_exposed_before_the_first_step_ends_is_looked_at():
-    loop = arrange(load_scenario("surface_90_far"), 64, replace={"estimator": TruthEstimator()})
+    loop = arrange(load_scenario("surface_90_far"), 77, replace={"estimator": TruthEstimator()})
     first = loop.step()
     for _ in range(30):
         loop.step()

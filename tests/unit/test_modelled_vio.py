@@ -9,6 +9,7 @@ from perch_core.errors import ConfigError
 from perch_core.values import CameraModel, OdometryState, rotated
 from perch_core.vehicle import load_vehicle
 from perch_sim import modelled_vio, seeding, vio_model
+from perch_sim.calibration import true_imu
 from perch_sim.imu import Imu
 from perch_sim.modelled_vio import ModelledVio
 from perch_sim.vio_model import VioModelParameters
@@ -86,9 +87,10 @@ def test_its_whole_state_is_as_wrong_as_its_covariance_says(monkeypatch):
         vio.on_camera_info(frame(stamp - 20 * MS + OFFSET))
         s = states[-1]
         true = truth(s.stamp)
-        imu = Imu(load_vehicle("snapdragon").imu, seeding.stream(seed, "imu"))
+        config = true_imu(load_vehicle("snapdragon").imu, seed)
+        imu = Imu(config, seeding.stream(seed, "imu"))
         theta = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(s.q_WB), np.array(true.q_WB)))
-        walked = np.random.default_rng(seed).standard_normal(6) * np.sqrt(19.98) * np.repeat([0.0002, 0.002], 3)
+        walked = np.random.default_rng(seed).standard_normal(6) * np.sqrt(19.98) * np.repeat([config.gyro_bias_walk, config.accel_bias_walk], 3)
         error = np.concatenate([true.p_WB - s.p_WB, true.v_WB - s.v_WB, theta, imu.bias[3:] + walked[:3] - s.gyro_bias,
                                 imu.bias[:3] + walked[3:] - s.accel_bias])
         assert np.linalg.eigvalsh(s.covariance).min() > 0.0 and np.array_equal(s.covariance, s.covariance.T)

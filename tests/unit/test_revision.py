@@ -34,7 +34,7 @@ def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text(f"# Results\n\n{revision.banner('1234567')}\n\n## A table\n")
     assert page.read_text().splitlines()[2] == (
-        "> **Of commit 1234567** (digest 0123456789ab). What has changed since: `git diff --stat 1234567 -- src config`")
+        "> **Of commit 1234567** (digest 0123456789ab). What has changed since: `git diff --stat 1234567 -- src config requirements`")
     assert revision.mark([page]) == []
     monkeypatch.setattr(revision, "digest", lambda: "ba9876543210")
     assert revision.mark([page]) == [page] and revision.mark([page]) == []
@@ -43,7 +43,7 @@ def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
 
 def test_results_of_several_commits_are_older_than_the_code():
     text = revision.banner("13d2870+, cde665f")
-    assert "Of commits 13d2870+, cde665f, older than the code**" in text and "git diff --stat 13d2870 -- src config" in text
+    assert "Of commits 13d2870+, cde665f, older than the code**" in text and "git diff --stat 13d2870 -- src config requirements" in text
     assert not revision.out_of_date(text, NOW)
 
 
