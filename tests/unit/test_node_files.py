@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
 
 import pytest
 from perch_core import config
+from perch_core.ros import parameters
 from perch_eval.in_process.parameters import COMPONENTS, component_class
 
 FILES = {name: config.config_dir() / f"{name}.yaml" for name in COMPONENTS}
@@ -22,13 +22,5 @@ def test_its_values_are_the_defaults(name):
 
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_each_parameter_says_what_it_is(name):
-    def silent(cls: type, prefix: str = "") -> list[str]:
-        kinds, out = typing.get_type_hints(cls), []
-        for field in config.settable(cls):
-            if dataclasses.is_dataclass(kinds[field.name]):
-                out += silent(kinds[field.name], f"{prefix}{field.name}.")
-            elif not field.metadata.get("doc"):
-                out.append(prefix + field.name)
-        return out
-
-    assert not silent(component_class(name, {}).config_type)
+    leaves = parameters._leaves(component_class(name, {}).config_type)
+    assert not [leaf for leaf, (field, _) in leaves.items() if not field.metadata.get("doc")]
