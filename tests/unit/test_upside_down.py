@@ -56,14 +56,21 @@ def hovering():
 
 
 def failed(loop, fault, lasting):
-    """The controller's state when the vehicle has failed, or 3 s after it turned over, the time since it last moved [s], and what it says."""
+    """The controller's state when it has failed, or the vehicle has lain for 1.6 s, the time since it last moved [s], and what it says."""
     since = fault(loop) if lasting is None else fault(loop, lasting)
     flight, plant = loop.components["controller"].flight, loop.vehicle.simulation.plant
-    moved = since
-    while flight.state is not State.FAILED and loop.time < since + 4.0:
-        loop.step()
+
+    def moving():
         x = plant.state
-        if so3.quat_to_matrix(x.q_WB)[2, 2] > 0.0 or np.linalg.norm(x.v_WB) > 0.05 or np.linalg.norm(x.w_WB_B) > 0.5:
+        return so3.quat_to_matrix(x.q_WB)[2, 2] > 0.0 or np.linalg.norm(x.v_WB) > 0.05
+
+    while loop.time < since + 0.2 or moving():
+        loop.step()
+        assert loop.time < since + 3.0, "it does not lie there"
+    lying = moved = loop.time
+    while flight.state is not State.FAILED and loop.time < lying + 1.6:
+        loop.step()
+        if moving() or np.linalg.norm(plant.state.w_WB_B) > 0.5:  # it rocks, as its rotors turn
             moved = loop.time
     return flight.state, loop.time - moved, flight.flown.message
 
