@@ -1,4 +1,4 @@
-"""Falls that end upside down on the ground: the motors stop within 1.5 s of its last movement, and the controller says FAILED."""
+"""Falls that end upside down on the ground: the motors stop within 1.5 s, and the controller says FAILED."""
 
 from __future__ import annotations
 
@@ -56,27 +56,20 @@ def hovering():
 
 
 def failed(loop, fault, lasting):
-    """The controller's state when it has failed, or the vehicle has lain for 1.6 s, the time since it last moved [s], and what it says."""
+    """The controller's state when it has failed, or the vehicle has lain for 1.5 s, and what it says."""
     since = fault(loop) if lasting is None else fault(loop, lasting)
     flight, plant = loop.components["controller"].flight, loop.vehicle.simulation.plant
-
-    def moving():
-        x = plant.state
-        return so3.quat_to_matrix(x.q_WB)[2, 2] > 0.0 or np.linalg.norm(x.v_WB) > 0.05
-
-    while loop.time < since + 0.2 or moving():
+    while loop.time < since + 0.2 or so3.quat_to_matrix(plant.state.q_WB)[2, 2] > 0.0 or np.linalg.norm(plant.state.v_WB) > 0.05:
         loop.step()
         assert loop.time < since + 3.0, "it does not lie there"
-    lying = moved = loop.time
-    while flight.state is not State.FAILED and loop.time < lying + 1.6:
+    lying = loop.time
+    while flight.state is not State.FAILED and loop.time < lying + 1.5:
         loop.step()
-        if moving() or np.linalg.norm(plant.state.w_WB_B) > 0.5:  # it rocks, as its rotors turn
-            moved = loop.time
-    return flight.state, loop.time - moved, flight.flown.message
+    return flight.state, flight.flown.message
 
 
 @pytest.mark.parametrize("fault, lasting", [(upside_down, None), (imu_fails, 1.0), (imu_fails, math.inf), (controller_stops, 0.6),
                                             (controller_stops, 1.0)])
 def test_upside_down_on_the_ground_is_failed_within_one_and_a_half_seconds(fault, lasting, hovering):
-    state, after, message = branched(lambda: failed(hovering, fault, lasting))
-    assert state is State.FAILED and after < 1.5, (state, message)
+    state, message = branched(lambda: failed(hovering, fault, lasting))
+    assert state is State.FAILED, (state, message)

@@ -9,6 +9,7 @@ from perch_core.arrays import Array
 from perch_core.errors import PlanningRefusal
 from perch_core.jit import compiled
 from perch_core.values import Certificate
+from perch_core.vector3 import norm
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 
@@ -38,7 +39,7 @@ class PerchRefusal(PlanningRefusal):
 
 @compiled
 def _figures(points: Array, a: Array, R_WS: Array, extension: float, offset: float, moving: bool, low_height: float,
-             high_height: float, clearance: float) -> tuple[float, float, float, int, float, int, float]:
+             high_height: float, clearance: float) -> tuple[float, float, float, int, float, int, float, float]:
     """What is known of a plan from its start and its points.
 
     Args:
@@ -52,13 +53,14 @@ def _figures(points: Array, a: Array, R_WS: Array, extension: float, offset: flo
     Returns:
         (specific thrust of the start [m/s^2], reach of the rim towards the surface at the start [m], distance of the start
         from the surface's plane [m], first point whose height is out of range and that height [m], first waypoint that is too
-        near to the plane and its distance [m]); points are -1 where there is none.
+        near to the plane and its distance [m], least length of the way to the contact [m]); points are -1 where there is none.
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
     specific = sqrt(x * x + y * y + z * z)
     lean = min(abs(x * R_WS[0, 2] + y * R_WS[1, 2] + z * R_WS[2, 2]) / max(specific, 1e-9), 1.0)
     last, wrong, near = len(points) - 1, -1, -1
     start = height = distance = 0.0
+    way = -abs(offset)
     for k in range(last + 1):
         z = points[k, 2] + (offset * R_WS[2, 2] if k == last else 0.0)
         if wrong < 0 and not (moving and k == last) and not low_height <= z <= high_height:
@@ -66,11 +68,13 @@ def _figures(points: Array, a: Array, R_WS: Array, extension: float, offset: flo
         far = 0.0
         for d in range(3):
             far += R_WS[d, 2] * (points[k, d] - points[last, d])
+        if k:
+            way += norm((points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1], points[k, 2] - points[k - 1, 2]))
         if k == 0:
             start = far
         elif k < last and near < 0 and far <= clearance:
             near, distance = k, far
-    return specific, extension * sqrt(1.0 - lean * lean), start, wrong, height, near, distance
+    return specific, extension * sqrt(1.0 - lean * lean), start, wrong, height, near, distance, way
 
 
 def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
@@ -78,7 +82,7 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
 
     Raises:
         PerchRefusal: the surface's attitude needs a thrust out of range [M:eq9, M:eq11], the vehicle cannot hover, the
-            start or the contact break the box, or the start breaks the thrust range.
+            start or the contact break the box, the start breaks the thrust range, or the contact is too far away.
     """
     low, high = limits.thrust
     contact = vehicle.mass * settings.impact_acceleration
@@ -96,7 +100,7 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
                            f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N")
     start, surface = problem.start, problem.surface
-    specific, rim, distance, wrong, height, near, at_waypoint = _figures(
+    specific, rim, distance, wrong, height, near, at_waypoint, way = _figures(
         problem.points, start.a, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
         *limits.height, limits.clearance)
     specific *= vehicle.mass
@@ -113,6 +117,10 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
+    if way > limits.speed * settings.duration_max and not any(problem.target_velocity.tolist()):
+        raise PerchRefusal(BOX, "speed_max and duration_max", limits.speed * settings.duration_max - way,
+                           f"the way to the contact is {way:.1f} m, longer than speed_max {limits.speed:g} m/s goes in duration_max "
+                           f"{settings.duration_max:g} s")
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
                            f"the start is {_place(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it")
