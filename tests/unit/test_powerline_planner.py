@@ -19,11 +19,9 @@ from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import P, Q, V
 from perch_core.values import AtEnd
 from perch_core.vehicle import load_vehicle
-from perch_planner.powerline import planner as planning
-from perch_planner.powerline import problem, service
-from perch_planner.powerline.planner import LINES_MAX, PowerlinePlanner
+from perch_planner.powerline import problem, relaxation, search, service
+from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
-from perch_planner.powerline.relaxation import RELAXATIONS
 from perch_planner.powerline.report import write_report
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from system.scripts import call_script
@@ -135,7 +133,7 @@ def test_a_recovery_from_inside_a_wire_is_refused(planner: PowerlinePlanner, pla
 
 
 def test_more_lines_than_the_problem_holds_are_all_avoided(planner: PowerlinePlanner) -> None:
-    fence = tuple(Segment([8.0 + 0.3 * k, 0, 4.2], [0, 1, 0], 2.0, 0.03, 100 + k) for k in range(2 * LINES_MAX))
+    fence = tuple(Segment([8.0 + 0.3 * k, 0, 4.2], [0, 1, 0], 2.0, 0.03, 100 + k) for k in range(2 * search.LINES_MAX))
     plan = planner.plan(replace(REQUEST, lines=REQUEST.lines + fence, with_recovery=False))
     assert next(b for b in plan.bounds if b.quantity == "clearance").holds
 
@@ -175,7 +173,7 @@ def near_the_ground(drop: float = 2.6) -> PowerlineRequest:
 
 
 def test_a_perch_that_is_not_found_is_refused_with_the_limit_without_which_it_is(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planning, "LAST_RESORT", np.inf)  # IPOPT takes seconds to find none either
+    monkeypatch.setattr(relaxation, "LAST_RESORT", np.inf)  # IPOPT takes seconds to find none either
     with pytest.raises(PlanningRefusal, match=r"keeps the height limit; without it there is one: height in .* required \[0.8") as refusal:
         planner.plan(near_the_ground())
     assert (refusal.value.code, refusal.value.constraint) == ("infeasible", "height [P:eq14e]") and refusal.value.margin < 0.0
@@ -184,8 +182,8 @@ def test_a_perch_that_is_not_found_is_refused_with_the_limit_without_which_it_is
 
 
 def test_a_refusal_says_that_no_limit_alone_is_the_cause(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planning, "RELAXATIONS", RELAXATIONS[3:])
-    monkeypatch.setattr(planning, "ATTEMPTS", 3)
+    monkeypatch.setattr(relaxation, "RELAXATIONS", relaxation.RELAXATIONS[3:])
+    monkeypatch.setattr(search, "ATTEMPTS", 3)
     with pytest.raises(PlanningRefusal, match="none of these alone .*: thrust range of the rotors, body-rate limit") as refusal:
         planner.plan(near_the_ground())
     assert refusal.value.code == "infeasible"

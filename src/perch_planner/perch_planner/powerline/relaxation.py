@@ -1,15 +1,21 @@
-"""Limits of a perch, to be taken away one at a time where the solver finds none: what a caller can change first, then the vehicle's."""
+"""A perch, and where the solver finds none, the limit without which there is one: what a caller can change first, then the vehicle's."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from time import perf_counter
 from typing import NamedTuple
 
+from perch_core.errors import PlanningRefusal
 from perch_core.vehicle import Vehicle
-from perch_planner.powerline.request import PowerlineRequest
+from perch_planner.powerline.plan import Manoeuvre
+from perch_planner.powerline.request import PerchPose, PowerlineRequest
+from perch_planner.powerline.search import NotConverged, Search, Task
 from perch_planner.powerline.settings import PowerlineSettings
 
+FIRST_GUESSES = 2  # of a perch, before the limits are tried one at a time, and then IPOPT
+LAST_RESORT = 7.0  # times of a first attempt that does not converge, which IPOPT's greatest number of iterations takes
 FASTER = 2.0  # of the rotors, without the range of their thrust; thrust grows with the square
 
 _Problem = tuple[PowerlineRequest, PowerlineSettings, Vehicle]
@@ -37,3 +43,56 @@ RELAXATIONS = (
                lambda r, s, v: (r, s, replace(v, speed_min=0.0, speed_max=FASTER * v.speed_max))),
     Relaxation("body-rate limit", "body rate", lambda r, s, v: (r, s, replace(v, body_rate_max=1e3))),
 )
+
+
+def fly_perch(search: Search, request: PowerlineRequest, pose: PerchPose, until: float) -> Manoeuvre:
+    """A perch; where the first guesses lead to none, the limits are tried first, and then IPOPT while there is time.
+
+    Args:
+        search: of the vehicle, within all limits.
+        request: with its deadline.
+        pose: where to perch.
+        until: that deadline on the clock of `perf_counter` [s].
+
+    Raises:
+        PlanningRefusal: there is none; it names the limit without which there is one.
+    """
+    task = search.perch(request, pose)
+    try:
+        return search.fly(task, guesses=FIRST_GUESSES)
+    except NotConverged as refusal:
+        found, patience = _relaxed(search, task, refusal, until), refusal.patience
+    if isinstance(found, Manoeuvre):
+        return found
+    left = until - perf_counter() - (LAST_RESORT * patience if found.constraint != task.name else 0.0)  # a cause must not be lost
+    if left <= 0.0:
+        raise found
+    try:
+        return search.fly(replace(task, request=replace(request, solver="ipopt", deadline=left)), first=FIRST_GUESSES)
+    except NotConverged:
+        raise found from None
+
+
+def _relaxed(search: Search, task: Task, refusal: NotConverged, until: float) -> Manoeuvre | PlanningRefusal:
+    """A refusal that names the first limit without which a perch is soon found; that perch, where it keeps all limits."""
+    words = f"none of these alone is seen to be the cause: {', '.join(relaxation.words for relaxation in RELAXATIONS)}"
+    for relaxation in RELAXATIONS:
+        if perf_counter() + refusal.patience > until:
+            words = f"no time was left to look for the cause, allow more than {task.request.deadline:g} s"
+            break
+        request, settings, vehicle = relaxation.relaxed(replace(task.request, solver="fatrop"), search.settings, search.vehicle)
+        wider = replace(search, settings=settings, vehicle=vehicle)
+        try:
+            found = wider.fly(wider.perch(request, task.wanted), "trial", guesses=1)
+        except PlanningRefusal:
+            continue
+        bounds = search.bounds(task, found.times, found.states, found.rates)
+        broken = {str(bound): bound.margin for bound in bounds if not bound.holds}
+        if found.duration > task.duration[1]:
+            broken[f"duration {found.duration:.2f} s, required at most {task.duration[1]:g} s"] = task.duration[1] - found.duration
+        if not broken:
+            return replace(found, bounds=bounds)
+        first, margin = next(iter(broken.items()))
+        return PlanningRefusal(refusal.code, relaxation.constraint, margin,
+                               f"no perch was found that keeps the {relaxation.words}; without it there is one: {first}")
+    return PlanningRefusal(refusal.code, refusal.constraint, refusal.margin, f"{refusal}; {words}")

@@ -1,0 +1,257 @@
+"""Perch and recovery: solve, fly at 1 ms, check, and solve again where the check fails. [P:V-B, P:Fig.3]"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perch_core.errors import PlanningRefusal
+from perch_core.lines import Segment, scaled_clearance
+from perch_core.rotor_model import P, Q, STATES, THRUST
+from perch_core.so3 import quat_from_matrix
+from perch_core.values import Certificate
+from perch_core.vehicle import Vehicle
+from perch_planner.powerline import guess
+from perch_planner.powerline.certificate import certify, certify_end
+from perch_planner.powerline.flight import fly
+from perch_planner.powerline.formulation import Formulation, Weights
+from perch_planner.powerline.nlp import Numbers, Solution, Structure
+from perch_planner.powerline.plan import Manoeuvre
+from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
+from perch_planner.powerline.settings import Margins, PowerlineSettings
+from perch_planner.powerline.solving import Solver, end_room, end_weights, run_weights, see_weights
+from perch_planner.powerline.stage_functions import line_parameters
+
+LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
+ATTEMPTS = 6  # solves of one manoeuvre: with a larger N, or from another guess and with another solver
+EASED = 0.75  # of `leaving` and `approaching`, after each solve that finds no plan to the end: they are wishes, unlike the limits
+RADIUS_REDUCTION = 0.02  # the paper's, for a recovery that starts at the wire: part of a wire's radius is safety [m]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One manoeuvre to solve: a perch or a recovery.
+
+    Attributes:
+        name: for messages.
+        request: its start, every line for the check, whether the first one is kept in view, solver and deadline.
+        wanted: end pose and velocity.
+        lines: in the problem, the target first.
+        weights: of the costs.
+        end: what vanishes at the end, see `nlp.Structure`.
+        duration: bounds of T [s].
+        margins: by which the nodes keep away from the limits.
+        guess: attempt and N -> states and inputs.
+        accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
+        leaving: clearance that the margins grow to within a quarter of the time, if there is a plan; 0: they stay as they are.
+        approaching: clearance that they have until a tenth of the time before the end, if there is a plan; 0: the same.
+        at_end: clearance that the wanted pose leaves, which no margin exceeds there; 1: any.
+        radius_reduction: taken off the wires' radius [m].
+    """
+
+    name: str
+    request: PowerlineRequest
+    wanted: PerchPose
+    lines: tuple[Segment, ...]
+    weights: Weights
+    end: str
+    duration: tuple[float, float]
+    margins: Margins
+    guess: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
+    accuracy: tuple[float, float, float]
+    leaving: float = 0.0
+    approaching: float = 0.0
+    at_end: float = 1.0
+    radius_reduction: float = 0.0
+
+
+class NotConverged(PlanningRefusal):
+    """No manoeuvre was found, and nothing says which limit is the cause.
+
+    Attributes:
+        patience: time of the first attempt [s]; a trial without a limit, with half as many iterations, takes less.
+    """
+
+    def __init__(self, name: str, tried: str, patience: float) -> None:
+        super().__init__("infeasible", name, -1.0, f"no {name} was found: the solver did not converge from several guesses ({tried}); "
+                                                   "start farther away, higher, or choose another pitch")
+        self.patience = patience
+
+
+@dataclass(frozen=True)
+class Search:
+    """Looks for manoeuvres within the limits of a vehicle and of settings; a solver serves searches within other limits too."""
+
+    vehicle: Vehicle
+    settings: PowerlineSettings
+    formulation: Formulation
+    solver: Solver
+
+    def bounds(self, task: Task, times: np.ndarray, states: np.ndarray, rates: np.ndarray) -> tuple[Certificate, ...]:
+        """Certificates of a flight: all limits and its end."""
+        return (*certify(self.vehicle, times, states, rates, task.request.lines, self.settings.height_min, self._thrust_max(task), task.radius_reduction),
+                *certify_end(times, states, task.wanted, *task.accuracy))
+
+    def _thrust_max(self, task: Task) -> float:
+        """Greatest thrust of a rotor that a plan may use [N]."""
+        return max(self.settings.thrust_share * self.vehicle.thrust_max, float(task.request.start[THRUST].max()))
+
+    def perch(self, request: PowerlineRequest, pose: PerchPose) -> Task:
+        """From the start of a request, which has its deadline, to a pose."""
+        s, formulation, target = self.settings, self.formulation, request.target()
+        turn = aside = 0.0
+        if request.perception:
+            q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)
+            way = target.closest_point(pose.p_WB) - request.start[P]
+            turn = guess.facing_turn(request.start[Q], q_BC, way)
+            aside = guess.side_turn(request.start[Q], q_BC, target.direction, way)
+        T0 = guess.perch_duration(request.start, pose.p_WB)
+
+        def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+            return guess.perch_guess(self.solver.model, request.start, pose.p_WB, pose.s3_W, s.height_min + 0.05, intervals,
+                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn, aside)
+
+        approaching = min(s.margins.approaching, _share(self._clearance(request.start, request.lines)))
+        at_end = _share(0.5 * self._clearance(np.concatenate([pose.p_WB, pose.q_WB]), request.lines))
+        return Task(
+            "perch", request, pose, _relevant(request.lines, target, request.start[P], pose.p_WB), formulation.perch,
+            "perched" if formulation.hard_end else "", s.duration, s.margins, first_guess, formulation.accuracy, approaching=approaching, at_end=at_end)
+
+    def recovery(self, request: PowerlineRequest, hover: np.ndarray) -> Task:
+        """From the start of a request towards a hover [m], whatever else it asks for."""
+        s, formulation, start = self.settings, self.formulation, request.start
+        margins, reduction = self._room(start, request.lines)
+
+        def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+            return guess.recovery_guess(self.solver.model, start, hover, s.height_min + 0.1, intervals,
+                                        (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
+
+        nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
+        return Task(
+            "recovery", replace(request, perception=False), PerchPose(hover, E3), _relevant(request.lines, nearest, start[P], hover),
+            formulation.recovery, "hovering" if formulation.hard_end else "", s.recovery_duration, margins, first_guess,
+            (np.inf, *formulation.accuracy[1:]), leaving=margins.leaving, radius_reduction=reduction)
+
+    def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
+        """Margins that the start of a recovery leaves, and what to take off the wires' radii for it to begin free.
+
+        Raises:
+            PlanningRefusal: the body cuts a wire by more than that.
+        """
+        margins, clearance = self.settings.margins, np.inf
+        height = min(margins.height, max(0.0, 0.5 * (start[2] - self.settings.height_min)))
+        for reduction in (0.0, RADIUS_REDUCTION):
+            thin = [replace(line, radius=max(line.radius - reduction, 1e-3)) for line in lines]
+            clearance = self._clearance(start, thin)
+            if clearance > 0:
+                return replace(margins, height=height, clearance=min(margins.clearance, 0.5 * _share(clearance))), reduction
+        raise PlanningRefusal("start_invalid", "clearance [P:eq14j]", clearance,
+                              f"no recovery: the body cuts a line, scaled distance {1 + clearance:.2f} < 1")
+
+    def _clearance(self, state: np.ndarray, lines: Sequence[Segment]) -> float:
+        """Scaled distance of the nearest line from the body, less 1, at a state (17,); inf without lines."""
+        return min((float(scaled_clearance(state[None, P], state[None, Q], line, self.vehicle.body_radii)[0]) for line in lines),
+                   default=np.inf)
+
+    def fly(self, task: Task, cold: str = "sight", first: int = 0, guesses: int = ATTEMPTS) -> Manoeuvre:
+        """Solve, fly and check until the check passes.
+
+        Args:
+            task: what to solve.
+            cold: phase that begins from a guess.
+            first: attempt to begin with.
+            guesses: attempts of which one at least must converge.
+
+        Raises:
+            PlanningRefusal: it does not.
+        """
+        s, vehicle = self.settings, self.vehicle
+        thrust_max = self._thrust_max(task)
+        margins, wish, intervals, lines, solver_name = task.margins, EASED**first, s.intervals, task.lines, task.request.solver
+        iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, cold
+        patience = 0.0
+        for attempt in range(first, ATTEMPTS):
+            if time > task.request.deadline:  # a refusal with its cause is worth more than being stopped
+                break
+            states, inputs = previous if previous is not None else task.guess(attempt, intervals)
+            numbers = Numbers(
+                start=task.request.start, reference=np.concatenate([task.wanted.p_WB, task.wanted.s3_W, task.wanted.v_W, np.zeros(3)]),
+                lines=np.array([line_parameters(line, task.radius_reduction) for line in lines]).reshape(-1, 8),
+                run_weights=run_weights(task.weights, self.formulation.ramp, vehicle.thrust_rate_max, intervals),
+                end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
+                height_min=s.height_min + margins.height,
+                thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
+                body_rate=vehicle.body_rate_max - margins.body_rate, states=states, inputs=inputs,
+                clearance=_clearances(margins.clearance, wish * task.leaving, wish * task.approaching, task.at_end, intervals),
+                defects=np.zeros((intervals, STATES + 1)), end_room=end_room(task.end, *task.accuracy))
+            structure = Structure(intervals, len(lines), task.request.perception, task.end, solver_name)
+            found = self.solver.solve(structure, numbers, phase)
+            iterations, time, cpu_time = iterations + found.iterations, time + found.time, cpu_time + found.cpu_time
+            patience = patience or time
+            if not (found.converged and np.all(np.isfinite(found.states))):
+                if worst is None and attempt + 1 >= guesses:
+                    break
+                previous, phase, wish = None, cold, EASED * wish
+                solver_name = "ipopt" if attempt >= 1 else solver_name
+                continue
+            rates = vehicle.thrust_rate_max * np.clip(found.inputs, -1.0, 1.0)
+            times, flown, dense_rates = fly(self.solver.model, task.request.start, rates, found.duration)
+            bounds = self.bounds(task, times, flown, dense_rates)
+            broken = [bound for bound in bounds if not bound.holds]
+            if not broken:
+                return Manoeuvre(times, flown, dense_rates, bounds, intervals, solver_name, iterations, time, cpu_time,
+                                 found.cost)
+            worst = broken[0]
+            lines = _joined(lines, task.request.lines, flown, max(vehicle.body_radii))
+            missed = all(bound.quantity.startswith("end_") for bound in broken)
+            drifted = missed and phase != "polish"
+            if not drifted:
+                intervals = int(np.ceil(1.5 * intervals))
+                wish *= EASED if missed else 1.0
+            previous, phase = _resampled(found, intervals), "polish" if drifted else "solve"
+        if worst is not None:
+            raise PlanningRefusal("infeasible", worst.quantity, worst.margin, f"no {task.name} within the limits: {worst}")
+        raise NotConverged(task.name, found.status, patience)
+
+
+def _share(clearance: float) -> float:
+    """(d^2 - 1) / (d^2 + 1) of a scaled distance d = 1 + clearance: what margins are counted in."""
+    return 1.0 if np.isinf(clearance) else ((1 + clearance) ** 2 - 1) / ((1 + clearance) ** 2 + 1)
+
+
+def _clearances(least: float, leaving: float, approaching: float, at_end: float, intervals: int) -> np.ndarray:
+    """Clearance margins of all nodes but the first, shape (N,): `least` where a wire is left or met, more in the open."""
+    past = np.arange(1, intervals + 1) / intervals
+    open_air = np.maximum(np.minimum(4.0 * past, 1.0) * (leaving - least), np.minimum(10.0 * (1.0 - past), 1.0) * (approaching - least))
+    return np.minimum(least + np.maximum(open_air, 0.0), at_end + 10.0 * (1.0 - past))
+
+
+def _relevant(lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> tuple[Segment, ...]:
+    """The target first, then the others nearest to the straight way."""
+    way = np.linspace(start, end, 20)
+    others = sorted((line for line in lines if line is not target), key=lambda line: float(line.distance(way).min()))
+    return (*([target] if target is not None else []), *others[: LINES_MAX - 1])
+
+
+def _joined(lines: tuple[Segment, ...], known: tuple[Segment, ...], flown: np.ndarray, reach: float) -> tuple[Segment, ...]:
+    """The lines of the problem, the last replaced by one that the flight came too near to without its being there."""
+    present = {line.id for line in lines}
+    for line in known:
+        if line.id not in present and float(line.distance(flown[:, P]).min()) < 1.2 * reach:
+            return (*lines[: LINES_MAX - 1], line)
+    return lines
+
+
+def _resampled(found: Solution, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+    """A solution as the guess for another N: states interpolated, inputs held."""
+    old = len(found.inputs)
+    if old == intervals:
+        return found.states, found.inputs
+    s_old, s_new = np.linspace(0, 1, old + 1), np.linspace(0, 1, intervals + 1)
+    states = np.stack([np.interp(s_new, s_old, column) for column in found.states.T], axis=1)
+    states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
+    states[:, STATES] = found.duration
+    rows = np.minimum((s_new[:-1] * old).astype(int), old - 1)
+    return states, found.inputs[rows]
