@@ -7,10 +7,9 @@ after the file, so that it counts.
 
 from __future__ import annotations
 
-import os
 import sys
 
-from perch_setup import ROOT, command_parser, enter
+from perch_setup import ROOT, become, command_parser, enter, quiet_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/run_node.py vehicle
@@ -28,10 +27,11 @@ def main() -> int:
     parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     arguments, for_node = parser.parse_known_args()
     enter(*["view"] * (arguments.node == "viewer"))
-    from perch_core.errors import PerchError
-    from perch_eval.arguments import open_network
-    from perch_eval.nodes import executable
-    from perch_sim.scenario import NODES
+    with quiet_on_interrupt():
+        from perch_core.errors import PerchError
+        from perch_eval.arguments import open_network
+        from perch_eval.nodes import executable
+        from perch_sim.scenario import NODES
 
     packages = NODES | dict.fromkeys(("betaflight", "mavlink"), "perch_autopilot")
     try:
@@ -44,7 +44,7 @@ def main() -> int:
         return 2
     file = ROOT / "config" / f"{arguments.node}.yaml"
     with_file = ["--ros-args", "--params-file", str(file), "--"] if file.exists() and not arguments.no_config else []
-    os.execv(path, [path, *with_file, *for_node])
+    become(path, [path, *with_file, *for_node])
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Only the standard library is used here, because nothing else is installed when this code first runs.
 """
 
-from .enter import command_parser, enter, leave_quietly_on_interrupt, quiet_on_interrupt, run
+from .enter import become, command_parser, enter, leave_quietly_on_interrupt, quiet_on_interrupt, run
 from .errors import SetupError
 from .layout import EXTRAS, ROOT
 from .machine import Platform, detect_platform
@@ -14,6 +14,7 @@ __all__ = [
     "ROOT",
     "Platform",
     "SetupError",
+    "become",
     "command_parser",
     "detect_platform",
     "enter",

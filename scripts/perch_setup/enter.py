@@ -7,7 +7,7 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import NoReturn
 
@@ -36,6 +36,8 @@ def enter(*extras: str) -> None:
     Returns only inside the environment. Prints one line and exits where set-up cannot be done.
     """
     if os.environ.get(_ENTERED) == str(os.getpid()) and sys.prefix == str(VENV):
+        with quiet_on_interrupt():
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         return
     try:
         environment = variables(prepare(extras=() if _HELP & set(sys.argv) else extras))
@@ -48,7 +50,13 @@ def enter(*extras: str) -> None:
     environment[_ENTERED] = str(os.getpid())
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execve(VENV_PYTHON, [str(VENV_PYTHON), *sys.argv], environment)
+    become(str(VENV_PYTHON), [str(VENV_PYTHON), *sys.argv], environment)
+
+
+def become(path: str, arguments: list[str], environment: Mapping[str, str] = os.environ) -> NoReturn:
+    """Start another program in this process. Python shows a traceback of Ctrl-C while it starts: one is held back until our code runs."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.execve(path, arguments, environment)
 
 
 def run(module: str, *extras: str) -> NoReturn:

@@ -6,9 +6,11 @@ import ctypes
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from perch_eval.nodes import executable
 from perch_eval.program import Program
 from perch_eval.stack import Stack
 
@@ -53,6 +55,32 @@ with quiet_on_interrupt():
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60.0)
     assert (process.returncode, error) == (130, "")
+
+
+def interrupted_once(process: subprocess.Popen, file: str, words: str) -> str:
+    """What a process says after SIGINT at the moment when words are in a file of its /proc."""
+    place = Path(f"/proc/{process.pid}/{file}")
+    while words not in place.read_text() and process.poll() is None:
+        time.sleep(0.001)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60.0)[1]
+    assert process.returncode in (0, 130), said  # 0: it has begun to be a node
+    return said
+
+
+CONTROLLER = executable("perch_control", "controller")
+
+
+@pytest.mark.parametrize("file, words", [
+    ("cmdline", f"{sys.executable}\0{SCRIPTS}"), ("cmdline", CONTROLLER), ("maps", "_multiarray_umath"), ("maps", "_rclpy_pybind11")])
+def test_ctrl_c_while_run_node_starts_leaves_no_traceback(ros_domain, file, words):
+    command = [sys.executable, "-S", str(SCRIPTS / "run_node.py"), "controller"]
+    assert interrupted_once(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), file, words) == ""
+
+
+@pytest.mark.parametrize("words", ["_multiarray_umath", "_rclpy_pybind11"])
+def test_ctrl_c_while_an_executable_loads_leaves_no_traceback(ros_domain, words):
+    assert interrupted_once(subprocess.Popen([CONTROLLER], stderr=subprocess.PIPE, text=True), "maps", words) == ""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

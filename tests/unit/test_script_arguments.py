@@ -85,7 +85,7 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     monkeypatch.setattr(script, "enter", lambda *_: None)
-    monkeypatch.setattr(script.os, "execv", become)
+    monkeypatch.setattr(script, "become", become)
     monkeypatch.setattr(sys, "argv", ["run_node.py", node, "--ros-args", "-p", "link:=/dev/ttyACM0"])
     with pytest.raises(Became) as started:
         script.main()

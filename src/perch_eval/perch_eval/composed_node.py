@@ -13,8 +13,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from perch_core.ros.node import run
-from perch_core.ros.wiring import Wiring
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import run
+    from perch_core.ros.wiring import Wiring
 
 
 def create_nodes(plan: list[dict[str, Any]], wiring: Wiring) -> list[Any]:

@@ -1,7 +1,10 @@
 """Node `recorder`: `ros2 run perch_eval recorder`."""
 
-from perch_core.ros.node import node
-from perch_eval.ros.recorder import Recorder
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import node
+    from perch_eval.ros.recorder import Recorder
 
 NODE = node("recorder", Recorder)
 create, main = NODE.create, NODE.main

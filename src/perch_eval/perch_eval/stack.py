@@ -18,8 +18,8 @@ from perch_eval.shared_memory import SharedMemory
 
 _ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 1.0))
 """Signals to stop with, and how long each has [s]: on a busy machine a recording may need seconds to be finished."""
-_AT_START = ((signal.SIGINT, 0.3), (signal.SIGTERM, 0.2), (signal.SIGKILL, 1.0))
-"""The same while programs load and compile: they have nothing to finish, and may not listen yet."""
+_AT_START = ((signal.SIGTERM, 0.5), (signal.SIGKILL, 1.0))
+"""The same while programs load and compile: they have nothing to finish, and Python would show a traceback of SIGINT."""
 _POLL_S = 0.02
 
 

@@ -1,7 +1,10 @@
 """Node `viewer`: `ros2 run perch_eval viewer`."""
 
-from perch_core.ros.node import node
-from perch_eval.ros.viewer import Viewer
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import node
+    from perch_eval.ros.viewer import Viewer
 
 NODE = node("viewer", Viewer)
 create, main = NODE.create, NODE.main

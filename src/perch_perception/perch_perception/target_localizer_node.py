@@ -1,7 +1,10 @@
 """Node `target_localizer`: `ros2 run perch_perception target_localizer`."""
 
-from perch_core.ros.node import node
-from perch_perception.target_localizer import TargetLocalizer
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import node
+    from perch_perception.target_localizer import TargetLocalizer
 
 NODE = node("target_localizer", TargetLocalizer)
 create, main = NODE.create, NODE.main

@@ -1,7 +1,10 @@
 """Node `powerline_planner`: `ros2 run perch_planner powerline_planner`."""
 
-from perch_core.ros.node import node
-from perch_planner.powerline_planner import PowerlinePlannerComponent
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import node
+    from perch_planner.powerline_planner import PowerlinePlannerComponent
 
 NODE = node("powerline_planner", PowerlinePlannerComponent)
 create, main = NODE.create, NODE.main

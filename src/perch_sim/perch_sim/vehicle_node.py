@@ -1,7 +1,10 @@
 """Node `vehicle`: `ros2 run perch_sim vehicle`. In lockstep it owns the schedule, otherwise the wall clock paces it."""
 
-from perch_core.ros.node import node
-from perch_sim.simulated_vehicle import SimulatedVehicle
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import node
+    from perch_sim.simulated_vehicle import SimulatedVehicle
 
 NODE = node("vehicle", SimulatedVehicle, deadline="imu", lockstep="perch_sim.ros.vehicle_node:VehicleNode")
 create, main = NODE.create, NODE.main

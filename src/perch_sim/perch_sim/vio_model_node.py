@@ -1,7 +1,10 @@
 """Node `vio_model`: `ros2 run perch_sim vio_model`. A stand-in for VIO, made from the truth."""
 
-from perch_core.ros.node import node
-from perch_sim.modelled_vio import ModelledVio
+from perch_core.interrupts import quiet_on_interrupt
+
+with quiet_on_interrupt():
+    from perch_core.ros.node import node
+    from perch_sim.modelled_vio import ModelledVio
 
 NODE = node("vio_model", ModelledVio)
 create, main = NODE.create, NODE.main
