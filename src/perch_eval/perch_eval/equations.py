@@ -7,7 +7,6 @@ or `[M:eq15]`. A tag may name several: `[P:eq3-7]`, `[M:eq2,12,13]`, `[M:alg1]`;
 
 from __future__ import annotations
 
-import argparse
 import ast
 import re
 import sys
@@ -15,8 +14,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from perch_eval.arguments import command_parser
 from perch_eval.revision import root
 
+EXAMPLES = """examples:
+  python3 scripts/equations.py                                       write docs/equations.md
+  python3 scripts/equations.py && git diff docs/equations.md         see what has moved
+  grep -rnI M:eq15 src                                               see all that has to do with an equation
+
+exit code: 0 written, 1 written, but an equation has not the one definition that flies"""
 TITLES = {
     "M": {"eq1": "rigid-body dynamics", "eq2": "geometric control: thrust and moment", "eq3": "piecewise polynomials",
           "eq4": "cost: squared derivative", "eq5": "cost matrix of one segment", "eq6": "derivatives at a time",
@@ -180,7 +186,7 @@ def page(root: Path) -> str:
 
 def main() -> int:
     """Write docs/equations.md; 1 where it has an equation without the one definition that flies."""
-    argparse.ArgumentParser(prog="equations.py", description=__doc__, epilog="example:  python3 scripts/equations.py").parse_args()
+    command_parser("equations.py", __doc__, EXAMPLES).parse_args()
     (root() / "docs" / "equations.md").write_text(page(root()))
     for line in (wrong := problems(root())):
         print(line, file=sys.stderr)
