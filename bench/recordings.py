@@ -77,13 +77,9 @@ ODOMETRY = """
 
 ATE by `evo`, after alignment; drift and attitude from the start on, with place and heading of the start taken away.
 """
-V101 = """What these figures are made of:
-
-- The attitude's error is tilt. At rest the accelerometer reads 0.075 and -0.067 m/s^2 across the truth's vertical, which cannot be
-  told from a tilt of 0.39 and 0.44 deg about x and y.
-- The path that the estimator is compared over ends in a rise of 14 cm, too straight for an ATE of the attitude.
-- NEES is that of `sensor.yaml`'s densities: the rotors shake the IMU, whose noise at rest is 16 times those of the file in both
-  sensors, and `perceive.py` warns of it."""
+V101 = """
+At rest a tilt cannot be told from the accelerometer's bias. NEES is that of `sensor.yaml`'s densities, while the idling rotors shake
+the IMU: `perceive.py` warns of it."""
 TAGS = """
 OpenVINS and VINS-Mono report some centimetres of ATE on the whole of V1_01 (58 m), which is not among these recordings.
 
@@ -96,21 +92,18 @@ OpenVINS and VINS-Mono report some centimetres of ATE on the whole of V1_01 (58 
 pupil-apriltags (`pip install pupil-apriltags`) with `quad_decimate` 1 on the same images, beside:
 """
 WIRES = """
-What is found on NASA's photographs beyond the reference was looked at: all 13 are tags. The clipboard's reference is the
-calibration over all its images and tags, and over the distances between its rows and columns: the paper is not flat. The rotation
-series' calibration is not the camera's: least squares over all 15 photographs moves the principal point by 29 px, and the turns are
-then wrong by 1.1 deg as well, which is what the turntable leaves.
+The clipboard's reference is the calibration over all its images and tags, and over the distances between its rows and columns: the
+paper is not flat. The rotation series is scored with its repository's calibration.
 
 ## Wires
 
 By length, within 8 px of what is traced (which are a wire's edges). PLDU and PLDM: all photographs of the published test sets, every
-sixth of which was used to choose thresholds. Nobody has traced the street's wires: of 47 arcs, 37 were wires when they were looked at,
-the others mullions, eaves, edges of houses and two poles.
+sixth of which was used to choose thresholds. Nobody has traced the street's wires.
 """
 END = """
 In rooms arcs are edges of doors and folds of curtains, on NASA's photographs painted lines. What lies on a surface is told from a wire
-by its motion (`backdrop`), which single photographs do not show. Wires that end at a pole before they cross half of the image, and the
-three of one street photograph before a tree, are not found."""
+by its motion (`backdrop`), which single photographs do not show. Wires that end at a pole before they cross half of the image are not
+found."""
 
 
 # -- the page --------------------------------------------------------------------------------------------------------
