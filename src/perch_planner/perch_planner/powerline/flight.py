@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.components import components
 from perch_core.rotor_model import INPUTS, STATES, RotorModel, rk4
 
-STEP = 1e-3  # [s], as in the paper
+STEP = 1e-3  # upper bound [s], as in the paper
 
 
 @lru_cache(maxsize=8)
@@ -24,8 +24,7 @@ def _chain(model: RotorModel, steps: int) -> ca.Function:
     return _flow(model).mapaccum(f"chain{steps}", steps)
 
 
-def fly(model: RotorModel, start: np.ndarray, rates: np.ndarray, duration: float, step: float = STEP
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fly(model: RotorModel, start: np.ndarray, rates: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrate the model under piecewise constant thrust rates.
 
     Args:
@@ -33,14 +32,13 @@ def fly(model: RotorModel, start: np.ndarray, rates: np.ndarray, duration: float
         start: state, shape (17,).
         rates: thrust rates of each of N equal intervals [N/s], shape (N, 4).
         duration: of all intervals together [s].
-        step: upper bound of the integration step [s].
 
     Returns:
         Times from 0 [s], shape (m + 1,), states with unit quaternions, shape (m + 1, 17), and the rate in force after
         each state, shape (m + 1, 4), the last repeated.
     """
     intervals = len(rates)
-    per_interval = max(1, int(np.ceil(duration / intervals / step)))
+    per_interval = max(1, int(np.ceil(duration / intervals / STEP)))
     h = duration / (intervals * per_interval)
     inputs = np.repeat(np.asarray(rates, float), per_interval, axis=0)
     # One interval at a time: the chain's length then depends on the step only, and few chains are built.

@@ -34,12 +34,12 @@ class PowerlinePlanner:
     def __post_init__(self) -> None:
         self.solver = Solver(self.vehicle, self.gravity, self.settings.camera)
 
-    def warm_up(self, lines: int = 3) -> None:
-        """Build the solvers of the usual structures beforehand, so that the first plan is as fast as the others."""
+    def warm_up(self) -> None:
+        """Build the solvers of the usual structures, with three lines, beforehand, so that the first plan is as fast as the others."""
         for perception, end in ((False, "perched"), (True, "perched"), (False, "hovering")):
             for phase in PHASES:
                 if phase != "trial" and (perception or phase != "sight"):  # nobody solves that one without perception costs
-                    self.solver.problem(Structure(self.settings.intervals, lines, perception, end), phase)
+                    self.solver.problem(Structure(self.settings.intervals, 3, perception, end), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
         """Plan a perch with its recovery, or a recovery alone; a perch after which no recovery is found says so.
