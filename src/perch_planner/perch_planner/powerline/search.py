@@ -125,8 +125,7 @@ class Search:
         margins, reduction = self._room(start, request.lines)
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-            return guess.recovery_guess(self.solver.model, start, hover, s.height_min + 0.1, intervals,
-                                        (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
+            return guess.recovery_guess(self.solver.model, start, hover, s.height_min + 0.1, intervals, (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
 
         nearest = min(request.lines, key=lambda line: float(line.distance(start[P])), default=None)
         return Task(
@@ -167,11 +166,9 @@ class Search:
         Raises:
             PlanningRefusal: it does not.
         """
-        s, vehicle = self.settings, self.vehicle
-        thrust_max = self._thrust_max(task)
+        s, vehicle, thrust_max = self.settings, self.vehicle, self._thrust_max(task)
         margins, wish, intervals, lines, solver_name = task.margins, EASED**first, s.intervals, task.lines, task.request.solver
-        iterations, time, cpu_time, worst, previous, phase = 0, 0.0, 0.0, None, None, cold
-        patience = 0.0
+        iterations, time, cpu_time, patience, worst, previous, phase = 0, 0.0, 0.0, 0.0, None, None, cold
         for attempt in range(first, ATTEMPTS):
             if time > task.request.deadline:  # a refusal with its cause is worth more than being stopped
                 break
@@ -181,13 +178,11 @@ class Search:
                 lines=np.array([line_parameters(line, task.radius_reduction) for line in lines]).reshape(-1, 8),
                 run_weights=run_weights(task.weights, self.formulation.ramp, vehicle.thrust_rate_max, intervals),
                 end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
-                height_min=s.height_min + margins.height,
-                thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
+                height_min=s.height_min + margins.height, thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),
                 body_rate=vehicle.body_rate_max - margins.body_rate, states=states, inputs=inputs,
                 clearance=_clearances(margins.clearance, wish * task.leaving, wish * task.approaching, task.at_end, intervals),
                 defects=np.zeros((intervals, STATES + 1)), end_room=end_room(task.end, *task.accuracy))
-            structure = Structure(intervals, len(lines), task.request.perception, task.end, solver_name)
-            found = self.solver.solve(structure, numbers, phase)
+            found = self.solver.solve(Structure(intervals, len(lines), task.request.perception, task.end, solver_name), numbers, phase)
             iterations, time, cpu_time = iterations + found.iterations, time + found.time, cpu_time + found.cpu_time
             patience = patience or time
             if not (found.converged and np.all(np.isfinite(found.states))):
@@ -197,12 +192,11 @@ class Search:
                 solver_name = "ipopt" if attempt >= 1 else solver_name
                 continue
             rates = vehicle.thrust_rate_max * np.clip(found.inputs, -1.0, 1.0)
-            times, flown, dense_rates = fly(self.solver.model, task.request.start, rates, found.duration)
-            bounds = self.bounds(task, times, flown, dense_rates)
+            times, flown, rates = fly(self.solver.model, task.request.start, rates, found.duration)
+            bounds = self.bounds(task, times, flown, rates)
             broken = [bound for bound in bounds if not bound.holds]
             if not broken:
-                return Manoeuvre(times, flown, dense_rates, bounds, intervals, solver_name, iterations, time, cpu_time,
-                                 found.cost)
+                return Manoeuvre(times, flown, rates, bounds, intervals, solver_name, iterations, time, cpu_time, found.cost)
             worst = broken[0]
             lines = _joined(lines, task.request.lines, flown, max(vehicle.body_radii))
             missed = all(bound.quantity.startswith("end_") for bound in broken)
@@ -229,10 +223,9 @@ def _clearances(least: float, leaving: float, approaching: float, at_end: float,
 
 
 def _relevant(lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> tuple[Segment, ...]:
-    """The target first, then the others nearest to the straight way."""
+    """The target, one of the lines, first, then the others nearest to the straight way."""
     way = np.linspace(start, end, 20)
-    others = sorted((line for line in lines if line is not target), key=lambda line: float(line.distance(way).min()))
-    return (*([target] if target is not None else []), *others[: LINES_MAX - 1])
+    return tuple(sorted(lines, key=lambda line: (line is not target, float(line.distance(way).min())))[:LINES_MAX])
 
 
 def _joined(lines: tuple[Segment, ...], known: tuple[Segment, ...], flown: np.ndarray, reach: float) -> tuple[Segment, ...]:
