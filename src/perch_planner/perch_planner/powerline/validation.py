@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from typing import NoReturn
 
@@ -35,14 +36,15 @@ def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: Powerli
     if abs(norm - 1) > 1e-2:
         _refuse("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
     if request.recovery_only:
-        _start(request, vehicle, settings, touching_allowed=True)
-        return None
+        _start(request, vehicle, settings)
+        return None  # a recovery starts at a line
     pose, target = request.perch, request.target()
     if pose is None:
         _refuse("bad_input", "perch pose", -1.0, "no perch pose is given")
     _finite({"perch position": pose.p_WB, "perch direction": pose.s3_W, "end velocity": pose.v_W})
     _crossing(request.lines)
     _start(request, vehicle, settings)
+    _clear(request, vehicle)
     _perch(request, pose, target, vehicle, settings)
     _ahead(request, pose, target, vehicle, settings)
     return pose
@@ -59,8 +61,7 @@ def _finite(values: dict[str, np.ndarray]) -> None:
 
 
 def _crossing(lines: tuple[Segment, ...]) -> None:
-    trimmed = {line.id: Segment(line.centre, line.direction, max(line.half_length - END_TRIM, 1e-3), line.radius, line.id)
-               for line in lines}
+    trimmed = {line.id: replace(line, half_length=max(line.half_length - END_TRIM, 1e-3)) for line in lines}
     if len(trimmed) < len(lines):
         _refuse("bad_input", "line ids", -1.0, "two lines have the same id")
     for a, b in combinations(trimmed.values(), 2):
@@ -70,7 +71,7 @@ def _crossing(lines: tuple[Segment, ...]) -> None:
                     f"lines {a.id} and {b.id} cross: their axes come within {segment_distance(a, b):.3f} m; the map is wrong")
 
 
-def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings, touching_allowed: bool = False) -> None:
+def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     start = request.start
     if start[2] < settings.height_min:
         _refuse("start_invalid", "height [P:eq14e]", start[2] - settings.height_min,
@@ -85,10 +86,11 @@ def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSetti
     if low < -1e-6 or high > 1.05 * vehicle.thrust_max:
         _refuse("start_invalid", "rotor thrust [P:eq14f]", min(low, vehicle.thrust_max - high),
                 f"start rotor thrusts {low:.2f} .. {high:.2f} N are outside [0, {vehicle.thrust_max:.2f}] N")
-    if touching_allowed:  # a recovery starts at a line
-        return
+
+
+def _clear(request: PowerlineRequest, vehicle: Vehicle) -> None:
     for line in request.lines:
-        clearance = float(scaled_clearance(start[None, P], start[None, Q], line, vehicle.body_radii)[0])
+        clearance = float(scaled_clearance(request.start[None, P], request.start[None, Q], line, vehicle.body_radii)[0])
         if clearance < 0:
             _refuse("start_invalid", "clearance [P:eq14j]", clearance,
                     f"line {line.id} is nearer than the body at the start: scaled distance {1 + clearance:.2f} < 1; move away first")
@@ -100,27 +102,21 @@ def _perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle
     if perch.p_WB[2] < settings.height_min:
         _refuse("infeasible", "height [P:eq14e]", perch.p_WB[2] - settings.height_min,
                 f"perch height {perch.p_WB[2]:.3f} m is below height_min {settings.height_min:g} m")
-    far, reach = float(np.linalg.norm(perch.p_WB - request.start[P])), _reach(request, vehicle, settings)
+    longest, most = settings.duration[1], 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY  # all thrust and gravity in one direction
+    reach = float(np.linalg.norm(request.start[V])) * longest + 0.5 * most * longest**2
+    far = float(np.linalg.norm(perch.p_WB - request.start[P]))
     if far > reach:
         _refuse("infeasible", "duration", reach - far,
-                f"the perch is {far:.1f} m away; in {settings.duration[1]:g} s no more than {reach:.1f} m can be flown; start nearer")
-    grip = perch.p_WB - vehicle.wire_offset * perch.s3_W
-    miss = float(target.distance(grip))
+                f"the perch is {far:.1f} m away; in {longest:g} s no more than {reach:.1f} m can be flown; start nearer")
     for line in request.lines:
         clearance = float(scaled_clearance(perch.p_WB[None], perch.q_WB[None], line, vehicle.body_radii)[0])
         if clearance < 0:
             _refuse("perch_in_collision", "clearance [P:eq14j]", clearance,
                     f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
+    miss = float(target.distance(perch.p_WB - vehicle.wire_offset * perch.s3_W))
     if miss > GRIPPER_ERROR_MAX:
         _refuse("bad_input", "gripper", GRIPPER_ERROR_MAX - miss,
                 f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {GRIPPER_ERROR_MAX:g} m)")
-
-
-def _reach(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> float:
-    """Distance that nothing flies beyond in the longest duration: all thrust and gravity in one direction [m]."""
-    duration = settings.duration[1]
-    most = 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY
-    return float(np.linalg.norm(request.start[V])) * duration + 0.5 * most * duration**2
 
 
 def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
