@@ -120,10 +120,7 @@ def _perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle
 
 
 def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
-    mount = vehicle.mounts.get(settings.camera)
-    if mount is None:
-        _refuse("bad_input", "camera", -1.0, f"vehicle {vehicle.name} has no camera {settings.camera!r}")
-    axis_W = so3.quat_to_matrix(request.start[Q]) @ mount.R_BC[:, 2]
+    axis_W = so3.quat_to_matrix(request.start[Q]) @ vehicle.mounts[settings.camera].R_BC[:, 2]
     way = target.closest_point(perch.p_WB) - request.start[P]
     bearing = float(np.degrees(so3.angle_between(axis_W, way)))
     if bearing > BEARING_MAX:
