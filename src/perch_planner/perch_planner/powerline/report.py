@@ -12,6 +12,7 @@ import numpy as np
 from perch_core import config
 from perch_core.errors import PlanningRefusal
 from perch_core.json_values import finite
+from perch_core.rotor_model import THRUST
 from perch_planner.powerline.plan import Manoeuvre
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.visibility import visibility
@@ -33,13 +34,11 @@ def write_csv(planned: PlannedProblem, path: Path) -> None:
 def summary(planned: PlannedProblem) -> dict[str, Any]:
     """Durations, solver figures, certificates and visibility of a plan, ready for JSON."""
     parts = {}
-    for name in ("perch", "recovery"):
-        part = getattr(planned.plan, name)
+    for name, part in (("perch", planned.plan.perch), ("recovery", planned.plan.recovery)):
         if part is not None:
             parts[name] = {"duration_s": part.duration, "solve_time_s": part.solve_time, "cpu_time_s": part.cpu_time,
-                           "iterations": part.iterations,
-                           "solver": part.solver, "intervals": part.intervals, "cost": part.cost,
-                           "peak_rotor_thrust_N": float(part.states[:, 13:17].max()), "least_height_m": float(part.states[:, 2].min())}
+                           "iterations": part.iterations, "solver": part.solver, "intervals": part.intervals, "cost": part.cost,
+                           "peak_rotor_thrust_N": float(part.states[:, THRUST].max()), "least_height_m": float(part.states[:, 2].min())}
     certificates = [{"quantity": b.quantity, "unit": b.unit, "minimum": b.minimum, "maximum": b.maximum,
                      "lower_limit": finite(b.lower_limit), "upper_limit": finite(b.upper_limit), "margin": b.margin,
                      "holds": b.holds} for b in planned.plan.bounds]

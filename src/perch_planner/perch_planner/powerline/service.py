@@ -8,7 +8,6 @@ from enum import IntEnum
 import numpy as np
 
 from perch_core.errors import ConfigError, PerchError, PlanningRefusal
-from perch_core.lines import Segment
 from perch_core.rotor_model import P, THRUST, V, W, RotorModel, hover_state
 from perch_core.values import AtEnd, PowerlinePlan, PowerlinePlanRequest, limits, seconds
 from perch_planner.powerline import plan
@@ -71,17 +70,13 @@ def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offse
     if request.perch_pose is not None:
         perch = PerchPose.at(*request.perch_pose, request.end_velocity)
     else:
-        _near(target, np.asarray(request.perch_point, float))
-        perch = PerchPose.on_line(target, request.perch_point, float(request.perch_pitch), wire_offset, start[P], request.end_velocity)
+        point = np.asarray(request.perch_point, float)
+        away = float(target.distance(point))
+        if away > POINT_REACH:
+            raise PlanningRefusal("bad_input", "perch point", POINT_REACH - away,
+                                  f"perch_point {point.tolist()} is {away:.2f} m from line {target.id} between its ends (allowed {POINT_REACH:g} m)")
+        perch = PerchPose.on_line(target, point, float(request.perch_pitch), wire_offset, start[P], request.end_velocity)
     return replace(wanted, perch=perch)
-
-
-def _near(target: Segment, point: np.ndarray) -> None:
-    away = float(target.distance(point))
-    if away > POINT_REACH:
-        raise PlanningRefusal("bad_input", "perch point", POINT_REACH - away,
-                              f"perch_point {point.tolist()} is {away:.2f} m from line {target.id} between its ends "
-                              f"(allowed {POINT_REACH:g} m)")
 
 
 def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> PowerlinePlan:
@@ -96,17 +91,15 @@ def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> Powerlin
     perch, recovery = found.perch, found.recovery
     at_end, recovery_start = AtEnd.CONTACT, -1.0
     if recovery is not None:
-        at_end, recovery_start = (AtEnd.HOLD, 0.0) if perch is None else (AtEnd.RECOVER, float(perch.duration))
+        at_end, recovery_start = (AtEnd.HOLD, 0.0) if perch is None else (AtEnd.RECOVER, perch.duration)
     words = ([] if perch is None else [f"perch after {perch.duration:.3f} s"]) + (
         [] if recovery is None else [f"recovery of {recovery.duration:.3f} s"])
     without = f", without recovery: {found.without_recovery}" if found.without_recovery else ""
     return PowerlinePlan(
         success=True, message=", then ".join(words) + without, trajectory=trajectory, at_end=at_end,
-        contact_time=0.0 if perch is None else CONTACT_TIME, recovery_start=recovery_start,
-        certificates=found.bounds,
-        perch_time=0.0 if perch is None else float(perch.duration), recovery_time=0.0 if recovery is None else float(recovery.duration),
-        solve_time=0.0 if perch is None else float(perch.solve_time),
-        recovery_solve_time=0.0 if recovery is None else float(recovery.solve_time),
+        contact_time=0.0 if perch is None else CONTACT_TIME, recovery_start=recovery_start, certificates=found.bounds,
+        perch_time=0.0 if perch is None else perch.duration, recovery_time=0.0 if recovery is None else recovery.duration,
+        solve_time=0.0 if perch is None else perch.solve_time, recovery_solve_time=0.0 if recovery is None else recovery.solve_time,
         iterations=int(sum(part.iterations for part in found.parts)), solver=found.parts[0].solver)
 
 
