@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
-from typing import NoReturn
 
 import numpy as np
 
@@ -30,17 +29,17 @@ def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: Powerli
         PlanningRefusal: code bad_input, empty_map, start_invalid or perch_in_collision; the message names the value.
     """
     if np.shape(request.start) != (17,):
-        _refuse("bad_input", "start state", -1.0, f"start state has shape {np.shape(request.start)}, needs (17,)")
+        raise PlanningRefusal("bad_input", "start state", -1.0, f"start state has shape {np.shape(request.start)}, needs (17,)")
     _finite({"start state": request.start, "hover": np.zeros(3) if request.hover is None else request.hover})
     norm = float(np.linalg.norm(request.start[Q]))
     if abs(norm - 1) > 1e-2:
-        _refuse("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
+        raise PlanningRefusal("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
     if request.recovery_only:
         _start(request, vehicle, settings)
         return None  # a recovery starts at a line
     pose, target = request.perch, request.target()
     if pose is None:
-        _refuse("bad_input", "perch pose", -1.0, "no perch pose is given")
+        raise PlanningRefusal("bad_input", "perch pose", -1.0, "no perch pose is given")
     _finite({"perch position": pose.p_WB, "perch direction": pose.s3_W, "end velocity": pose.v_W})
     _crossing(request.lines)
     _start(request, vehicle, settings)
@@ -50,73 +49,69 @@ def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: Powerli
     return pose
 
 
-def _refuse(code: str, constraint: str, margin: float, message: str) -> NoReturn:
-    raise PlanningRefusal(code, constraint, margin, message)
-
-
 def _finite(values: dict[str, np.ndarray]) -> None:
     for name, value in values.items():
         if not np.all(np.isfinite(value)):
-            _refuse("bad_input", name, -1.0, f"{name} {np.asarray(value).tolist()} is not finite")
+            raise PlanningRefusal("bad_input", name, -1.0, f"{name} {np.asarray(value).tolist()} is not finite")
 
 
 def _crossing(lines: tuple[Segment, ...]) -> None:
     trimmed = {line.id: replace(line, half_length=max(line.half_length - END_TRIM, 1e-3)) for line in lines}
     if len(trimmed) < len(lines):
-        _refuse("bad_input", "line ids", -1.0, "two lines have the same id")
+        raise PlanningRefusal("bad_input", "line ids", -1.0, "two lines have the same id")
     for a, b in combinations(trimmed.values(), 2):
         gap = segment_distance(a, b) - a.radius - b.radius
         if gap < 0 and abs(a.direction @ b.direction) < CROSSING_COSINE:
-            _refuse("bad_input", "lines cross", gap,
-                    f"lines {a.id} and {b.id} cross: their axes come within {segment_distance(a, b):.3f} m; the map is wrong")
+            raise PlanningRefusal("bad_input", "lines cross", gap,
+                                  f"lines {a.id} and {b.id} cross: their axes come within {segment_distance(a, b):.3f} m; the map is wrong")
 
 
 def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     start = request.start
     if start[2] < settings.height_min:
-        _refuse("start_invalid", "height [P:eq14e]", start[2] - settings.height_min,
-                f"start height {start[2]:.3f} m is below height_min {settings.height_min:g} m; climb first")
+        raise PlanningRefusal("start_invalid", "height [P:eq14e]", start[2] - settings.height_min,
+                              f"start height {start[2]:.3f} m is below height_min {settings.height_min:g} m; climb first")
     rate, speed = float(np.linalg.norm(start[W])), float(np.linalg.norm(start[V]))
     if rate > vehicle.body_rate_max:
-        _refuse("start_invalid", "body rate", vehicle.body_rate_max - rate,
-                f"start body rate {rate:.2f} rad/s is above {vehicle.body_rate_max:g} rad/s")
+        raise PlanningRefusal("start_invalid", "body rate", vehicle.body_rate_max - rate,
+                              f"start body rate {rate:.2f} rad/s is above {vehicle.body_rate_max:g} rad/s")
     if speed > SPEED_MAX:
-        _refuse("start_invalid", "speed", SPEED_MAX - speed, f"start speed {speed:.2f} m/s is above {SPEED_MAX:g} m/s")
+        raise PlanningRefusal("start_invalid", "speed", SPEED_MAX - speed, f"start speed {speed:.2f} m/s is above {SPEED_MAX:g} m/s")
     low, high = start[THRUST].min(), start[THRUST].max()
     if low < -1e-6 or high > 1.05 * vehicle.thrust_max:
-        _refuse("start_invalid", "rotor thrust [P:eq14f]", min(low, vehicle.thrust_max - high),
-                f"start rotor thrusts {low:.2f} .. {high:.2f} N are outside [0, {vehicle.thrust_max:.2f}] N")
+        raise PlanningRefusal("start_invalid", "rotor thrust [P:eq14f]", min(low, vehicle.thrust_max - high),
+                              f"start rotor thrusts {low:.2f} .. {high:.2f} N are outside [0, {vehicle.thrust_max:.2f}] N")
 
 
 def _clear(request: PowerlineRequest, vehicle: Vehicle) -> None:
     for line in request.lines:
         clearance = float(scaled_clearance(request.start[None, P], request.start[None, Q], line, vehicle.body_radii)[0])
         if clearance < 0:
-            _refuse("start_invalid", "clearance [P:eq14j]", clearance,
-                    f"line {line.id} is nearer than the body at the start: scaled distance {1 + clearance:.2f} < 1; move away first")
+            raise PlanningRefusal("start_invalid", "clearance [P:eq14j]", clearance,
+                                  f"line {line.id} is nearer than the body at the start: scaled distance {1 + clearance:.2f} < 1; move away first")
 
 
 def _perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     if abs(np.linalg.norm(perch.s3_W) - 1) > 1e-3:
-        _refuse("bad_input", "perch direction", -1.0, "the wanted direction of b3 is not a unit vector")
+        raise PlanningRefusal("bad_input", "perch direction", -1.0, "the wanted direction of b3 is not a unit vector")
     if perch.p_WB[2] < settings.height_min:
-        _refuse("infeasible", "height [P:eq14e]", perch.p_WB[2] - settings.height_min,
-                f"perch height {perch.p_WB[2]:.3f} m is below height_min {settings.height_min:g} m")
+        raise PlanningRefusal("infeasible", "height [P:eq14e]", perch.p_WB[2] - settings.height_min,
+                              f"perch height {perch.p_WB[2]:.3f} m is below height_min {settings.height_min:g} m")
     longest, most = settings.duration[1], 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY  # all thrust and gravity in one direction
     reach = float(np.linalg.norm(request.start[V])) * longest + 0.5 * most * longest**2
     far = float(np.linalg.norm(perch.p_WB - request.start[P]))
     if far > reach:
-        _refuse("infeasible", "duration", reach - far,
-                f"the perch is {far:.1f} m away; in {longest:g} s no more than {reach:.1f} m can be flown; start nearer")
+        raise PlanningRefusal("infeasible", "duration", reach - far,
+                              f"the perch is {far:.1f} m away; in {longest:g} s no more than {reach:.1f} m can be flown; start nearer")
     for line in request.lines:
         clearance = float(scaled_clearance(perch.p_WB[None], perch.q_WB[None], line, vehicle.body_radii)[0])
         if clearance < 0:
-            _refuse("perch_in_collision", "clearance [P:eq14j]", clearance,
-                    f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
+            raise PlanningRefusal("perch_in_collision", "clearance [P:eq14j]", clearance,
+                                  f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
     miss = float(target.distance(perch.p_WB - vehicle.wire_offset * perch.s3_W))
     if miss > GRIPPER_ERROR_MAX:
-        _refuse("bad_input", "gripper", GRIPPER_ERROR_MAX - miss,
-                f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {GRIPPER_ERROR_MAX:g} m)")
+        raise PlanningRefusal("bad_input", "gripper", GRIPPER_ERROR_MAX - miss,
+                              f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {GRIPPER_ERROR_MAX:g} m)")
 
 
 def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
@@ -124,6 +119,6 @@ def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle
     way = target.closest_point(perch.p_WB) - request.start[P]
     bearing = float(np.degrees(so3.angle_between(axis_W, way)))
     if bearing > BEARING_MAX:
-        _refuse("bad_input", "line ahead", BEARING_MAX - bearing,
-                f"line {target.id} is behind the vehicle: {bearing:.0f} deg from the camera's axis "
-                f"(allowed {BEARING_MAX:g} deg); turn to face it first")
+        raise PlanningRefusal("bad_input", "line ahead", BEARING_MAX - bearing,
+                              f"line {target.id} is behind the vehicle: {bearing:.0f} deg from the camera's axis "
+                              f"(allowed {BEARING_MAX:g} deg); turn to face it first")
