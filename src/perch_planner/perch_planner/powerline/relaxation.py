@@ -18,8 +18,6 @@ FIRST_GUESSES = 2  # of a perch, before the limits are tried one at a time, and 
 LAST_RESORT = 7.0  # times of a first attempt that does not converge, which IPOPT's greatest number of iterations takes
 FASTER = 2.0  # of the rotors, without the range of their thrust; thrust grows with the square
 
-_Problem = tuple[PowerlineRequest, PowerlineSettings, Vehicle]
-
 
 class Relaxation(NamedTuple):
     """A limit, and a problem without it.
@@ -32,7 +30,7 @@ class Relaxation(NamedTuple):
 
     words: str
     constraint: str
-    relaxed: Callable[[PowerlineRequest, PowerlineSettings, Vehicle], _Problem]
+    relaxed: Callable[[PowerlineRequest, PowerlineSettings, Vehicle], tuple[PowerlineRequest, PowerlineSettings, Vehicle]]
 
 
 RELAXATIONS = (
