@@ -1,8 +1,4 @@
-"""A vehicle at rest from plain publishers: nothing of perch is imported but messages.
-
-`states.py RATE COUNT [clock]`: COUNT motor commands at RATE; `clock`: publish /clock, too. What came back is printed as JSON.
-"""
-
+"""A vehicle at rest, from plain publishers of messages alone: `states.py RATE COUNT [clock]` prints what came back as JSON."""
 import json
 import sys
 import time
@@ -10,83 +6,55 @@ import time
 import rclpy
 from nav_msgs.msg import Odometry
 from perch_msgs.msg import ControllerCommand, MotorCommand
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 
-WINDOW = 20   # samples without an answer of both nodes, at most, once there has been one: a busy machine loses nothing
-LOST = 5.0    # [s] before both answer in time, what is still to come after so long was lost
-PATIENCE = 250.0  # [s]
-
-
-class Rest(Node):
-    def __init__(self, rate: float, clock: bool) -> None:
-        super().__init__("plain_states")
-        self.imu = self.create_publisher(Imu, "imu/data_raw", qos_profile_sensor_data)
-        self.vio = self.create_publisher(Odometry, "vio/odometry", qos_profile_sensor_data)
-        self.order = self.create_publisher(ControllerCommand, "controller/command", 10)
-        self.clock = self.create_publisher(Clock, "/clock", 10) if clock else None
-        self.sent, self.states, self.commands, self.speeds = [], [], [], []
-        self.heard = time.monotonic()
-        self.begun = None  # stamp from which on both answer in time
-        deep = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(Odometry, "odometry", self.take_state, deep)
-        self.create_subscription(MotorCommand, "motor_command", self.take_command, deep)
-        self.stamp, self.period, self.every = time.time_ns(), round(1e9 / rate), max(1, round(rate / 30.0))
-        self.create_timer(1.0 / rate, self.step)
-
-    def take_state(self, msg) -> None:
-        self.heard = time.monotonic()
-        self.states.append(nanoseconds(msg.header.stamp))
-        if len(self.states) % 50 == 0 and not self.speeds:  # the controller may not have discovered this script yet
-            self.command(ControllerCommand.ARM)
-
-    def take_command(self, msg) -> None:
-        self.heard = time.monotonic()
-        self.commands.append(nanoseconds(msg.header.stamp))
-        if msg.armed:
-            self.speeds = list(map(float, msg.rotor_speed))
-
-    def command(self, what: int) -> None:
-        order = ControllerCommand(command=what, reason="a plain script says so")
-        order.header.stamp.sec, order.header.stamp.nanosec = divmod(self.stamp, 10**9)
-        self.order.publish(order)
-
-    def step(self) -> None:
-        if self.states and self.commands:
-            if self.stamp - min(self.states[-1], self.commands[-1]) <= WINDOW * self.period:
-                self.begun = self.begun or self.stamp + self.period
-            elif self.begun or time.monotonic() - self.heard < LOST:
-                return
-        self.stamp += self.period
-        imu = Imu()
-        imu.header.stamp.sec, imu.header.stamp.nanosec = divmod(self.stamp, 10**9)
-        imu.header.frame_id, imu.linear_acceleration.z = "imu_link", 9.81
-        if self.clock:
-            self.clock.publish(Clock(clock=imu.header.stamp))
-        self.imu.publish(imu)
-        self.sent.append(self.stamp)
-        if len(self.sent) % self.every == 0:
-            state = Odometry()
-            state.header.stamp, state.header.frame_id, state.child_frame_id = imu.header.stamp, "odom", "base_link"
-            state.pose.pose.orientation.w = 1.0
-            for i in range(6):
-                state.pose.covariance[7 * i], state.twist.covariance[7 * i] = 1e-4, 1e-3
-            self.vio.publish(state)
-
-
-def nanoseconds(stamp) -> int:
-    return stamp.sec * 10**9 + stamp.nanosec
-
-
+WINDOW, LOST = 20, 5.0  # samples without an answer, at most; until both nodes answer in time, answers are lost after so long [s]
+period, count, end = round(1e9 / float(sys.argv[1])), int(sys.argv[2]), time.monotonic() + 250.0  # [ns], motor commands, [s]
+seen = dict(begun=None, heard=0.0, sent=[time.time_ns()], states=[], commands=[], speeds=[])  # begun: since then both answer
 rclpy.init()
-node, count, end = Rest(float(sys.argv[1]), "clock" in sys.argv), int(sys.argv[2]), time.monotonic() + PATIENCE
-while (len(node.commands) < count or not node.speeds) and time.monotonic() < end:
+node, qos = rclpy.create_node("plain_states"), QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+imu, vio = node.create_publisher(Imu, "imu/data_raw", qos), node.create_publisher(Odometry, "vio/odometry", qos)
+order = node.create_publisher(ControllerCommand, "controller/command", 10)
+clock = node.create_publisher(Clock, "/clock", 10) if "clock" in sys.argv else None
+force, pose = Imu(), Odometry(child_frame_id="base_link")
+force.header.frame_id, pose.header.frame_id, pose.header.stamp = "imu_link", "odom", force.header.stamp  # one stamp of both
+force.linear_acceleration.z, pose.pose.pose.orientation.w = 9.81, 1.0
+pose.pose.covariance[::7], pose.twist.covariance[::7] = 1e-4, 1e-3
+
+def give(command):
+    order.publish(ControllerCommand(header=force.header, command=command, reason="a plain script says so"))
+
+def take(answer, what):
+    seen["heard"] = time.monotonic()
+    seen[what].append(answer.header.stamp.sec * 10**9 + answer.header.stamp.nanosec)
+    if what == "commands" and answer.armed:
+        seen["speeds"] = answer.rotor_speed.tolist()
+    if what == "states" and len(seen[what]) % 50 == 0 and not seen["speeds"]:  # the controller may not know it yet
+        give(ControllerCommand.ARM)
+
+def send():
+    stamp = seen["sent"][-1] + period
+    if seen["states"] and seen["commands"]:
+        if stamp - min(seen["states"][-1], seen["commands"][-1]) <= WINDOW * period:
+            seen["begun"] = seen["begun"] or stamp
+        elif seen["begun"] or time.monotonic() - seen["heard"] < LOST:
+            return
+    seen["sent"].append(stamp)
+    force.header.stamp.sec, force.header.stamp.nanosec = divmod(stamp, 10**9)
+    if clock:
+        clock.publish(Clock(clock=force.header.stamp))
+    imu.publish(force)
+    if len(seen["sent"]) % max(1, round(1e9 / 30.0 / period)) == 0:
+        vio.publish(pose)
+
+node.create_subscription(Odometry, "odometry", lambda answer: take(answer, "states"), qos)
+node.create_subscription(MotorCommand, "motor_command", lambda answer: take(answer, "commands"), qos)
+node.create_timer(1e-9 * period, send)
+while (len(seen["commands"]) < count or not seen["speeds"]) and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.1)
-node.command(ControllerCommand.DISARM)
-for _ in range(20):
-    rclpy.spin_once(node, timeout_sec=0.02)
-types = {kind for _, kinds in node.get_topic_names_and_types() for kind in kinds}
-print(json.dumps({"begun": node.begun, "sent": node.sent, "states": node.states, "commands": node.commands, "speeds": node.speeds,
-                  "types": sorted(types), "nodes": node.get_node_names()}))
+give(ControllerCommand.DISARM)
+types = [kind for _, kinds in node.get_topic_names_and_types() for kind in kinds]
+print(json.dumps(seen | {"nodes": node.get_node_names(), "types": types}))
+time.sleep(0.4)  # the last message is on its way
