@@ -245,6 +245,10 @@ def test_the_interval_is_that_of_the_score_test(k, n):
         assert abs(k / n - p) == pytest.approx(1.959964 * np.sqrt(p * (1.0 - p) / n), abs=1e-6) if p != outermost else k == n * outermost
 
 
+def test_a_rate_counts_outcomes():
+    assert Rate.of(k % 4 == 0 for k in range(10)) == Rate(3, 10) and Rate.of([]) == Rate(0, 0)
+
+
 def test_spread_leaves_out_what_is_no_number():
     spread = Spread.of([3.0, None, 1.0, float("nan"), 2.0])
     assert (spread.median, spread.low, spread.high, spread.count) == (2.0, 1.0, 3.0, 3)

@@ -20,6 +20,12 @@ class Rate:
     successes: int
     trials: int
 
+    @classmethod
+    def of(cls, outcomes: Iterable[bool]) -> Rate:
+        """Of the trials' outcomes: whether each was a success."""
+        found = list(outcomes)
+        return cls(sum(found), len(found))
+
     @property
     def value(self) -> float:
         """Share of successes; nan without trials."""

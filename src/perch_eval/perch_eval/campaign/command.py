@@ -91,7 +91,7 @@ def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
 
 def summary(found: list[RunResult]) -> str:
     """Success and causes for the terminal, most frequent first."""
-    rate = Rate(sum(r.cause == SUCCESS for r in found), len(found))
+    rate = Rate.of(r.cause == SUCCESS for r in found)
     lines = [f"success: {rate}  (95 % Wilson)"]
     for cause, flights in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():
         lines.append(f"  {flights:5d}  {cause:<11} {MEANING.get(cause, '')}")

@@ -69,7 +69,7 @@ def success_curve(found: Sequence[RunResult], name: str) -> Figure:
     """Success rate over one varied quantity with 95 % Wilson intervals."""
     axis = Axis([r.values[name] for r in found])
     cells = [[r for r in found if axis.cell(r.values[name]) == k] for k in range(len(axis.labels))]
-    rates = [Rate(sum(r.cause == SUCCESS for r in cell), len(cell)) for cell in cells]
+    rates = [Rate.of(r.cause == SUCCESS for r in cell) for cell in cells]
     figure = Figure(figsize=(max(4.0, 0.9 * len(cells) + 1.0), 2.6), layout="constrained")
     axes = figure.subplots()
     value = np.array([r.value for r in rates])

@@ -28,7 +28,7 @@ def write_report(campaign: Campaign, found: Sequence[RunResult], folder: Path) -
 
 
 def _page(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> str:
-    rate = Rate(sum(r.cause == SUCCESS for r in found), len(found))
+    rate = Rate.of(r.cause == SUCCESS for r in found)
     varied = [name for name in campaign.vary if name != "seed"]
     complete = [r for r in found if all(name in r.values for name in varied)]
     parts = [f"<p>{text(campaign.description)}</p>", _facts(campaign, found, rate), _causes(found, folder)]

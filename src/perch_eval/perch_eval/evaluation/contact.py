@@ -53,7 +53,7 @@ def _table(groups: dict[str, list[RunResult]]) -> list[str]:
 
 
 def _rate(flights: Sequence[RunResult]) -> Rate:
-    return Rate(sum(r.cause == SUCCESS for r in flights), len(flights))
+    return Rate.of(r.cause == SUCCESS for r in flights)
 
 
 def _others(flights: Sequence[RunResult]) -> str:

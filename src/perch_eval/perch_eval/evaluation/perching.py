@@ -89,7 +89,7 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
                   f"{_seeds(effort)}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
                   "95 % Wilson intervals.")
     for name, paper in SUCCESSES.items():
-        rate = Rate(sum(r.cause == SUCCESS for r in groups[name]), len(groups[name]))
+        rate = Rate.of(r.cause == SUCCESS for r in groups[name])
         bar = BARS[name] if effort.full else paper / 5
         why = f"at least {100 * bar:.0f} %" + ("" if effort.full else ", the paper's rate")
         causes = ", ".join(f"seed {r.seed}: {r.cause}" for r in groups[name] if r.cause != SUCCESS)
@@ -123,7 +123,7 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     six.show("largest body rate, `surface_90`", rates.words(1.0, 0, "deg/s"))
     six.claim(f"largest body rate, `{AGGRESSIVE}`", fast.words(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s",
               0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None, "within 10 % of the paper's")
-    held = Rate(sum(r.cause == SUCCESS for r in groups[AGGRESSIVE]), len(groups[AGGRESSIVE]))
+    held = Rate.of(r.cause == SUCCESS for r in groups[AGGRESSIVE])
     six.claim(f"perches, `{AGGRESSIVE}`", str(held), "", held.value >= 0.95 if held.trials else None, "at least 95 %")
     six.claim("largest acceleration", peaks.words(1.0, 1, "m/s^2"), f"up to {PEAK_ACCELERATION:g} m/s^2", peaks.median >= 0.7 * PEAK_ACCELERATION,
               "at least 70 % of the paper's")

@@ -81,7 +81,7 @@ def flown_sections(effort: Effort) -> list[Section]:
     found = flights(effort, tuple(TABLE))
     for case, (paper_p, paper_q, *_) in TABLE.items():
         runs, name = found[case, True], WORDS[case]
-        rate = Rate(sum(r.cause == SUCCESS for r in runs), len(runs))
+        rate = Rate.of(r.cause == SUCCESS for r in runs)
         words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in runs if r.cause != SUCCESS)
         out.show(f"{name}: gripped the cable", str(rate), "", words)
         for title, key, paper, factor, unit in (("position RMSE", "perching_position_m", paper_p, 100.0, "cm"),
