@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import cv2
 import numpy as np
@@ -91,6 +92,11 @@ def test_a_report_is_written(recorded, reported):
     for words in ("mission commands arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad",
                   "front camera, 1.00 to 3.80 s", "data:image/webp"):
         assert words in page
+    for row in (f"<th>date</th><td>{written['date']}</td>", f"<th>commit</th><td>{written['commit']} (digest {written['digest']})</td>",
+                "<td>0.7 m/s (0.2 to 1 m/s): +0.3 m/s left</td>"):
+        assert row in page
+    reported_at = datetime.strptime(written["date"], "%Y-%m-%d %H:%M UTC").replace(tzinfo=UTC)
+    assert abs(datetime.now(UTC) - reported_at) < timedelta(hours=1)
     assert written["real_time_factor"] == pytest.approx(1.5)
     assert "1.50: 3.00 s of simulated time in 2.00 s" in page
 

@@ -14,14 +14,14 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.arguments import command, command_parser
 from perch_eval.flight_view import FlightView
-from perch_eval.margins import limits, margins
+from perch_eval.margins import limits, margins, number
 from perch_eval.metrics import FIGURES, figures, flight_metrics
 from perch_eval.page import image, page, section, table
 from perch_eval.recorded import opened, report_of, vehicle_of
 from perch_eval.scene_3d import scene_3d
 
 COLOURS = ("#1f77b4", "#d95f02")
-SAID = ("outcome", "scenario", "vehicle", "seed", "message")  # words of a report
+SAID = ("outcome", "scenario", "vehicle", "seed", "date", "commit", "digest", "message")  # words of a report
 EXAMPLES = """examples:
   python3 scripts/compare.py out/flight.mcap /tmp/flight/flight.mcap   page compare.html in this folder
   python3 scripts/compare.py before after --out before_after.html      folders of demo.py, with flight.mcap and report.json
@@ -124,7 +124,7 @@ def _margin_table(sides: Sequence[Side]) -> str:
     rows = []
     for name in dict.fromkeys(name for found in by_name for name in found):
         both = [found[name] for found in by_name if name in found]
-        kept = (f"{found[name]['value']:.2f}, {found[name]['left']:+.2f} left" if name in found else "-" for found in by_name)
+        kept = (f"{number(found[name]['value'])}, {number(found[name]['left'], '+')} left" if name in found else "-" for found in by_name)
         rows.append((f"{name} [{both[0]['unit']}]", " / ".join(dict.fromkeys(map(limits, both))), *kept))
     return table(rows, ("", "limits", *(side.view.name for side in sides))) if rows else ""
 

@@ -42,10 +42,21 @@ class Margin:
         return {"name": self.name, "value": self.value, "low": self.low, "high": self.high, "unit": self.unit, "left": self.left}
 
 
+def number(value: float, sign: str = "") -> str:
+    """A value with three significant digits and no exponent; with a `sign` of "+", a plus sign as well."""
+    return f"{float(f'{value:.3g}'):{sign}g}"
+
+
 def limits(margin: dict[str, Any]) -> str:
-    """The limits of a mapped margin in words; null, as JSON has it, is no limit."""
-    low, high = (None if limit is None or math.isinf(limit) else limit for limit in (margin["low"], margin["high"]))
-    return f"at least {low:.3g}" if high is None else f"at most {high:.3g}" if low is None else f"{low:.3g} to {high:.3g}"
+    """The limits of a mapped margin in words, without the unit; null, as JSON has it, is no limit."""
+    low, high = (None if limit is None or math.isinf(limit) else number(limit) for limit in (margin["low"], margin["high"]))
+    return f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
+
+
+def in_words(margin: dict[str, Any]) -> str:
+    """A mapped margin in words: `0.7 m/s (0.2 to 1 m/s): +0.3 m/s left`."""
+    unit = margin["unit"]
+    return f"{number(margin['value'])} {unit} ({limits(margin)} {unit}): {number(margin['left'], '+')} {unit} left"
 
 
 def margins(flight: Flight, vehicle: Vehicle, scenario: Scenario | None = None) -> list[Margin]:

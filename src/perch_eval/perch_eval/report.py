@@ -6,6 +6,7 @@ import json
 import math
 import re
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +22,18 @@ from perch_eval.flight_view import FlightView
 from perch_eval.identification.answers import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected, recorded
-from perch_eval.margins import limits, margins
+from perch_eval.margins import in_words, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
 from perch_eval.page import Html, image, page, section, table, text
+from perch_eval.revision import made_of
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
 from perch_sim.scenario import Scenario
 
 def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, message: str, wall_time: float,
                  end_time: float, start_time: float | None = None) -> dict[str, Any]:
-    """Read `flight.mcap` in `folder` and write `report.json` and `report.html` beside it.
+    """Read `flight.mcap` in `folder`, of a flight that has just ended, and write `report.json` and `report.html` beside it.
 
     Args:
         folder: output folder of the flight.
@@ -53,6 +55,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
         "outcome": outcome, "message": message, "scenario": scenario.name, "vehicle": scenario.vehicle, "seed": seed,
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **made_of(),
         "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, vehicle, end_time),
@@ -170,8 +173,9 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
-    kept = [(m["name"], f"{m['value']:.2f} {m['unit']} ({limits(m)}): {m['left']:+.2f} left") for m in report["margins"]]
-    flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"])]
+    kept = [(m["name"], in_words(m)) for m in report["margins"]]
+    flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"]), ("date", report["date"]),
+             ("commit", report["commit"] + (f" (digest {report['digest']})" if report["digest"] else ""))]
     return page(
         title, table([*flown, *summary(report)]), section("Margins", table(kept), "No perch was planned."),
         section("Timeline", table((f"{t:.3f} s", words) for t, words in _timeline(flight))),
