@@ -11,8 +11,9 @@ import pytest
 from unit.recorded_flights import flown, record
 
 from perch_core.vehicle import load_vehicle
-from perch_eval import comparison
-from perch_eval.margins import limits, margins
+from perch_eval import comparison, plots
+from perch_eval.flight_view import FlightView
+from perch_eval.margins import in_words, limits, margins
 from perch_eval.report import build_report
 from perch_sim.scenario import load_scenario
 
@@ -35,6 +36,12 @@ def test_margins_are_distances_to_the_limits_of_vehicle_and_material(recorded):
 def test_limits_are_words_also_after_json():
     assert [limits({"low": low, "high": high}) for low, high in ((0.2, 1.0), (-math.inf, 4.5), (None, 4.5), (0.5, None))] == [
         "0.2 to 1", "at most 4.5", "at most 4.5", "at least 0.5"]
+
+
+@pytest.mark.parametrize("value, left, said", [
+    (0.71234, 0.28766, "0.712 m/s (at most 1 m/s): +0.288 m/s left"), (1146.4, -1145.4, "1150 m/s (at most 1 m/s): -1150 m/s left")])
+def test_a_margin_in_words_has_units_and_three_digits(value, left, said):
+    assert in_words({"value": value, "low": None, "high": 1.0, "unit": "m/s", "left": left}) == said
 
 
 def compared(page):
@@ -64,6 +71,22 @@ def test_two_flights_are_on_one_page(recorded, tmp_path, monkeypatch):
     assert rows["outcome"] == ["-", "perched", ""] and rows["seed"] == ["-", "7", ""] and rows["message"][1] == "held &lt;by velcro&gt;"
     assert rows["tilt error at contact [deg]"][:2] == ["at most 15", "-"], "limits of the material are those of the report"
     assert text.count("data:image/png;base64,") == 5 and "<one>" not in text
+
+
+def test_each_flight_has_its_pad_and_its_wires_where_they_differ(recorded):
+    view = FlightView.of(recorded[1], load_vehicle("snapdragon"), "one", "#111111")
+    wire = np.array([[[1.0, -1.0, 2.0], [1.0, 1.0, 2.0]]])
+    one = replace(view, cables=wire)
+    other = replace(one, name="other", colour="#222222", pad=(view.pad[0] + [0.5, 0.0, 0.2], view.pad[1]), cables=wire + 0.3)
+
+    def drawn(*views):
+        lines = plots.path_figure(*views).axes[0].lines
+        return [(line.get_label(), line.get_color(), line.get_xdata()[0]) for line in lines if line.get_label().endswith(("pad", "cable"))]
+
+    assert drawn(one, other) == [("one, pad", "#111111", pytest.approx(2.0)), ("other, pad", "#222222", pytest.approx(2.5)),
+                                 ("one, cable", "#111111", pytest.approx(1.0)), ("other, cable", "#222222", pytest.approx(1.3))]
+    assert [line[:2] for line in drawn(one, replace(one, name="same"))] == [("pad", "k"), ("cable", "k")]
+    assert [line[0] for line in drawn(replace(one, pad=None), other)][0] == "other, pad"
 
 
 def test_the_report_of_another_flight_is_not_used(reported, tmp_path, capsys):

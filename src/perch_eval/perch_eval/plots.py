@@ -164,10 +164,8 @@ def path_figure(*views: FlightView) -> Figure:
     figure = Figure(figsize=(12, 5), layout="constrained")
     axis = figure.subplots()
     along = _horizontal(views[0])
-    if views[0].pad is not None:
-        c, R = views[0].pad
-        ends = np.array([c - PAD * R[:, 0], c + PAD * R[:, 0]])
-        axis.plot(ends[:, :2] @ along, ends[:, 2], color="k", lw=5, solid_capstyle="butt", label="pad")
+    for ends, colour, label in _of_each(views, "pad", _pad_from_side):
+        axis.plot(ends[:, :2] @ along, ends[:, 2], color=colour, lw=5, solid_capstyle="butt", label=label)
     for view in views:
         wanted, name = (WANTED, "") if len(views) == 1 else (view.colour, f"{view.name}, ")
         for states, colour, width, label in ((view.reference, wanted, 1.0, f"{name}reference"), (view.truth, view.colour, 1.6, f"{name}truth")):
@@ -180,12 +178,30 @@ def path_figure(*views: FlightView) -> Figure:
                     color=ESTIMATE if len(views) == 1 else view.colour, label=f"{name}b3")
         axis.update_datalim(np.stack([(p + b3)[:, :2] @ along, (p + b3)[:, 2]], axis=1))
     axis.set_aspect("equal", adjustable="datalim")
-    for k, ends in enumerate(views[0].cables):  # drawn as far as the path is shown
-        axis.add_artist(Line2D(ends[:, :2] @ along, ends[:, 2], color="k", marker="o", ms=5, label="" if k else "cable"))
+    for ends, colour, label in _of_each(views, "cable", lambda view: view.cables):  # drawn as far as the path is shown
+        axis.add_artist(Line2D(ends[:, :2] @ along, ends[:, 2], color=colour, marker="o", ms=5, label=label))
     axis.set(xlabel="along the perch [m]", ylabel="z [m]")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
     return figure
+
+
+def _pad_from_side(view: FlightView) -> np.ndarray:
+    """End points of the pad's middle line in W [m], shape (1, 2, 3), or (0, 2, 3) where there is none."""
+    if view.pad is None:
+        return np.zeros((0, 2, 3))
+    c, R = view.pad
+    return np.array([[c - PAD * R[:, 0], c + PAD * R[:, 0]]])
+
+
+def _of_each(views: Views, kind: str, segments: Callable[[FlightView], np.ndarray]) -> list[tuple[np.ndarray, str, str]]:
+    """End points (2, 3) [m], colour and label of what stands at the flights' places: black where it is the same for all of them."""
+    found = [segments(view) for view in views]
+    if all(np.array_equal(found[0], other) for other in found):
+        looks = [("k", kind)]
+    else:
+        looks = [(view.colour, f"{view.name}, {kind}") for view in views]
+    return [(ends, colour, "" if k else label) for several, (colour, label) in zip(found, looks) for k, ends in enumerate(several)]
 
 
 def _horizontal(view: FlightView) -> np.ndarray:
