@@ -19,9 +19,12 @@ from perch_core.component import Job, JobFailed, JobStopped
 from perch_core.errors import ConfigError
 from perch_core.isolated import IsolatedRunner
 from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePlanRequest
+from perch_core.vehicle import load_vehicle
 from perch_planner import powerline_planner
 from perch_planner.powerline import problem
+from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.service import PowerlinePlanError
+from perch_planner.powerline.settings import PowerlineSettings
 from perch_planner.powerline_planner import PowerlinePlannerComponent, PowerlinePlannerParameters
 from unit.planner_asker import Asked
 
@@ -263,3 +266,5 @@ def test_a_planner_is_loaded_once_whatever_may_change(ask: Asked) -> None:
 def test_parameters_that_cannot_be_are_refused(changes: dict, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         PowerlinePlannerComponent(PowerlinePlannerParameters(**changes))
+    with pytest.raises(ConfigError, match=words):  # as scripts/plan.py asks
+        PowerlinePlanner(load_vehicle(changes.get("vehicle", "rpg")), PowerlineSettings(camera=changes.get("camera", "front")))

@@ -10,7 +10,7 @@ from typing import Any
 
 from perch_core.component import Component, Diagnostics, Job, JobStopped, Service
 from perch_core.config import text
-from perch_core.errors import ConfigError, PerchError, PlanningRefusal
+from perch_core.errors import PerchError, PlanningRefusal
 from perch_core.rotor_model import RotorModel
 from perch_core.values import PowerlinePlan, PowerlinePlanRequest, limits
 from perch_core.vehicle import load_vehicle
@@ -62,14 +62,11 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
     def __init__(self, config: PowerlinePlannerParameters) -> None:
         super().__init__(config)
         self._vehicle = load_vehicle(config.vehicle)
-        if config.camera not in self._vehicle.mounts:
-            raise ConfigError("powerline_planner", "camera", f"vehicle {self._vehicle.name} has no camera {config.camera!r}")
-        if not math.isfinite(self._vehicle.thrust_rate_max):
-            raise ConfigError("powerline_planner", "vehicle", f"{self._vehicle.name} has no thrust_rate_max, which [P:eq14g] needs")
         self._model = RotorModel.of(self._vehicle)
         # The deadline may change, and goes with each request.
         own = {field.name: getattr(config, field.name) for field in fields(PowerlineSettings)}
         self._settings = PowerlineSettings(**own | {"deadline": PowerlineSettings.deadline})
+        self._settings.check(self._vehicle)
 
     def preload(self) -> Callable[[], Any]:
         """Load the planner, and compile it the first time on a machine."""

@@ -32,6 +32,7 @@ class PowerlinePlanner:
     solver: Solver = field(init=False)
 
     def __post_init__(self) -> None:
+        self.settings.check(self.vehicle)
         self.solver = Solver(self.vehicle, self.gravity, self.settings.camera)
 
     def warm_up(self) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 from perch_core.config import part, quantity, text
 from perch_core.errors import ConfigError
+from perch_core.vehicle import Vehicle
 
 DEADLINE_MAX = 10.0
 """No plan may take longer, whatever a request asks for [s]."""
@@ -54,3 +56,14 @@ class PowerlineSettings:
             low, high = getattr(self, key)
             if not low < high:
                 raise ConfigError("", key, f"[{low:g}, {high:g}] s is not an interval")
+
+    def check(self, vehicle: Vehicle) -> None:
+        """Refuse a vehicle for which there are no plans with these settings.
+
+        Raises:
+            ConfigError: it lacks the camera or a largest rate of its thrusts.
+        """
+        if self.camera not in vehicle.mounts:
+            raise ConfigError("powerline_planner", "camera", f"vehicle {vehicle.name} has no camera {self.camera!r}")
+        if not isfinite(vehicle.thrust_rate_max):
+            raise ConfigError("powerline_planner", "vehicle", f"{vehicle.name} has no thrust_rate_max, which [P:eq14g] needs")
