@@ -47,8 +47,13 @@ class Mission:
         self.node.create_timer(0.1, self._diagnose, callback_group=group)
         self.executor = MultiThreadedExecutor(4, context=self.context)
         self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.closing = threading.Event()
+        self.thread = threading.Thread(target=self._spin, daemon=True)
         self.thread.start()
+
+    def _spin(self):
+        while not self.closing.is_set():
+            self.executor.spin_once(timeout_sec=0.05)
 
     def _tick(self):
         if self.passes.is_set():
@@ -92,6 +97,8 @@ class Mission:
         self.finish.set()
         if self.begins.is_set():
             self.ended.wait(120.0)
+        self.closing.set()
+        self.thread.join(120.0)  # before what wakes it is gone
         self.executor.shutdown(timeout_sec=5.0)
         self.node.destroy_node()
         self.context.try_shutdown()
