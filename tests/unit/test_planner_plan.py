@@ -228,10 +228,18 @@ def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_t
 
 
 def test_a_plan_longer_than_duration_max_is_refused_and_says_what_it_would_take():
-    waypoints = tuple(Waypoint((-8.0 * (k % 2), 3.0 * (k % 3), 1.4)) for k in range(60))
+    waypoints = tuple(Waypoint((-3.0 * (k % 2), 1.0 * (k % 3), 1.4)) for k in range(60))
     with pytest.raises(PerchRefusal, match="duration_max") as caught:
         plan(PerchProblem(HOVER, surface(90.0), waypoints), PerchSettings(), VEHICLE)
     assert caught.value.code == refusals.BOX and caught.value.margin < 0.0 and caught.value.relaxed["duration_max"] > 20.0
+
+
+def test_a_contact_farther_away_than_speed_max_goes_in_duration_max_is_refused_before_the_search():
+    waypoints = tuple(Waypoint((-8.0 * (k % 2), 0.0, 1.4)) for k in range(60))
+    with pytest.raises(PerchRefusal, match="longer than speed_max 12 m/s goes in duration_max 20 s") as caught:
+        plan(PerchProblem(HOVER, surface(90.0), waypoints), PerchSettings(), VEHICLE)
+    assert caught.value.code == refusals.BOX and caught.value.iterations == 0
+    assert caught.value.margin == pytest.approx(12.0 * 20.0 - (0.1 + 59 * 8.0 + np.hypot(9.7, 0.1) - abs(VEHICLE.perch_offset)))
 
 
 @pytest.mark.parametrize("minimum_time", [False, True])
