@@ -44,24 +44,24 @@ def main() -> int:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as tests/conftest.py does, and says why
     os.environ.setdefault("PYTHONPYCACHEPREFIX", str(KEPT))
     enter(*EXTRAS)
-    if arguments.quick:
-        for_pytest = ["tests/unit", "-m", "quick", *for_pytest]
-    return run_tests(arguments.fast, for_pytest)
+    return run_tests(arguments.quick, arguments.fast, for_pytest)
 
 
-def run_tests(fast: bool, for_pytest: list[str]) -> int:
-    """Run pytest in this process, which keeps a ROS domain to itself meanwhile."""
+def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
+    """Run pytest in this process, which keeps a ROS domain to itself meanwhile, or in several that share all tests or the quick ones."""
     from perch_eval.domain import free_domain
 
     os.environ["ROS_DOMAIN_ID"] = str(free_domain())
     # Before the first message class is imported: rclpy does not check fields by default.
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
     os.chdir(ROOT)
+    chosen = ["tests/unit", "-m", "quick"] if quick else ["--ignore=tests/system"] if fast else []
+    processes = PROCESSES - 1 if quick else PROCESSES  # quick tests wait for nothing
     if not fast and not for_pytest and PROCESSES > 2:
-        print(f"{PROCESSES} processes share the tests; what the others print comes at the end", flush=True)
-        share = Share(parts(test_files()), PROCESSES)
-        share.end(run_pytest(["-o", "console_output_style=classic"], share, Beforehand()))
-    return run_pytest(["--ignore=tests/system", *for_pytest] if fast else for_pytest)
+        print(f"{processes} processes share the tests; what the others print comes at the end", flush=True)
+        share = Share(parts(test_files()), processes)
+        share.end(run_pytest([*chosen, "-o", "console_output_style=classic"], share, *() if quick else (Beforehand(),)))
+    return run_pytest([*chosen, *for_pytest])
 
 
 def run_pytest(arguments: list[str], *plugins: object) -> int:

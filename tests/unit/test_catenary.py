@@ -87,6 +87,7 @@ def distances(cable: Catenary, vertices: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - nearest, axis=-1).min(axis=1)
 
 
+@pytest.mark.slow
 @given(cables(), st.integers(1, 25))
 def test_stated_errors_of_a_fit_are_its_errors(cable, count):
     fit = fit_segments(cable, count)

@@ -50,6 +50,7 @@ def compared(page):
     return {name: re.findall("<td>([^<]*)</td>", cells) for name, cells in rows}, re.search(r"<p>(The two are [^.,]*)", page)[1]
 
 
+@pytest.mark.slow
 def test_two_flights_are_on_one_page(recorded, tmp_path, monkeypatch):
     """The second flight is off by 5 cm of estimate more in y, and was reported."""
     a, b = tmp_path / "a", tmp_path / "b"
@@ -89,6 +90,7 @@ def test_each_flight_has_its_pad_and_its_wires_where_they_differ(recorded):
     assert [line[0] for line in drawn(replace(one, pad=None), other)][0] == "other, pad"
 
 
+@pytest.mark.slow
 def test_the_report_of_another_flight_is_not_used(reported, tmp_path, capsys):
     channels = flown()
     channels["odometry"] = channels["odometry"][5:]
@@ -99,12 +101,14 @@ def test_the_report_of_another_flight_is_not_used(reported, tmp_path, capsys):
     assert "is not the report of" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_limits_that_differ_are_both_told(reported):
     one = comparison.read("one", "k", reported[0])
     other = replace(one, report=one.report | {"margins": [dict(m, high=12.0) for m in one.report["margins"] if m["unit"] == "N"]})
     assert f"at most {4 * load_vehicle('snapdragon').thrust_max:.3g} / at most 12</td>" in comparison._margin_table((one, other))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", ["report", "comparison"])
 def test_a_flight_can_be_turned_on_a_page_that_needs_no_network(page, reported, tmp_path, monkeypatch):
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)

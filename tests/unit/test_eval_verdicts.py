@@ -43,6 +43,7 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
     assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
 
 
+@pytest.mark.slow
 def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, monkeypatch):
     scenario = load_scenario("inspection")
     times, states = reference_states(scenario)

@@ -74,6 +74,7 @@ def approach(world, images=20):
         yield world.image(np.array([x, 0.0, 1.1]), np.array([1.5, 0.0, 0.0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.0, 2.3])
 def test_covariance_of_one_image_covers_calibration(x):
     """From afar, and at 0.7 m, where the camera's place on the body counts as much as what it sees."""
