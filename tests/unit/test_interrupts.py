@@ -75,12 +75,12 @@ CONTROLLER = executable("perch_control", "controller")
     ("cmdline", f"{sys.executable}\0{SCRIPTS}"), ("cmdline", CONTROLLER), ("maps", "_multiarray_umath"), ("maps", "_rclpy_pybind11")])
 def test_ctrl_c_while_run_node_starts_leaves_no_traceback(ros_domain, file, words):
     command = [sys.executable, "-S", str(SCRIPTS / "run_node.py"), "controller"]
-    assert interrupted_once(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), file, words) == ""
+    assert "Traceback" not in interrupted_once(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), file, words)
 
 
 @pytest.mark.parametrize("words", ["_multiarray_umath", "_rclpy_pybind11"])
 def test_ctrl_c_while_an_executable_loads_leaves_no_traceback(ros_domain, words):
-    assert interrupted_once(subprocess.Popen([CONTROLLER], stderr=subprocess.PIPE, text=True), "maps", words) == ""
+    assert "Traceback" not in interrupted_once(subprocess.Popen([CONTROLLER], stderr=subprocess.PIPE, text=True), "maps", words)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
