@@ -71,7 +71,7 @@ def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:
     need = Requirements(
         start=np.array([[0.0, 0.0, 1.4], rest, rest, rest]), start_yaw=(0.0, 0.0), waypoints=np.zeros((0, 3)), p_S=WALL.p_WS,
         s1=WALL.R_WS[:, 0], s2=WALL.R_WS[:, 1], s3=WALL.normal, v_S=rest, perch_offset=0.04, mass=0.25,
-        impact_acceleration=3.3, impact_speed=(0.65, 0.8), tangential_speed=0.3, contact_delay=0.03, tube=(0.12, 0.01, 0.1, 0.33),
+        impact_acceleration=3.3, impact_speed=(0.65, 0.8), tangential_speed=0.3, contact_delay=0.04, tube=(0.12, 0.01, 0.1, 0.33),
         thrust=limits["thrust"], body_rate=limits["body_rate"][1], speed=limits["speed"][1], height=limits["height"],
         extension=0.15)
     assert verify(plan.trajectory.durations, plan.trajectory.coefficients, need, step=1e-3) == []

@@ -177,7 +177,7 @@ def test_minimum_time_is_shorter_and_still_verifies():
 
 
 def test_certificates_enclose_what_dense_sampling_finds():
-    planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), surface(90.0)))
+    planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), surface(90.0)), PerchSettings(contact_delay=0.03))
     proofs = {c.quantity: c for c in planned.certificates}
     at = planned.trajectory.sample_many(np.linspace(0.0, planned.duration, 4001))
     states = [flat_to_state(*row, VEHICLE.mass) for row in zip(at.p, at.v, at.a, at.j, at.s, at.yaw, at.yaw_rate, at.yaw_acc)]

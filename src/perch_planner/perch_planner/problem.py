@@ -138,8 +138,8 @@ class PerchParameters:
     impact_acceleration: float = quantity(3.3, unit="m/s^2", above=0.0, high=100.0, doc="alpha of [M:eq11]")
     impact_speed_min: float = quantity(0.65, unit="m/s", low=0.0, high=20.0, doc="v_min of [M:eq14], along -s3, at the planned contact")
     impact_speed_max: float = quantity(0.8, unit="m/s", low=0.0, high=20.0, doc="v_max of [M:eq14], along -s3")
-    contact_delay: float = quantity(0.03, unit="s", low=0.0, high=0.2,
-                                    doc="speed and slip are bounded on time and, where both can be, so late: an error of 2 cm holds a contact up by this")
+    contact_delay: float = quantity(0.04, unit="s", low=0.0, high=0.2,
+                                    doc="speed and slip are bounded on time and, where both can be, so late: errors and lag delay a contact")
     tangential_speed_max: float = quantity(0.3, unit="m/s", above=0.0, high=20.0, doc="slip over the surface at contact")
     tube_time: float = quantity(0.12, unit="s", low=0.0, high=2.0, doc="t_k of [M:eq15]")
     thrust_reserve: float = quantity(0.9, above=0.0, high=1.0, doc="share of the vehicle's thrust that a plan may use")

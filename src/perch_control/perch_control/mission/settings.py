@@ -38,7 +38,7 @@ class MissionSettings:
     mapping_standoff: float = quantity(2.2, unit="m", above=0.0, high=50.0, doc="but not nearer to the target than this")
     plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
     replan_period: ClassVar[float] = 0.1  # [s]
-    replan_until: ClassVar[float] = 0.7  # no new plan closer than this to the contact [s]
+    replan_until: ClassVar[float] = 0.4  # no new plan closer than this to the contact [s]
     contact_time: float = quantity(0.25, unit="s", low=0.0, high=2.0, doc="how long adhesion is awaited after the planned contact")
     contact_early: ClassVar[float] = 0.15  # how long before the planned contact adhesion is looked for [s]
     waypoints: tuple[float, ...] = quantity((), unit="m, deg", doc="of an inspection, in map: x, y, z, yaw of each, one after the other")
