@@ -43,7 +43,7 @@ class Margin:
 
 
 def number(value: float, sign: str = "") -> str:
-    """A value with three significant digits and no exponent; with a `sign` of "+", a plus sign as well."""
+    """A value with three significant digits; with a `sign` of "+", a plus sign as well."""
     return f"{float(f'{value:.3g}'):{sign}g}"
 
 

@@ -113,18 +113,18 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[wrong]
         raise PerchRefusal(BOX, f"height of the {name}", margin,
                            f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m")
-    speed = hypot(*start.v.tolist())
+    speed, at_rest = hypot(*start.v.tolist()), not any(problem.target_velocity.tolist())
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
-    if way > limits.speed * settings.duration_max and not any(problem.target_velocity.tolist()):
+    if way > limits.speed * settings.duration_max and at_rest:
         raise PerchRefusal(BOX, "speed_max and duration_max", limits.speed * settings.duration_max - way,
                            f"the way to the contact is {way:.1f} m, longer than speed_max {limits.speed:g} m/s goes in duration_max "
                            f"{settings.duration_max:g} s")
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
                            f"the start is {_place(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it")
-    if near >= 0 and not any(problem.target_velocity.tolist()):
+    if near >= 0 and at_rest:
         raise PerchRefusal(BOX, f"clearance of waypoint {near - 1} from the surface's plane", at_waypoint - limits.clearance,
                            f"waypoint {near - 1} is {_place(at_waypoint)}; it needs more than {limits.clearance:.3f} m in front of it")
 
