@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 import operator
 import os
@@ -22,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from perch_core.processes import without_collector
 
 _STATISTICS = {"median": lambda x: float(np.median(x)), "p99": lambda x: float(np.percentile(x, 99)),
                "max": lambda x: float(np.max(x)), "min": lambda x: float(np.min(x))}
@@ -80,16 +80,11 @@ def measure(call: Callable[[], object], repetitions: int = 200, warm_up: int = 3
     for _ in range(warm_up):
         call()
     times = np.empty(repetitions)
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
+    with without_collector():
         for k in range(repetitions):
             begin = time.perf_counter()
             call()
             times[k] = time.perf_counter() - begin
-    finally:
-        if enabled:
-            gc.enable()
     return times
 
 

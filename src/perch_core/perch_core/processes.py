@@ -58,6 +58,18 @@ def one_thread_for_sums() -> None:
                     getattr(library, function)(1)
 
 
+@contextmanager
+def without_collector() -> Iterator[None]:
+    """Nothing is looked through for garbage meanwhile."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def freeze_heap() -> None:
     """Keep what is there now out of the garbage collector's sight: looking through it again takes up to 0.1 s, at any moment."""
     gc.collect()

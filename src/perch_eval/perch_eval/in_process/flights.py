@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import gc
 import time as clock
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from perch_core.component import Component
 from perch_core.config import choice
 from perch_core.errors import PerchError
+from perch_core.processes import without_collector
 from perch_core.values import NANOSECONDS, seconds
 from perch_eval.goal import goal_of, outcome_of
 from perch_eval.in_process.loop import Loop
@@ -103,25 +102,13 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
     return perch(arrange(scenario, seed, sensing), scenario, linger)
 
 
-@contextmanager
-def _without_collector() -> Iterator[None]:
-    """A trace keeps what it is given: looking through that for garbage again and again takes a tenth of a flight's time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
     """Fly an arrangement from the scenario's goal to its end; arguments as those of `fly`."""
     began = clock.perf_counter()
     goal = loop.send("mission", goal_of(scenario))
     limit = round(scenario.time_limit * NANOSECONDS)
     stamp = 0
-    with _without_collector():
+    with without_collector():  # a trace keeps what it is given: looking through that again and again takes a tenth of a flight's time
         while goal.result is None and stamp < limit + PATIENCE:
             stamp = loop.step()
             goal.cancel_requested = stamp > limit
