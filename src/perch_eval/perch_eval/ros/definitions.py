@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 
 from perch_eval.mcap_log import Schema
-
-_PRIMITIVE = {"bool", "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32",
-              "int64", "uint64", "string", "wstring"}
 
 
 def type_name(msg_type: type) -> str:
@@ -35,13 +34,9 @@ def message_definition(name: str) -> str:
         if full in seen:
             return
         seen[full] = (Path(get_package_share_directory(package)) / kind / f"{short}.msg").read_text()
-        for line in seen[full].splitlines():
-            word = line.split("#")[0].strip().split(" ")[0]
-            base = word.split("[")[0].split("<")[0]
-            if not base or base in _PRIMITIVE:
-                continue
-            inner_package, _, inner = base.rpartition("/")
-            collect(f"{inner_package.split('/')[0] or package}/msg/{inner}")
+        fields = getattr(import_module(f"{package}.{kind}"), short).get_fields_and_field_types()
+        for inner_package, inner in re.findall(r"(\w+)/(\w+)", " ".join(fields.values())):
+            collect(f"{inner_package}/msg/{inner}")
 
     collect(name)
     first, *rest = seen
