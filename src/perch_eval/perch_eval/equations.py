@@ -15,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from perch_eval.arguments import command_parser
+from perch_eval.evaluation.document import table
 from perch_eval.revision import root
 
 EXAMPLES = """examples:
@@ -173,14 +174,14 @@ def page(root: Path) -> str:
              "The definition is the one place to change, and what flies. `grep -rnI M:eq15 src` finds what else has to do with it.",
              "As M prints it, section IV-C is [perch_planner/paper/paper_m.py](../src/perch_planner/perch_planner/paper/paper_m.py).", ""]
     for paper, titles in TITLES.items():
-        lines += [f"## Paper {paper}", "", "| equation | what | definition | tests |", "| --- | --- | --- | --- |"]
+        rows = []
         for eq, title in titles.items():
             places = ", ".join(f"[`{p.name}`](../{p.file})" for p in found.get((paper, eq), []))
             reason = f"; {REASONS[paper, eq]}" if (paper, eq) in REASONS else ""
             checks = ", ".join(f"[{path.name}](../{path})" for path in tests.get((paper, eq), []))
             number = f"({eq[2:]})" if eq.startswith("eq") else "algorithm 1"
-            lines.append(f"| {paper} {number} | {title}{reason} | {places} | {checks} |")
-        lines.append("")
+            rows.append((f"{paper} {number}", f"{title}{reason}", places, checks))
+        lines += [f"## Paper {paper}", "", *table("equation | what | definition | tests", rows), ""]
     return "\n".join(lines)
 
 

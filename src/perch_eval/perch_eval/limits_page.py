@@ -11,6 +11,7 @@ from perch_core.ros import topics
 from perch_core.ros.late_service import WAITING
 from perch_core.values import limits
 from perch_eval.arguments import command_parser
+from perch_eval.evaluation.document import table
 from perch_eval.in_process.parameters import COMPONENTS
 from perch_eval.revision import root
 
@@ -56,30 +57,26 @@ def _topics() -> Iterator[str]:
             if port.value in limits.LIMITS:
                 channel = port._channel.replace("{camera}", "front").replace("{images}", "image_raw")
                 takers.setdefault(topics.topic(channel).channel, {}).setdefault(port.value.__name__, []).append(node)
-    yield "## Topics\n\n| topic | value | taken by | bytes | read per second | queue |\n| --- | --- | --- | --- | --- | --- |"
-    for row in topics.TOPICS:
-        for value, nodes in takers.get(row.channel, {}).items():
-            size = f"{row.largest >> 20} Mi" if row.largest >= 1 << 20 else f"{row.largest >> 10} Ki"
-            yield (f"| `{row.channel}` | {value} | {', '.join(dict.fromkeys(nodes))} | {size} | {row.often or 'all'} | "
-                   f"{row.qos.subscribe.depth} |")
-    yield ""
+    yield from ("## Topics", "", *table("topic | value | taken by | bytes | read per second | queue", (
+        (f"`{row.channel}`", value, ", ".join(dict.fromkeys(nodes)),
+         f"{row.largest >> 20} Mi" if row.largest >= 1 << 20 else f"{row.largest >> 10} Ki", row.often or "all", row.qos.subscribe.depth)
+        for row in topics.TOPICS for value, nodes in takers.get(row.channel, {}).items())), "")
 
 
 def _requests() -> Iterator[str]:
-    yield (f"## Requests and goals\n\nAt most {WAITING} requests of a service wait, and {WAITING_MAX} plans; more plans are refused. Every request "
-           "is answered.\n\n| service, action | value | node |\n| --- | --- | --- |")
+    rows = []
     for node, cls in _components():
         taken = [(port._channel, port.request) for port in ports(cls, Service)] + [(port._channel, port.goal) for port in ports(cls, Action)]
-        yield from (f"| `{channel}` | {value.__name__} | {node} |" for channel, value in taken)
-    yield ""
+        rows += [(f"`{channel}`", value.__name__, node) for channel, value in taken]
+    yield from ("## Requests and goals", "",
+                f"At most {WAITING} requests of a service wait, and {WAITING_MAX} plans; more plans are refused. Every request is answered.", "",
+                *table("service, action | value | node", rows), "")
 
 
 def _values() -> Iterator[str]:
     yield "## Values"
     for kind, fields in limits.LIMITS.items():
-        yield f"\n### {kind.__name__}\n\n| field | allowed |\n| --- | --- |"
-        for name, limit in fields.items():
-            yield f"| `{name}` | {_allowed(limit)} |"
+        yield from ("", f"### {kind.__name__}", "", *table("field | allowed", ((f"`{name}`", _allowed(limit)) for name, limit in fields.items())))
 
 
 def _allowed(limit: object) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import platform
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from perch_core.json_values import finite
-from perch_eval.evaluation.sections import FAILS, HOLDS, MISSING, VACUOUS, Effort, Section
+from perch_eval.evaluation.sections import BETTER, FAILS, HOLDS, MISSING, VACUOUS, WORSE, Effort, Section
 from perch_eval.revision import banner, commit, made_of
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}
@@ -30,13 +31,9 @@ def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, A
     (effort.out / f"{data or name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")
 
 
-def counts(sections: Sequence[Section]) -> dict[str, int]:
+def counts(sections: Sequence[Section]) -> Counter[str]:
     """Rows by verdict."""
-    out: dict[str, int] = {}
-    for section in sections:
-        for row in section.rows:
-            out[row.verdict] = out.get(row.verdict, 0) + 1
-    return out
+    return Counter(row.verdict for section in sections for row in section.rows)
 
 
 def table(head: str, rows: Iterable[Sequence[object]]) -> list[str]:
@@ -56,9 +53,9 @@ def machine() -> str:
 def _page(sections: Sequence[Section], duration: float) -> list[str]:
     found = counts(sections)
     lines = ["# Results", "", f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
-             f"{found.get(HOLDS, 0)} claims hold, {found.get(FAILS, 0)} fail, {found.get(VACUOUS, 0)} are vacuous (nothing occurred that they are "
-             f"about); {found.get('better', 0)} further values are better than the paper's, {found.get('worse', 0)} worse; "
-             f"{found.get(MISSING, 0)} rows are not available.", "",
+             f"{found[HOLDS]} claims hold, {found[FAILS]} fail, {found[VACUOUS]} are vacuous (nothing occurred that they are "
+             f"about); {found[BETTER]} further values are better than the paper's, {found[WORSE]} worse; "
+             f"{found[MISSING]} rows are not available.", "",
              "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "
              "**P**: Paneque et al., *Perception-Aware Perching on Powerlines with Multirotors*. "
              "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", ""]

@@ -9,6 +9,7 @@ import json
 import re
 from pathlib import Path
 
+from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import MISSING
 from perch_eval.revision import root
 
@@ -39,10 +40,10 @@ def table() -> str:
     commit = re.search(r"Of commit ([0-9a-f]{7})", (root() / page).read_text())
     if commit is None:
         raise LookupError(f"{page}: no commit")
-    lines = [f"| of [{commit[1]}]({page}) | paper | ours | verdict |", "| --- | --- | --- | --- |"]
-    for title, key, name in ROWS:
-        found = rows.get((key, name), {"paper": "", "ours": "not evaluated", "verdict": MISSING})
-        lines.append(f"| {title} | {found['paper'] or '-'} | {found['ours']} | {found['verdict'].lower()} |")
+    missing = {"paper": "", "ours": "not evaluated", "verdict": MISSING}
+    found = ((title, rows.get((key, name), missing)) for title, key, name in ROWS)
+    lines = document.table(f"of [{commit[1]}]({page}) | paper | ours | verdict", (
+        (title, row["paper"] or "-", row["ours"], row["verdict"].lower()) for title, row in found))
     return "\n".join(lines) + "\n"
 
 
