@@ -182,10 +182,10 @@ def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Tra
         if truth is not None:
             try:
                 compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
-                told.figures["vio"] |= compared.figures()
+                told.figures["vio"] |= compared.figures
                 told.rows += _evaluation_rows("VIO", compared)
                 against = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth)
-                told.figures["estimator"] = against.figures()
+                told.figures["estimator"] = against.figures
                 told.rows += _evaluation_rows("estimator", against)[:2]
             except RecordingError as error:
                 told.rows.append(("not compared", str(error)))
@@ -230,17 +230,17 @@ def _board(perception: Perception) -> tuple[dict[str, float], str]:
 
 
 def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
-    f = e.figures()
+    f = e.figures
     drift = f"{f['drift_percent']:.2f} % of the path" if np.isfinite(f["drift_percent"]) else "a path too short for a share"
     start = (f"{name}: from the start on", f"{100 * f['final_error_m']:.1f} cm off at the end ({drift}), "
              f"{100 * f['largest_error_m']:.1f} cm at most; attitude {f['attitude_rms_deg']:.2f} deg rms")
     nees = (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (honest: 3)")
-    if not np.isfinite(e.ate):  # it stands, or moves along a line
+    if not np.isfinite(f["ate_rmse_m"]):  # it stands, or moves along a line
         return [start, nees]
-    attitude, why = (f", {e.ate_deg:.2f} deg", "") if np.isfinite(e.ate_deg) else ("", "; too straight a path to align attitudes by")
-    return [(f"{name}: ATE (evo)", f"{100 * e.ate:.2f} cm{attitude} rms over {e.duration:.1f} s and {e.path:.1f} m{why}"), start,
-            (f"{name}: RPE (evo)", f"{100 * e.rpe:.2f} cm, {e.rpe_deg:.2f} deg rms over {e.rpe_delta:g} m"),
-            (f"{name}: scale", f"{e.scale:.4f}"), nees]
+    attitude, why = (f", {f['ate_rmse_deg']:.2f} deg", "") if np.isfinite(f["ate_rmse_deg"]) else ("", "; too straight a path to align attitudes by")
+    return [(f"{name}: ATE (evo)", f"{100 * f['ate_rmse_m']:.2f} cm{attitude} rms over {f['compared_s']:.1f} s and {f['path_m']:.1f} m{why}"), start,
+            (f"{name}: RPE (evo)", f"{100 * f['rpe_rmse_m']:.2f} cm, {f['rpe_rmse_deg']:.2f} deg rms over {f['rpe_delta_m']:g} m"),
+            (f"{name}: scale", f"{f['scale']:.4f}"), nees]
 
 
 def _trajectory(states: Sequence[InertialState] | Sequence[OdometryState]) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +22,14 @@ class Evaluation:
     """How far an estimate is from the truth.
 
     Attributes:
-        duration: compared [s].
-        path: length of the true path [m].
-        ate: absolute trajectory error after the best rigid alignment, rms [m]; nan: the motion is too short to be aligned.
-        ate_deg: the same of the attitude [deg]; nan also where the path is so straight that its shape leaves its attitude open.
-        rpe: error of the motion over `rpe_delta` of path, rms [m]; nan likewise.
-        rpe_deg: of the attitude [deg].
-        rpe_delta: [m].
-        scale: of the estimate against the truth; nan likewise.
+        figures: for a table or JSON, of n poses; nan: not known.
+            compared_s, path_m: duration, and length of the true path.
+            ate_rmse_m: absolute trajectory error after the best rigid alignment; nan: the motion is too short to be aligned.
+            ate_rmse_deg: the same of the attitude; nan also where the path is so straight that its shape leaves its attitude open.
+            rpe_rmse_m, rpe_rmse_deg: error of the motion over `rpe_delta_m` of path, and of its attitude; nan likewise.
+            scale: of the estimate against the truth; nan likewise.
+            final_error_m, largest_error_m, drift_percent, attitude_rms_deg: of `error` and `turn`.
+            nees_position_mean: of `nees`.
         stamps: of the compared poses [ns], shape (n,).
         error: estimate minus truth of the position, in the estimate's W, both beginning together with the same heading [m], shape (n, 3).
         turn: rotation vector in W of the estimate against the truth, likewise [rad], shape (n, 3).
@@ -36,42 +37,12 @@ class Evaluation:
         truth_W: the true path in the estimate's W, shape (n, 3).
     """
 
-    duration: float
-    path: float
-    ate: float
-    ate_deg: float
-    rpe: float
-    rpe_deg: float
-    rpe_delta: float
-    scale: float
+    figures: dict[str, float]
     stamps: np.ndarray
     error: np.ndarray
     turn: np.ndarray
     nees: np.ndarray
     truth_W: np.ndarray
-
-    @property
-    def final(self) -> float:
-        """Distance from the truth at the end [m]."""
-        return float(np.linalg.norm(self.error[-1]))
-
-    def figures(self) -> dict[str, float]:
-        """For a table or JSON."""
-        return {
-            "compared_s": self.duration,
-            "path_m": self.path,
-            "ate_rmse_m": self.ate,
-            "ate_rmse_deg": self.ate_deg,
-            "rpe_rmse_m": self.rpe,
-            "rpe_rmse_deg": self.rpe_deg,
-            "rpe_delta_m": self.rpe_delta,
-            "scale": self.scale,
-            "final_error_m": self.final,
-            "drift_percent": 100.0 * self.final / self.path if self.path > LEAST_PATH else np.nan,
-            "largest_error_m": float(np.linalg.norm(self.error, axis=1).max()),
-            "attitude_rms_deg": float(np.degrees(np.sqrt((self.turn**2).sum(axis=1).mean()))),
-            "nees_position_mean": float(np.nanmean(self.nees)) if np.isfinite(self.nees).any() else np.nan
-        }
 
 
 def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | None = None) -> Evaluation:
@@ -98,15 +69,16 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
     nees = np.full(len(error), np.nan)
     if covariances is not None:
         nees[1:] = consistency.nees(error[1:], covariances[kept][1:] + 1e-12 * np.eye(3))
-    delta = max(0.1, round(0.1 * true.length, 1))
-    ate, ate_deg, rpe, rpe_deg, scale = _by_evo(estimate, true, delta)
-    return Evaluation(duration=1e-9 * float(true.stamps[-1] - true.stamps[0]), path=true.length, ate=ate, ate_deg=ate_deg, rpe=rpe,
-                      rpe_deg=rpe_deg, rpe_delta=delta, scale=scale, stamps=true.stamps, error=error, turn=turn, nees=nees,
-                      truth_W=truth_W)
+    off = np.linalg.norm(error, axis=1)
+    figures = {"compared_s": 1e-9 * float(true.stamps[-1] - true.stamps[0]), "path_m": true.length, **_by_evo(estimate, true),
+               "final_error_m": float(off[-1]), "drift_percent": 100.0 * float(off[-1]) / true.length if true.length > LEAST_PATH else np.nan,
+               "largest_error_m": float(off.max()), "attitude_rms_deg": float(np.degrees(np.sqrt((turn**2).sum(axis=1).mean()))),
+               "nees_position_mean": float(np.nanmean(nees)) if np.isfinite(nees).any() else np.nan}
+    return Evaluation(figures, true.stamps, error, turn, nees, truth_W)
 
 
-def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float, float, float, float, float]:
-    """ATE [m], ATE [deg], RPE [m], RPE [deg], scale; nan where the motion is too short."""
+def _by_evo(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
+    """ATE, RPE and scale, as `Evaluation.figures` has them; nan where the motion is too short."""
     from evo.core import metrics
     from evo.core.geometry import GeometryException
     from evo.core.metrics import MetricsException, PoseRelation, Unit
@@ -119,23 +91,21 @@ def _by_evo(estimate: Trajectory, true: Trajectory, delta: float) -> tuple[float
         metric.process_data((of(true), ours))
         return float(metric.get_statistic(metrics.StatisticsType.rmse))
 
+    delta, ours = max(0.1, round(0.1 * true.length, 1)), of(estimate)
+    found = dict.fromkeys(("ate_rmse_m", "ate_rmse_deg", "rpe_rmse_m", "rpe_rmse_deg"), np.nan) | {"rpe_delta_m": delta, "scale": np.nan}
     if true.length < LEAST_PATH:
-        return np.nan, np.nan, np.nan, np.nan, np.nan
-    ours = of(estimate)
-    try:
+        return found
+    with suppress(GeometryException):  # along a line, or on the spot
         scale = float(of(estimate).align(of(true), correct_scale=True)[2])
         ours.align(of(true))
-        ate = rms(metrics.APE(PoseRelation.translation_part), ours)
-        ate_deg = rms(metrics.APE(PoseRelation.rotation_angle_deg), ours) if ate < MOST_OPEN * _breadth(true.p) else np.nan
-    except GeometryException:  # along a line, or on the spot
-        ate, ate_deg, scale = np.nan, np.nan, np.nan
-    try:
-        rpe, rpe_deg = (
+        found |= {"ate_rmse_m": rms(metrics.APE(PoseRelation.translation_part), ours), "scale": 1.0 / scale if scale else np.nan}
+        if found["ate_rmse_m"] < MOST_OPEN * _breadth(true.p):
+            found["ate_rmse_deg"] = rms(metrics.APE(PoseRelation.rotation_angle_deg), ours)
+    with suppress(MetricsException):
+        found["rpe_rmse_m"], found["rpe_rmse_deg"] = (
             rms(metrics.RPE(relation, delta, Unit.meters, rel_delta_tol=0.2, all_pairs=True, pairs_from_reference=True), of(estimate))
             for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg))
-    except MetricsException:
-        rpe, rpe_deg = np.nan, np.nan
-    return ate, ate_deg, rpe, rpe_deg, 1.0 / scale if scale else np.nan
+    return found
 
 
 def _breadth(p: np.ndarray) -> float:
