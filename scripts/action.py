@@ -17,7 +17,7 @@ EXAMPLES = """examples:
 def command_line() -> argparse.ArgumentParser:
     """Sub-commands and their arguments."""
     commands = Commands(__doc__, EXAMPLES)
-    commands.add("list", "calls:list_actions", "the actions of the graph").add_argument("-t", "--show-types", action="store_true")
+    commands.add_list("actions")
     goal = commands.add("send_goal", "calls:send_goal", "send a goal and wait for its result")
     goal.add_argument("action")
     goal.add_argument("type", help="as in perch_msgs/action/Perch")

@@ -17,7 +17,7 @@ EXAMPLES = """examples:
 def command_line() -> argparse.ArgumentParser:
     """Sub-commands and their arguments."""
     commands = Commands(__doc__, EXAMPLES)
-    commands.add("list", "calls:list_services", "the services of the graph").add_argument("-t", "--show-types", action="store_true")
+    commands.add_list("services")
     call = commands.add("call", "calls:call_service", "send a request, print the response")
     call.add_argument("service")
     call.add_argument("type", help="as in perch_msgs/srv/PlanPerch")

@@ -20,7 +20,7 @@ EXAMPLES = """examples:
 def command_line() -> argparse.ArgumentParser:
     """Sub-commands and their arguments."""
     commands = Commands(__doc__, EXAMPLES)
-    commands.add("list", "topics:list_topics", "the topics of the graph").add_argument("-t", "--show-types", action="store_true")
+    commands.add_list("topics")
     info = commands.add("info", "topics:show_info", "a topic's type, publishers and subscribers")
     info.add_argument("topic")
     info.add_argument("-v", "--verbose", action="store_true", help="nodes and QoS")

@@ -1,4 +1,4 @@
-"""Lists services and actions, sends requests and goals."""
+"""Sends requests and goals."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import argparse
 import sys
 
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient, get_action_names_and_types
+from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.node import Node
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, show_names, visit
+from ros_graph.connection import Visit, visit
 from ros_graph.messages import fill, interface, parse, to_yaml
 
 _STATUS = {
@@ -19,16 +18,6 @@ _STATUS = {
     GoalStatus.STATUS_CANCELED: "CANCELED",
     GoalStatus.STATUS_ABORTED: "ABORTED",
 }
-
-
-def list_services(arguments: argparse.Namespace) -> int:
-    """`service.py list`"""
-    return show_names(arguments, Node.get_service_names_and_types)
-
-
-def list_actions(arguments: argparse.Namespace) -> int:
-    """`action.py list`"""
-    return show_names(arguments, get_action_names_and_types)
 
 
 def call_service(arguments: argparse.Namespace) -> int:

@@ -43,6 +43,12 @@ class Commands:
         self._verbs.metavar = "|".join(self._verbs.choices)
         return command
 
+    def add_list(self, kind: str) -> None:
+        """The sub-command `list`, of `topics`, `services` or `actions`."""
+        command = self.add("list", "connection:list_names", f"the {kind} of the graph")
+        command.set_defaults(kind=kind)
+        command.add_argument("-t", "--show-types", action="store_true")
+
 
 def count(text: str) -> int:
     """A number of messages on a command line: at least one."""

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
 from typing import Any, TypeVar
 
+from rclpy.action import get_action_names_and_types
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -78,8 +79,10 @@ def hidden(name: str) -> bool:
     return any(part.startswith("_") for part in name.split("/"))
 
 
-def show_names(arguments: argparse.Namespace, observe: Callable[[Node], list[tuple[str, list[str]]]]) -> int:
-    """Print the names of the graph that are not hidden, with their types where that is asked for (`list -t`)."""
+def list_names(arguments: argparse.Namespace) -> int:
+    """`list`: prints the names of a kind that are not hidden, with their types where that is asked for (`-t`)."""
+    observe = {"topics": Node.get_topic_names_and_types, "services": Node.get_service_names_and_types,
+               "actions": get_action_names_and_types}[arguments.kind]
     with visit() as graph:
         found = graph.settle(lambda: observe(graph.node), arguments.spin_time)
     for name, types in sorted(found):

@@ -1,4 +1,4 @@
-"""What `topic.py` does: lists topics and describes them, prints, counts and publishes messages."""
+"""What `topic.py` does: describes topics, prints, counts and publishes messages."""
 
 from __future__ import annotations
 
@@ -11,19 +11,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, show_names, visit
+from ros_graph.connection import Visit, visit
 from ros_graph.messages import fill, interface, parse, pick, to_yaml
 
 REPORT_PERIOD = 1.0  # of `hz` [s]
-
-
-def list_topics(arguments: argparse.Namespace) -> int:
-    """`topic.py list`"""
-    return show_names(arguments, Node.get_topic_names_and_types)
 
 
 def show_info(arguments: argparse.Namespace) -> int:
