@@ -98,10 +98,8 @@ class RunningProgram:
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal to the whole process group."""
-        try:
+        with suppress(ProcessLookupError):
             os.killpg(self.pid, number)
-        except ProcessLookupError:
-            pass
 
     def wait(self, timeout: float) -> bool:
         """Whether it has ended within `timeout` seconds."""

@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -112,8 +113,7 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
         started = programs(scenario, seed, scenario_source=str(source), composed=composed, folder=folder)
     else:
         started = blind_programs(node_programs(blind_launches(scenario, seed, str(source), True), folder, composed=composed))
-    with own_domain(range(43, 70)):
-        progress, pilot = Progress(flights, what="flights"), MissionClient()
+    with own_domain(range(43, 70)), closing(MissionClient()) as pilot, closing(Progress(flights, what="flights")) as progress:
         try:
             with Stack(started, folder) as stack:
                 stack.wait_until_ready(pilot.visible_nodes, READY)
@@ -129,9 +129,6 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
             print(f"\n{error}", file=sys.stderr)
         except KeyboardInterrupt:
             print("\ninterrupted; what has been flown counts", file=sys.stderr)
-        finally:
-            progress.close()
-            pilot.close()
     return found
 
 

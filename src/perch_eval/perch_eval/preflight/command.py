@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -99,15 +100,12 @@ def _check(arguments: argparse.Namespace) -> int:
         raise PerchError(f"--shake: {vehicle.name} has no camera {arguments.shake!r}")
     from perch_eval.preflight.ros.listener import GraphListener
 
-    listener = GraphListener(vehicle, arguments.namespace)
-    try:
+    with closing(GraphListener(vehicle, arguments.namespace)) as listener:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         listener.await_first("imu/data_raw", arguments.listen)
         listener.listen(arguments.listen)
         found = [*listened(listener, vehicle), shaken(listener, vehicle, arguments.shake or ""),
                  *exercised(listener, arguments, checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
-    finally:
-        listener.close()
     print("\n".join(map(str, found)))
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}
     print(", ".join(f"{count} {verdict.value}" for verdict, count in counts.items()))

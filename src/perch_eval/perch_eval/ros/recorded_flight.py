@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -87,10 +88,7 @@ def write(path: Path, values: Iterable[tuple[str, int, Any]], namespace: str = "
         values: (channel, time [ns], value) in the order in which they are to stand in the file.
         namespace: of the vehicle.
     """
-    log = McapLog(path)
-    try:
+    with closing(McapLog(path)) as log:
         for channel, time, value in values:
             topic = channel if channel.startswith("/") else f"{namespace}/{channel}"
             log.write(topic, schema_of(topics.message_type(channel)), topics.encode(channel, value), time)
-    finally:
-        log.close()
