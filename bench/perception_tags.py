@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from importlib.util import find_spec
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from perch_perception.pose_buffer import BodyState
 from perch_perception.tags import BoardLocalizer, TagDetector, refine_corners
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import load_scenario
+from recordings_scores import ours_of, pupil
 
 # scenario, name, bars on position [cm] and attitude [deg]
 PLACES = (("surface_60", "60 deg, 1.7 m", 0.5, 0.3), ("surface_90", "90 deg, 1.7 m", 0.5, 0.3),
@@ -43,14 +44,12 @@ def figures(quick: bool) -> list[Figure]:
                   figure("tags: frame, searching (10 Hz at most)", "ms", first),
                   figure("tags: all four within 1 s", "share", [float(np.mean(acquired))], 0.99, "min >="),
                   figure("tags: flips", "frames", [float(flips)], 0.0, "max ==")]
-    return everything + out + (_beside_pupil(hovers) if find_spec("pupil_apriltags") else [])
+    return everything + out + (_beside_pupil(hovers, search) if (search := pupil()) else [])
 
 
-def _beside_pupil(hovers: int) -> list[Figure]:
+def _beside_pupil(hovers: int, search: Callable[[np.ndarray], list]) -> list[Figure]:
     """Corners in the same images by us and by pupil-apriltags (`pip install pupil-apriltags`), which knows no lens."""
-    from pupil_apriltags import Detector
-
-    theirs, out = Detector(families="tag36h11", quad_decimate=1.0), []
+    out = []
     for scenario_name, name, _, _ in PLACES:
         scenario = load_scenario(scenario_name)
         mount, board = load_vehicle(scenario.vehicle).mounts["front"], load_board(scenario.target.board)
@@ -64,9 +63,8 @@ def _beside_pupil(hovers: int) -> list[Figure]:
             refined = refine_corners(image, mount.camera, found.corners, modules=board.modules)
             errors["ours"] += [np.linalg.norm(corners - truth[board.ids.index(number)], axis=1)
                                for number, corners in zip(found.ids, mount.camera.project(refined.rays_C)[0])]
-            # their corners (lb, rb, rt, lt) of a marker turned by 180 deg, in pixels counted from the first one's corner
-            errors["pupil-apriltags"] += [np.linalg.norm(tag.corners[[1, 0, 3, 2]] - 0.5 - truth[board.ids.index(tag.tag_id)], axis=1)
-                                          for tag in theirs.detect(image) if tag.tag_id in board.ids]
+            errors["pupil-apriltags"] += [np.linalg.norm(ours_of(tag.corners) - truth[board.ids.index(tag.tag_id)], axis=1)
+                                          for tag in search(image) if tag.tag_id in board.ids]
         for who, each in errors.items():
             out += [figure(f"tags: found by {who}, one search, {name}", "share", [len(each) / (hovers * len(board.ids))])]
             out += [figure(f"tags: corners by {who}, {name}", "px", np.concatenate(each))] if each else []

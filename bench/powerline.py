@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "oracles"))
 
@@ -133,15 +134,10 @@ def _compile_time() -> float:
     """Processor time to the first ready solver on a machine that has compiled nothing yet [s]; 0 without a compiler."""
     if compiled.compiler() is None:
         return 0.0
-    before = os.environ.get("PERCH_CACHE")
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["PERCH_CACHE"] = folder
+    with tempfile.TemporaryDirectory() as folder, mock.patch.dict(os.environ, PERCH_CACHE=folder):
         begin = os.times()
         Solver(load_vehicle("rpg"))
         end = os.times()
-    os.environ.pop("PERCH_CACHE")
-    if before is not None:
-        os.environ["PERCH_CACHE"] = before
     return sum(end[:4]) - sum(begin[:4])
 
 
