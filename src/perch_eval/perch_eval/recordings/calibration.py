@@ -63,8 +63,7 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         ConfigError: a file cannot be read, lacks something, or has a model that is not known here.
     """
     out: dict[str, Any] = {
-        "name": re.sub(r"[^\w.+-]", "_",
-                       root.resolve().parent.name if root.name == "mav0" else root.resolve().name) or "asl",
+        "name": re.sub(r"[^\w.+-]", "_", root.resolve().parent.name if root.name == "mav0" else root.resolve().name) or "asl",
         "cameras": {}
     }
     imu = root / "imu0" / "sensor.yaml"

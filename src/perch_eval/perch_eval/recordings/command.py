@@ -52,20 +52,15 @@ exit code: 0 done, 1 VIO never gave a pose (or no image could be looked at), 2 t
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     out = command_parser("perceive.py", __doc__, EXAMPLES)
-    out.add_argument("recording",
-                     type=Path,
-                     metavar="RECORDING",
+    out.add_argument("recording", type=Path, metavar="RECORDING",
                      help="rosbag2 folder, .mcap, .db3, ROS 1 .bag, EuRoC or TUM-VI folder, images")
-    out.add_argument("--sensors",
-                     metavar="FILE",
+    out.add_argument("--sensors", metavar="FILE",
                      help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
     out.add_argument("--truth", metavar="FILE", help="true motion of the IMU's axes: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     out.add_argument("--camera", metavar="NAME", help="camera of VIO (default: down, or the first)")
     out.add_argument("--front", metavar="NAME", help="camera of target localiser and powerline mapper (default: front, or that of VIO)")
-    out.add_argument("--board",
-                     default="pad_four_tags",
-                     metavar="FILE",
+    out.add_argument("--board", default="pad_four_tags", metavar="FILE",
                      help="tag board, or its name in config/boards (default: %(default)s)")
     out.add_argument("--without", choices=OPTIONAL, nargs="+", default=[], metavar="NODE", help=f"leave out: {', '.join(OPTIONAL)}")
     out.add_argument("-p", "--parameter", action="append", default=[], metavar="NODE.NAME:=VALUE", help="change a parameter of a node")

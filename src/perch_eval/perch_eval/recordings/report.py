@@ -71,13 +71,8 @@ def frames_figure(frames: Sequence[Frame]) -> Figure:
     named: set[str] = set()
     for a, b in zip(edges[:-1], edges[1:]):
         outcome = frames[a].outcome
-        axes.axvspan(t[a],
-                     t[min(b,
-                           len(t) - 1)],
-                     color=COLOURS.get(outcome, "#888888"),
-                     alpha=0.15,
-                     lw=0,
-                     label=None if outcome in named else outcome.lower())
+        axes.axvspan(t[a], t[min(b, len(t) - 1)], color=COLOURS.get(outcome, "#888888"),
+                     alpha=0.15, lw=0, label=None if outcome in named else outcome.lower())
         named.add(outcome)
     axes.set(xlabel="time [s]", ylabel="tracks, observations")
     axes.legend(fontsize=8, ncol=4)

@@ -29,31 +29,21 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     out = command_parser("sensors.py", __doc__, EXAMPLES)
     verbs = out.add_subparsers(dest="verb", required=True, metavar="import|check")
-    read = verbs.add_parser("import",
-                            help="make a sensor file from a calibration",
-                            epilog=EXAMPLES,
+    read = verbs.add_parser("import", help="make a sensor file from a calibration", epilog=EXAMPLES,
                             formatter_class=argparse.RawDescriptionHelpFormatter)
     read.set_defaults(work=_import)
     read.add_argument("kind", choices=("kalibr", "euroc"))
-    read.add_argument("files",
-                      nargs="+",
-                      type=Path,
-                      metavar="FILE",
+    read.add_argument("files", nargs="+", type=Path, metavar="FILE",
                       help="kalibr: camchain-imucam.yaml [imu.yaml]; euroc: the recording's folder")
     read.add_argument("--out", type=Path, metavar="FILE", help="where to write (default: the terminal)")
     read.add_argument("--name", help="name of the sensors (default: that of the file)")
     read.add_argument("--rename", nargs="+", default=[], metavar="OLD=NEW", help="names of the cameras, as cam0=down")
-    read.add_argument("--imu-orientation",
-                      nargs=4,
-                      type=float,
-                      default=(0.0, 0.0, 0.0, 1.0),
-                      metavar=("X", "Y", "Z", "W"),
+    read.add_argument("--imu-orientation", nargs=4, type=float, default=(0.0, 0.0, 0.0, 1.0), metavar=("X", "Y", "Z", "W"),
                       help="axes of the IMU in the body (forward, left, up), as a quaternion (default: the body has the IMU's axes)")
     judge = verbs.add_parser("check", help="find what would make perception fail on a recording")
     judge.set_defaults(work=_check)
     judge.add_argument("recording", type=Path, metavar="RECORDING")
-    judge.add_argument("--sensors",
-                       metavar="FILE",
+    judge.add_argument("--sensors", metavar="FILE",
                        help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
     return out
 
