@@ -125,7 +125,9 @@ def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
 
 def _demonstrate(args: argparse.Namespace) -> int:
     open_network(args.network)
-    report = fly(args.scenario, args.seed, args.out, _composed(args), args.realtime, args.verbose, args.vehicle)
+    # Real time has deadlines at 500 Hz that the work of more neighbours in the same process would miss.
+    composed = sharing(args.composed, otherwise=() if args.separate else CHAIN_NODES if args.realtime else FAST_NODES)
+    report = fly(args.scenario, args.seed, args.out, composed, args.realtime, args.verbose, args.vehicle)
     from perch_eval.report import summary
     print(f"outcome: {report['outcome']}")
     print("".join(f"  {name}: {words}\n" for name, words in summary(report)), end="")
@@ -134,11 +136,6 @@ def _demonstrate(args: argparse.Namespace) -> int:
         return 2
     print(f"report: {args.out / 'report.html'}")
     return 0 if report["outcome"] in SUCCESSES else 1
-
-
-def _composed(args: argparse.Namespace) -> Collection[str]:
-    """Real time has deadlines at 500 Hz that the work of more neighbours in the same process would miss."""
-    return sharing(args.composed, otherwise=() if args.separate else CHAIN_NODES if args.realtime else FAST_NODES)
 
 
 main = command(parser, _demonstrate, interrupted="interrupted; all nodes are stopped")

@@ -98,12 +98,9 @@ def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
-    return Flight(motion, truth, read_imu(truth, true_imu(vehicle.imu, seed), rng), mount, tuple(frames), _told_wrong(seed), scenario.vehicle)
-
-
-def _told_wrong(seed: int) -> np.ndarray:
-    """A start is told as well as VIO believes it: a covariance cannot be judged on an error that was never made."""
-    return np.random.default_rng([seed, 9]).standard_normal(4) * TOLD_SIGMA
+    # A start is told as well as VIO believes it: a covariance cannot be judged on an error that was never made.
+    told_wrong = np.random.default_rng([seed, 9]).standard_normal(4) * TOLD_SIGMA
+    return Flight(motion, truth, read_imu(truth, true_imu(vehicle.imu, seed), rng), mount, tuple(frames), told_wrong, scenario.vehicle)
 
 
 @dataclass(frozen=True)

@@ -118,18 +118,13 @@ def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
     return ", ".join("-" if v is None or not math.isfinite(v) else f"{scale * v:.1f}" for v in values) + f" {unit}"
 
 
-def _inspection(figures: dict[str, Any]) -> str:
-    """What came of an inspection, in a line."""
-    return (f"{figures['collisions']} collisions ({figures['reference_collisions']} of the reference); mean reprojection error "
-            f"{figures['reprojection_px']:.0f} px ({figures['reference_reprojection_px']:.0f} px of the reference); "
-            f"least scaled clearance {figures['least_clearance']:.2f}")
-
-
 def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
     """What came of a flight, by name, for the page and for the terminal."""
     rows = [("message", report["message"])]
-    if "inspection" in report:
-        rows.append(("inspection", _inspection(report["inspection"])))
+    if f := report.get("inspection"):
+        rows.append(("inspection", f"{f['collisions']} collisions ({f['reference_collisions']} of the reference); mean reprojection error "
+                                   f"{f['reprojection_px']:.0f} px ({f['reference_reprojection_px']:.0f} px of the reference); "
+                                   f"least scaled clearance {f['least_clearance']:.2f}"))
     if error := report.get("target_error"):
         rows.append(("target error", f"{100 * error['position_m']:.1f} cm, {error['attitude_deg']:.2f} deg"))
     if contact := report.get("contact"):

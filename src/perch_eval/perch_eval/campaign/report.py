@@ -9,7 +9,7 @@ from pathlib import Path
 from perch_eval.campaign import figures
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.results import RunResult, flight_folder, worst
-from perch_eval.campaign.specification import Campaign
+from perch_eval.campaign.specification import Campaign, in_words
 from perch_eval.metrics import FIGURES
 from perch_eval.page import Html, image, page, section, table, text
 from perch_eval.statistics import Rate, Spread
@@ -75,14 +75,10 @@ def _spreads(found: Sequence[RunResult], present: dict[str, tuple[str, float]]) 
 def _flights(found: Sequence[RunResult], folder: Path) -> str:
     shown = [r for r in found if r.cause != SUCCESS][:200]
     kept = [r for r in found if r.cause == SUCCESS and (folder / flight_folder(r.number) / "report.html").exists()]
-    return table(((Html(_link(r, folder)), r.seed, r.cause, r.message, ", ".join(f"{k} {_short(v)}" for k, v in r.values.items()))
+    return table(((Html(_link(r, folder)), r.seed, r.cause, r.message, in_words(r.values))
                   for r in (*shown, *kept)), ("run", "seed", "cause", "message", "conditions"))
 
 
 def _link(result: RunResult, folder: Path) -> str:
     name, report = f"run {result.number}", flight_folder(result.number) / "report.html"
     return f'<a href="{report}">{name}</a>' if (folder / report).exists() else name
-
-
-def _short(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -143,7 +143,7 @@ def _check(campaign: Campaign, file: str) -> None:
     parameters: dict[str, Any] = {}
     different = {json.dumps(run.values): run for run in reversed(campaign.runs)}
     for run in sorted(different.values(), key=lambda run: run.number):
-        source = f"{file}: run {run.number} ({_words(run.values)})"
+        source = f"{file}: run {run.number} ({in_words(run.values)})"
         scenario = scenario_of(campaign.mapping(run), source)
         named = scenario.vehicle, scenario.target.board
         if named not in vehicles:
@@ -215,5 +215,6 @@ def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, 
     return tuple(out)
 
 
-def _words(values: Mapping[str, Any]) -> str:
+def in_words(values: Mapping[str, Any]) -> str:
+    """Varied values."""
     return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())

@@ -144,8 +144,5 @@ def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], li
 
 def _flown(seeds: range, cases: tuple[str, ...]) -> list[tuple[int, str, bool]]:
     """Seed, case and whether the gripper works, of every flight: a flight keeps its number when seeds are added."""
-    flown = []
-    for seed in seeds:
-        flown += [(seed, case, True) for case in cases]
-        flown += [(seed, case, False) for case in cases if case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]
-    return flown
+    return [(seed, case, grips) for seed in seeds for grips in (True, False) for case in cases
+            if grips or case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]
