@@ -8,24 +8,20 @@ has reached the supervisor. Needs the firmware (`python3 scripts/betaflight.py b
 
 from __future__ import annotations
 
-import sys
 from contextlib import closing
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from closed_loop.supervised_loop import Body, SupervisedLoop
+from harness import Figure, figure
 
-from closed_loop.supervised_loop import Body, SupervisedLoop  # noqa: E402
-from harness import Figure, figure  # noqa: E402
-
-from perch_autopilot.watchdog import OFF, Mode  # noqa: E402
-from perch_core.vehicle import load_vehicle  # noqa: E402
-from perch_eval.goal import goal_of  # noqa: E402
-from perch_eval.in_process import Loop, arrange  # noqa: E402
-from perch_eval.metrics import tilt_degrees  # noqa: E402
-from perch_sim.scenario import load_scenario  # noqa: E402
+from perch_autopilot.watchdog import OFF, Mode
+from perch_core.vehicle import load_vehicle
+from perch_eval.goal import goal_of
+from perch_eval.in_process import Loop, arrange
+from perch_eval.metrics import tilt_degrees
+from perch_sim.scenario import load_scenario
 
 SCENARIO = replace(load_scenario("surface_90"), vehicle="betaflight")
 LEVEL = 10.0                              # tilt that counts as level [deg]

@@ -6,22 +6,18 @@ the clock, which is given beside it. Deadlines in real time: `bench.py ros`. How
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from time import perf_counter, thread_time
 
 import numpy as np
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from closed_loop.loop import fly_to_contact, make_loop, perch
+from harness import Figure, figure, measure
 
-from closed_loop.loop import fly_to_contact, make_loop, perch  # noqa: E402
-from harness import Figure, figure, measure  # noqa: E402
-
-from perch_control.geometric import GeometricController  # noqa: E402
-from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings  # noqa: E402
-from perch_control.reference import FlatReference  # noqa: E402
-from perch_control.rotor_lag import RotorEstimate  # noqa: E402
-from perch_core.vehicle import ControlGains, load_vehicle  # noqa: E402
+from perch_control.geometric import GeometricController
+from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings
+from perch_control.reference import FlatReference
+from perch_control.rotor_lag import RotorEstimate
+from perch_core.vehicle import ControlGains, load_vehicle
 
 VEHICLE = load_vehicle("snapdragon")
 

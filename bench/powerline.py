@@ -11,14 +11,10 @@ Solve times are processor time: what a solve takes on one core that it has to it
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from unittest import mock
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "oracles"))
 
 import numpy as np
 import powerline_ipopt

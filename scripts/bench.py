@@ -38,6 +38,7 @@ def main() -> int:
     enter()
     leave_quietly_on_interrupt()
     sys.path.insert(0, str(ROOT / "bench"))
+    sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
     import harness
 
     results, failed = {}, False
