@@ -102,5 +102,5 @@ def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monk
         return flown
 
     monkeypatch.setattr(control, "computed", known)
-    sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", False, 1, 1, 1))
+    sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", False, range(1, 2), range(1, 2), 1))
     assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()

@@ -97,7 +97,7 @@ def test_a_crash_on_the_way_is_no_error_at_the_perch():
 
 
 def effort(tmp_path, seeds: int) -> Effort:
-    return Effort(True, 1, tmp_path, tmp_path, "evaluate.py", False, perch_seeds=1, line_seeds=seeds, layouts=1)
+    return Effort(True, 1, tmp_path, tmp_path, "evaluate.py", False, seeds=range(1, 2), seeds_on_lines=range(1, 1 + seeds), layouts=1)
 
 
 def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from perch_sim.scenario import load_scenario
 
 @pytest.fixture
 def effort(tmp_path):
-    return Effort(True, 1, tmp_path, tmp_path / "state", "x", False, 5, 1, 3)
+    return Effort(True, 1, tmp_path, tmp_path / "state", "x", False, range(1, 6), range(1, 2), 3)
 
 
 def verdicts(section):

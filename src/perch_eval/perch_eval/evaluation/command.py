@@ -63,7 +63,8 @@ def _regenerate(args: argparse.Namespace) -> int:
     counts = {name: getattr(args, name.replace("-", "_")) or (full if args.full else quick) for name, (_, quick, full) in FLIGHTS.items()}
     made_by = ["python3 scripts/evaluate.py", *["--full"] * args.full, *(f"--{name} {n}" for name, n in counts.items()),
                *(f"--only {name}" for name in args.only or ()), f"--out {args.out}"]
-    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by), args.fresh, *counts.values())
+    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by), args.fresh,
+                    range(1, 1 + counts["seeds"]), range(1, 1 + counts["line-seeds"]), counts["layouts"])
     began = time.monotonic()
     output_folder(args.out)
     sections = evaluate(effort, args.only or [name for name in PARTS if args.full or name not in BEYOND_PAPERS])

@@ -78,8 +78,8 @@ class Effort:
         state: folder of what an interrupted evaluation resumes from.
         command: what regenerates the page.
         fresh: forget what an earlier evaluation has done.
-        perch_seeds: flights of each perch condition.
-        line_seeds: flights of each powerline scenario.
+        seeds: of the flights of each perch condition.
+        seeds_on_lines: of the flights of each powerline scenario.
         layouts: random layouts of the inspection.
     """
 
@@ -89,19 +89,9 @@ class Effort:
     state: Path
     command: str
     fresh: bool
-    perch_seeds: int
-    line_seeds: int
+    seeds: range
+    seeds_on_lines: range
     layouts: int
-
-    @property
-    def seeds(self) -> range:
-        """Seeds of the flights of each perch condition."""
-        return range(1, self.perch_seeds + 1)
-
-    @property
-    def seeds_on_lines(self) -> range:
-        """Seeds of the flights of each powerline scenario."""
-        return range(1, self.line_seeds + 1)
 
 
 Part = Callable[[Effort], list[Section]]
