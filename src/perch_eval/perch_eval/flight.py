@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -73,7 +73,7 @@ class Flight:
         damage: why the recording could not be read to its end; empty if it could.
     """
 
-    def __init__(self, channels: Mapping[str, list[tuple[float, Any]]], source: str = "the flight", damage: str = "") -> None:
+    def __init__(self, channels: dict[str, list[tuple[float, Any]]], source: str = "the flight", damage: str = "") -> None:
         """
         Args:
             channels: (time [s], value) of each channel, in the order in which they were emitted.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
@@ -17,35 +17,6 @@ from perch_eval.ros.definitions import schema_of, type_name
 Timed = list[tuple[float, Any]]
 
 
-class _Channels(Mapping[str, Timed]):
-    """Channels whose messages are decoded when somebody asks for them."""
-
-    def __init__(self, names: dict[str, str], messages: dict[str, list[tuple[int, bytes]]]) -> None:
-        self._names, self._messages = names, messages
-        self._decoded: dict[str, Timed] = {}
-
-    def __getitem__(self, key: str) -> Timed:
-        if key not in self._decoded:
-            self._decoded[key] = list(self._decode(self._names[key], self._messages[key]))
-        return self._decoded[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._messages)
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    @staticmethod
-    def _decode(channel: str, messages: list[tuple[int, bytes]]) -> Iterator[tuple[float, Any]]:
-        for logged, data in messages:
-            try:
-                value = topics.decode(channel, data)
-            except (PerchError, LookupError):  # as the component that it was for dropped it; or an empty list of transforms
-                continue
-            time = time_of(value)
-            yield 1e-9 * logged if time is None else time, value
-
-
 class RecordedFlight(Flight):
     """The flight of an MCAP file, as the recorder or rosbag2 writes them. Only channels of `perch_core.ros.topics` are read."""
 
@@ -56,16 +27,31 @@ class RecordedFlight(Flight):
             namespace: of the vehicle, where several were recorded.
         """
         prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
-        names: dict[str, str] = {}
-        messages: dict[str, list[tuple[int, bytes]]] = {}
+        self._undecoded: dict[str, tuple[str, list[tuple[int, bytes]]]] = {}  # channel and messages that nobody has asked for
         damage: list[str] = []
         for topic, type_of, time, data in read(path, on_damage=damage.append):
             key = topic.removeprefix(prefix).lstrip("/")
             channel = _channel(key, type_of)
             if channel is not None and (topic.startswith(prefix) or channel.startswith("/")):
-                names[key] = channel
-                messages.setdefault(key, []).append((time, data))
-        super().__init__(_Channels(names, messages), str(path), damage[0] if damage else "")
+                self._undecoded.setdefault(key, (channel, []))[1].append((time, data))
+        super().__init__({key: [] for key in self._undecoded}, str(path), damage[0] if damage else "")
+
+    def values(self, channel: str) -> Timed:
+        """As of any flight."""
+        if channel in self._undecoded:
+            self._channels[channel] = list(_decoded(*self._undecoded[channel]))
+            del self._undecoded[channel]
+        return super().values(channel)
+
+
+def _decoded(channel: str, messages: list[tuple[int, bytes]]) -> Iterator[tuple[float, Any]]:
+    for logged, data in messages:
+        try:
+            value = topics.decode(channel, data)
+        except (PerchError, LookupError):  # as the component that it was for dropped it; or an empty list of transforms
+            continue
+        time = time_of(value)
+        yield 1e-9 * logged if time is None else time, value
 
 
 @lru_cache(maxsize=None)
