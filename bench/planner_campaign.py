@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 from random_perches import random_problem, requirements, shipped_settings
 
 from perch_core import config

@@ -77,21 +77,20 @@ def fill(message: Any, values: dict[str, Any], path: str = "") -> Any:
             fill(present, value, f"{here}.")
             continue
         try:
-            setattr(message, name, _convert(message, name, types[name], present, value, here))
+            setattr(message, name, _convert(types[name], present, value, here))
         except (TypeError, ValueError, AssertionError, OverflowError):
             raise GraphError(f"{here}: {value!r} does not fit {types[name]}") from None
     return message
 
 
-def _convert(message: Any, name: str, type_name: str, present: Any, value: Any, here: str) -> Any:
+def _convert(type_name: str, present: Any, value: Any, here: str) -> Any:
     """A value in the type of its field."""
     if not ("[" in type_name or type_name.startswith("sequence")):
         return _scalar(type_name, value)
     if not isinstance(value, list):
         raise TypeError
     if "/" in type_name:
-        slot = message.SLOT_TYPES[list(message.get_fields_and_field_types()).index(name)]
-        cls = _element_class(slot)
+        cls = interface(re.findall(r"\w+/\w+", type_name)[0], "msg")
         return [fill(cls(), item, f"{here}[{i}].") for i, item in enumerate(value)]
     element = type_name.removeprefix("sequence<").split("[")[0].rstrip(">").split(",")[0]
     items = [_scalar(element, item) for item in value]
@@ -118,12 +117,6 @@ def _scalar(type_name: str, value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError
     return value
-
-
-def _element_class(slot: Any) -> type:
-    """The message class of an array's elements."""
-    namespaced = slot.value_type
-    return getattr(importlib.import_module(".".join(namespaced.namespaces)), namespaced.name)
 
 
 def to_yaml(value: Any, arrays: bool = True) -> str:
