@@ -11,23 +11,11 @@ import importlib
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
     from perch_core.ros.node import run
-    from perch_core.ros.wiring import Wiring
-
-
-def create_nodes(plan: list[dict[str, Any]], wiring: Wiring) -> list[Any]:
-    """Create every node of a plan, each with its own arguments.
-
-    Raises:
-        PerchError: a node refuses its parameters.
-    """
-    return [importlib.import_module(entry["module"]).create(wiring, cli_args=entry["arguments"], use_global_arguments=False)
-            for entry in plan]
 
 
 def main() -> None:
@@ -40,7 +28,8 @@ def main() -> None:
     except (OSError, ValueError) as error:
         print(f"error: {sys.argv[1]}: {error}", file=sys.stderr)
         sys.exit(2)
-    run(lambda wiring: create_nodes(plan, wiring), [])
+    run(lambda wiring: [importlib.import_module(entry["module"]).create(wiring, cli_args=entry["arguments"], use_global_arguments=False)
+                        for entry in plan], [])
 
 
 if __name__ == "__main__":

@@ -61,19 +61,15 @@ def _show(args: argparse.Namespace) -> int:
         print(f"picture: {path}")
     else:
         start, end = span(view, args.start, args.end)
-        _animate(args, Scene(view, start, end), start, end, path)
+        step = args.speed / args.fps
+        times = start + step * np.arange(max(1, round((end - start) / step)))
+        print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
+        write_animation(Scene(view, start, end), times, args.fps, path)
+        print(f"animation: {path}")
     if args.plots:
         write_plots(view, args.plots, thrust=vehicle is not None)
         print(f"plots: {args.plots}")
     return 0
-
-
-def _animate(args: argparse.Namespace, scene: Scene, start: float, end: float, path: Path) -> None:
-    step = args.speed / args.fps
-    times = start + step * np.arange(max(1, round((end - start) / step)))
-    print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
-    write_animation(scene, times, args.fps, path)
-    print(f"animation: {path}")
 
 
 def span(view: FlightView, start: float | None, end: float | None, before: float = BEFORE, after: float = AFTER) -> tuple[float, float]:
