@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -183,10 +184,8 @@ def diagnostics(flight: Flight) -> dict[str, list[dict[str, float]]]:
     for _, said in flight.values("diagnostics"):
         values = {}
         for key, value in said.values.items():
-            try:
+            with suppress(ValueError):
                 values[key] = float(value)
-            except ValueError:
-                continue
         out.setdefault(str(said.values.get("node", "")).strip("/"), []).append(values)
     return out
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 FIRST_PORT, PORTS = 7400, 250
@@ -54,11 +55,9 @@ class SharedMemory:
         for segment in sorted(self.unused(self._seen)):
             mutex = Path(segment).with_name(f"sem.{Path(segment).name}_mutex")  # stays after a process that ended by itself, too
             for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl"), mutex):
-                try:
+                with suppress(OSError):  # gone already, or another user's
                     file.unlink()
                     removed.append(str(file))
-                except OSError:  # gone already, or another user's
-                    continue
         return removed
 
     def unused(self, segments: Iterable[str]) -> set[str]:
