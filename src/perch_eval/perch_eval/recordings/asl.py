@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from heapq import merge
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -66,16 +68,10 @@ class AslRecording(Recording):
 
     def events(self) -> Iterator[Event]:
         """In the order of the stamps, until a little after the last image; an IMU sample comes before an image of the same stamp."""
-        k, cameras = 0, self.sensors.cameras if self.sensors is not None else {}
-        last = self._frames[-1][0] + AFTER
-        for stamp, name, path in self._frames:
-            while k < len(self._stamps) and self._stamps[k] <= stamp:
-                yield self._sample(k)
-                k += 1
-            yield Event(name, stamp, picture(path, stamp, name, cameras.get(name)))
-        while k < len(self._stamps) and self._stamps[k] <= last:
-            yield self._sample(k)
-            k += 1
+        cameras, last = self.sensors.cameras if self.sensors is not None else {}, self._frames[-1][0] + AFTER
+        samples = takewhile(lambda event: event.arrived <= last, map(self._sample, range(len(self._stamps))))
+        frames = (Event(name, stamp, picture(path, stamp, name, cameras.get(name))) for stamp, name, path in self._frames)
+        yield from merge(samples, frames, key=lambda event: event.arrived)
 
     def _sample(self, k: int) -> Event:
         stamp, row = int(self._stamps[k]), self._imu[k].tolist()

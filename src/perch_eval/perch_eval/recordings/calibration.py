@@ -67,9 +67,9 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         "cameras": {}
     }
     imu = root / "imu0" / "sensor.yaml"
-    T_BI, content = _placed(imu)
+    T_BI = in_body(imu)
     if imu.is_file():
-        out["imu"] = _imu(str(imu), content, R_BI)
+        out["imu"] = _imu(str(imu), _mapping(imu), R_BI)
     for file in sorted(root.glob("cam*/sensor.yaml")):
         c, source = _mapping(file), str(file)
         T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
@@ -80,18 +80,13 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
 
 
 def in_body(file: Path) -> np.ndarray:
-    """T_BS of a `sensor.yaml`, shape (4, 4); the unit matrix where it has none.
+    """T_BS of a `sensor.yaml`, shape (4, 4); the unit matrix where it has none, or is not there.
 
     Raises:
         ConfigError: it cannot be read, or is no rigid transform.
     """
-    return _placed(file)[0]
-
-
-def _placed(file: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    """T_BS of a `sensor.yaml`, and what it says; a file that is not there says nothing."""
     content = _mapping(file) if file.is_file() else {}
-    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist())), content
+    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist()))
 
 
 def to_yaml(sensors: Sensors, comment: str = "") -> str:
