@@ -125,12 +125,16 @@ def test_from_the_ground_to_the_wall():
 
 
 def test_the_ground_tells_nothing_and_breaks_nothing():
-    """2 cm above the floor the image is a blur: no feature is made of noise, and the pose stays where VIO was told that it is."""
+    """2 cm above the floor the image is a blur: no feature is made of noise, and the pose stays where VIO was told that it is.
+
+    To what the IMU makes of the last 0.25 s, 1.1 mm an axis at 1 sigma.
+    """
     ground = [s for s in undisturbed() if 0.5 < s.time < 1.0]
     assert len(ground) > 10
     for step in ground:
         assert step.result.features < 10
-        assert np.linalg.norm(step.error[:3] + flight().told_wrong[:3]) < 1e-3
+        assert np.linalg.norm(step.error[:3] + flight().told_wrong[:3]) < 5e-3
+    assert np.linalg.norm(np.mean([step.error[:3] for step in ground], axis=0) + flight().told_wrong[:3]) < 2e-3
 
 
 def test_the_same_frames_give_the_same_bits():

@@ -31,7 +31,6 @@ from perch_perception.vio.tracker import Features, Tracker
 from perch_perception.vio.triangulation import triangulate
 
 _REST_LAG = 0.25  # the filter stays this far behind while it stands still [s]
-_UNNOTICED = 0.02  # 1 sigma of a take-off that is not yet noticed [m/s]
 _DARK = 0.15  # time without a visual update that is blindness where nothing is tracked [s]
 _BLIND = 0.5  # the same whatever is tracked [s]
 _LEAVING = 1.0  # from rest on, in which a take-off may go on blind [s]
@@ -243,7 +242,7 @@ class VisualInertialOdometry:
         """Tell the filter that the vehicle stood still, up to a little before now.
 
         A take-off is noticed some time after it began. The filter stays behind by `_REST_LAG`, so that what it was told
-        remains true, and catches up with the IMU when the vehicle leaves.
+        remains true, and catches up with the IMU when the vehicle leaves. What is said of now is its state and the IMU since.
         """
         filter, state = self._running, self._running.state
         until = max(state.stamp, exposed - round(_REST_LAG * 1e9))
@@ -252,20 +251,15 @@ class VisualInertialOdometry:
             rest.stop(filter)
             self._resting, self._sight = True, None
             self._views.clear()
-        steps = self._imu.run(state.stamp, until)
+        steps, shaken = self._imu.run(state.stamp, until), max(1.0, energy(window(self._imu, exposed)))
         if len(steps):
-            shaken = max(1.0, energy(window(self._imu, exposed)))
             rest.hold(filter, steps, until, shaken)
         self._informed = exposed
         self._views.append((exposed, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
             self._views.popleft()
         result = self._result(FrameOutcome.RESTING, features, FrameReport())
-        estimate = result.estimate
-        assert estimate is not None  # RESTING comes with a pose
-        # what is said of now, not of `until`: a take-off may just have begun
-        estimate.P[3:6, 3:6] += _UNNOTICED**2 * np.eye(3)
-        return replace(result, blind_for=0.0, estimate=replace(estimate, stamp=exposed, w_WB_B=np.zeros(3)))
+        return replace(result, blind_for=0.0, estimate=_estimate(rest.moved_on(filter, self._imu.run(until, exposed), exposed, shaken)))
 
     def _stand_on(self, floor: float, features: Features) -> None:
         """What was seen of the ground while the vehicle stood, and still is, becomes its first landmarks."""
@@ -317,18 +311,18 @@ class VisualInertialOdometry:
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
-            self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), self._estimate().pose_covariance[rows])
+            self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[rows])
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
         s = self._running.state
-        return VioResult(outcome, self._estimate() if outcome.has_pose else None, len(features.ids), report.used, report.refused,
+        return VioResult(outcome, _estimate(s) if outcome.has_pose else None, len(features.ids), report.used, report.refused,
                          report.nis, report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
 
-    def _estimate(self) -> VioPoseEstimate:
-        s = self._running.state
-        return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), s.w_WB_B.copy(), s.gyro_bias.copy(),
-                               s.accel_bias.copy(), s.P[np.ix_(_INERTIAL, _INERTIAL)])
+
+def _estimate(s: at.State) -> VioPoseEstimate:
+    return VioPoseEstimate(s.stamp, s.p_WB.copy(), s.R_WB.copy(), s.v_WB.copy(), s.w_WB_B.copy(), s.gyro_bias.copy(),
+                           s.accel_bias.copy(), s.P[np.ix_(_INERTIAL, _INERTIAL)])
 
 
 def _biases(state: at.State) -> tuple[np.ndarray, np.ndarray]:
