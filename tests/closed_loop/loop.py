@@ -46,11 +46,11 @@ class Perch:
 
 
 @cache
-def perch(name: str) -> Perch:
+def perch(name: str, settings: PerchSettings = PerchSettings()) -> Perch:
     """surface_<inclination [deg]>_<distance [m]>m: a surface at the height of the hover."""
     inclination, distance = map(float, name.removeprefix("surface_").removesuffix("m").split("_"))
     surface, vehicle = PerchSurface.from_inclination(np.array([distance, 0.0, 1.2]), np.radians(inclination)), load_vehicle("snapdragon")
-    planned = plan(PerchProblem(StartState((0.0, 0.0, 1.2)), surface), PerchSettings(), vehicle)
+    planned = plan(PerchProblem(StartState((0.0, 0.0, 1.2)), surface), settings, vehicle)
     return Perch(planned.trajectory, surface.normal, surface.p_WS + vehicle.perch_offset * surface.normal)
 
 
