@@ -32,6 +32,7 @@ class Flight:
         self.plant = Plant(load_vehicle("snapdragon"), np.zeros(3), disturbances=disturbances or Disturbances(), speed=np.zeros(4))
         self.period, self.stamp = round(1e9 / rate), START
         self.motors, self.status, self.lines, self.references = [], [], [], []
+        self.R_BI, self.imu_frame = np.eye(3), "imu_link"
         for name, kept in (("motor_command", self.motors), ("status", self.status), ("log", self.lines), ("reference", self.references)):
             getattr(self.component, name).receivers.append(kept.append)
 
@@ -40,7 +41,8 @@ class Flight:
         return OdometryState(self.stamp, s[0:3], s[6:10], rotated(s[6:10], s[3:6], -1.0), s[10:13], _NONE, _NONE)._replace(**changes)
 
     def imu(self, **changes) -> ImuSample:
-        return ImuSample(self.stamp, tuple(self.plant.w.tolist()), tuple(self.plant.specific_force_B.tolist()))._replace(**changes)
+        w_I, f_I = self.plant.w @ self.R_BI, self.plant.specific_force_B @ self.R_BI
+        return ImuSample(self.stamp, tuple(w_I.tolist()), tuple(f_I.tolist()), self.imu_frame)._replace(**changes)
 
     def step(self, seconds: float, odometry=True, imu=True, **changes) -> None:
         for _ in range(round(seconds * 1e9 / self.period)):

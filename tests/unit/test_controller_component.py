@@ -18,7 +18,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, ChooseLaw, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap,
-    TrajectoryOrder)
+    TrajectoryOrder, Transform)
 from perch_core.vehicle import load_vehicle
 from unit.controller_flight import START, Flight, hovering, parameters
 
@@ -160,6 +160,47 @@ def test_a_jump_with_a_covariance_that_is_no_number_is_refused():
     flight.step(0.004, pose_covariance=np.full((6, 6), NAN))
     flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=np.diag([NAN] + [1e-4] * 5))
     assert flight.state is State.LANDING and "pose_covariance: an entry of nan is not finite" in flight.said
+
+
+FLIPPED = (1.0, 0.0, 0.0, 0.0)  # forward, right, down in forward, left, up
+
+
+def forward_right_down(sensors: str = "") -> Flight:
+    """A flight whose IMU has the axes of aviation."""
+    flight = Flight(params=replace(parameters(), sensors=sensors))
+    flight.R_BI, flight.imu_frame = np.diag([1.0, -1.0, -1.0]), "fcu_imu"
+    return flight
+
+
+def test_an_imu_in_other_axes_is_turned_by_its_frame():
+    flight = forward_right_down()
+    flight.component.on_transform(Transform("base_link", "plate", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+    flight.component.on_transform(Transform("plate", "fcu_imu", (0.0, 0.0, 0.0), FLIPPED))
+    flight.take_off().step(1.0)
+    assert flight.state is State.HOVERING and flight.component.flight.thrust_ratio == pytest.approx(1.0, abs=0.02)
+    flight.step(6.0, odometry=False)
+    assert flight.state is State.DISARMED and flight.plant.impact_speed < 1.5, "the descent without position feels the right way, too"
+
+
+def test_an_imu_in_other_axes_is_turned_by_the_sensor_file(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("name: mine\nimu: {rate: 500, accel_noise_density: 0.01, gyro_noise_density: 0.001, accel_bias_walk: 0.001,\n"
+                    "  gyro_bias_walk: 0.0001, orientation: [1.0, 0.0, 0.0, 0.0]}\n")
+    flight = forward_right_down(str(file))
+    flight.imu_frame = "imu_link"
+    flight.take_off().step(1.0)
+    assert flight.state is State.HOVERING and flight.component.flight.thrust_ratio == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("frame, said", [("fcu_imu", "no usable IMU samples"), ("imu_link", "-9.8 m/s^2 along b3 at rest")])
+def test_it_does_not_arm_where_the_axes_of_the_imu_are_not_known_or_wrong(frame, said):
+    flight = forward_right_down()
+    flight.imu_frame = frame
+    flight.step(0.5)
+    flight.order(Command.ARM)
+    flight.step(0.1)
+    assert flight.state is State.DISARMED and said in flight.said and not flight.motors[-1].armed
+    assert ("/tf_static" in flight.said) == (frame == "fcu_imu")
 
 
 def test_odometry_in_another_frame_is_ignored():

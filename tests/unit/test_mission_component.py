@@ -17,7 +17,7 @@ from perch_core.surface import PerchSurface
 from perch_core.trajectory import SampledTrajectory, rest_to_rest
 from perch_core.values import (
     NANOSECONDS, ControllerStatus, EstimatorHealth, ImuSample, MappedPowerline, OdometryState, PerchGoal, PerchPlan, PowerlineMap, PowerlinePlan,
-    TargetPose, seconds)
+    TargetPose, Transform, seconds)
 from perch_core.vehicle import GRAVITY
 
 TICK, NAN = 20_000_000, float("nan")
@@ -50,6 +50,7 @@ class World:
         self.p, self.q, self.state, self.id = np.zeros(3), LEVEL, ControllerState.DISARMED, 0
         self.flown = self.contact = None
         self.covariance, self.thrust_ratio = NONE, 1.0
+        self.imu_frame, self.turn = "imu_link", (1.0, 1.0, 1.0)
         self.requests, self.orders, self.commands, self.lines, self.sees, self.odometry = [], [], [], [], True, True
         self.mission.trajectory.receivers.append(self.fly)
         self.mission.recovery.receivers.append(self.orders.append)
@@ -83,7 +84,7 @@ class World:
             self.q = tuple(Q_PERCH)
         force = tuple(so3.quat_rotate(so3.quat_conjugate(np.array(self.q)), [0, 0, GRAVITY]).tolist())
         for stamp in range(self.stamp - TICK + self.period, self.stamp + 1, self.period):
-            self.mission.on_imu(ImuSample(stamp, (0.0,) * 3, force))
+            self.mission.on_imu(ImuSample(stamp, (0.0,) * 3, tuple(f * s for f, s in zip(force, self.turn, strict=True)), self.imu_frame))
             if self.odometry:
                 self.mission.on_odometry(OdometryState(stamp, tuple(map(float, self.p)), self.q, (0.0,) * 3, (0.0,) * 3, self.covariance, NONE))
         self.mission.on_status(ControllerStatus(self.stamp, int(self.state), "geometric", self.id, 0.0, 0.0, 0.0, 0.0, 1.0, self.thrust_ratio, "says so"))
@@ -283,8 +284,15 @@ def test_a_foreign_target_is_refused_and_does_not_stop_the_flight(changes, word)
     np.testing.assert_allclose(world.goal.result.final_position, SURFACE.p_WS, atol=1e-9)
 
 
+def test_a_contact_is_felt_by_an_imu_in_other_axes():
+    world = World()
+    world.imu_frame, world.turn = "fcu_imu", (1.0, -1.0, -1.0)
+    world.mission.on_transform(Transform("base_link", "fcu_imu", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+    assert world.send().run().goal.ending == "succeeded"
+
+
 @pytest.mark.parametrize("frame, said", [("elsewhere", True), ("base_link", False), ("", False)])
-def test_imu_samples_in_other_axes_are_ignored_with_a_word(frame, said):
+def test_imu_samples_in_axes_that_are_not_known_are_ignored_with_a_word(frame, said):
     world = World().send().run(until=lambda w: w.phase == "searching")
     world.mission.on_imu(ImuSample(world.stamp, (0.0,) * 3, (0.0, 0.0, 9.8), frame))
     assert (f"imu/data_raw: frame {frame!r}" in world.said) == said

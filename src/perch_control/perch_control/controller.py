@@ -8,9 +8,10 @@ from typing import Any
 
 from perch_core.component import Component, Diagnostics, Emitter, Input, Output, Service, Wake
 from perch_core.errors import ConfigError, PerchError
+from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample,
-    LawChosen, MotorCommand, OdometryState, PowerlineMap, RatesThrust, TrajectoryOrder, nanoseconds, seconds)
+    LawChosen, MotorCommand, OdometryState, PowerlineMap, RatesThrust, TrajectoryOrder, Transform, nanoseconds, seconds)
 from perch_core.values.limits import problem
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
@@ -27,6 +28,7 @@ BLIND_AFTER = 0.08                # without odometry for so long, the IMU is ans
 LONGEST_PLAN = 60.0               # a way out that starts later is none out of what is flown [s]
 STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
 GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
+_FIXED = ("vehicle", "sensors")     # parameters that do not change after the start
 _WORDS = 200                      # characters of a reason that are passed on
 
 
@@ -41,9 +43,10 @@ class Controller(Component[ControllerParameters]):
     """
 
     config_type = ControllerParameters
-    changeable = tuple(field.name for field in fields(ControllerParameters) if field.name != "vehicle")
+    changeable = tuple(field.name for field in fields(ControllerParameters) if field.name not in _FIXED)
 
     imu = Input(ImuSample, "imu/data_raw")
+    transform = Input(Transform, "/tf_static")
     odometry = Input(OdometryState, "odometry", answered=True)
     trajectory = Input(TrajectoryOrder, "trajectory", answered=True)
     recovery = Input(TrajectoryOrder, "recovery")
@@ -62,7 +65,7 @@ class Controller(Component[ControllerParameters]):
     def __init__(self, config: ControllerParameters) -> None:
         """
         Raises:
-            ConfigError: there is no such vehicle or law.
+            ConfigError: there is no such vehicle, sensor file or law.
         """
         super().__init__(config)
         vehicle = load_vehicle(config.vehicle)
@@ -70,6 +73,7 @@ class Controller(Component[ControllerParameters]):
                                              "attitude_and_thrust": self.attitude_thrust}
         self._to_vehicle = commands[vehicle.actuation.type]
         self._assembly = Assembly(config, vehicle)
+        self._axes = ImuAxes(self.warn, config.sensors)
         self._stamps = StampGuard()
         self._spoken: int | None = None   # the host's time at which an input was last known to have come [ns]
         self._spoke, self._gone = False, False
@@ -91,22 +95,25 @@ class Controller(Component[ControllerParameters]):
 
     def reconfigure(self, config: ControllerParameters) -> None:
         """New gains and limits count from the next step."""
-        if config.vehicle != self.config.vehicle:
-            raise ConfigError("", "vehicle", "is fixed after the start")
+        for name in _FIXED:
+            if getattr(config, name) != getattr(self.config, name):
+                raise ConfigError("", name, "is fixed after the start")
         self._assembly.change(config)
         self.config = config
 
     # -- sensors -----------------------------------------------------------------------------------------------------
 
+    def on_transform(self, transform: Transform) -> None:
+        """Where a frame, perhaps the IMU's, is in another."""
+        self._axes.add_transform(transform)
+
     def on_imu(self, sample: ImuSample) -> None:
         """Known to the flight; answered where odometry has stopped."""
-        if why := sample.axes_problem:
-            self.warn(f"imu/data_raw: {why}: ignored", every=1.0)
-            return
-        if not self._believed(sample.stamp, "imu/data_raw"):
+        taken = self._axes.in_body(sample)
+        if taken is None or not self._believed(sample.stamp, "imu/data_raw"):
             return
         stamp, answered = sample.stamp, self._answered
-        self.flight.imu(seconds(stamp), sample.w_B, sample.f_B)
+        self.flight.imu(seconds(stamp), taken.w_B, taken.f_B)
         if answered is None or stamp <= answered or not (self._silent or stamp - answered >= nanoseconds(BLIND_AFTER)):
             return
         if self.flight.state not in (State.DISARMED, State.FAILED, State.ATTACHED):

@@ -8,7 +8,7 @@ from math import dist
 import numpy as np
 
 from perch_core.vector3 import axes_of
-from perch_core.vehicle import ControlGains, Vehicle
+from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
@@ -32,6 +32,7 @@ _STILL = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
 _MARGIN_PERCH = 0.15         # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
 _IDLE_TIME = 10.0            # armed on the ground without a trajectory for so long: motors off [s]
 _ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
+_ARM_FELT = 0.5 * GRAVITY    # specific force along b3 that is felt there at least [m/s^2]
 _COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
 _COASTING_HOVER = 1.0        # no VIO for so long: hover; the position drifts by centimetres until then [s]
 _COASTING_LAND = 3.0         # the same: descend without position [s]
@@ -150,8 +151,12 @@ class FlightController:
             raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry_timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({why})" if (why := self._senses.refused) else ""))
+        if x.now - self._senses.imu_stamp > self.settings.odometry_timeout:
+            raise CommandRefused("arm is refused: no usable IMU samples")
         if x.mode is State.DISARMED and axes_of(x.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
+        if x.mode is State.DISARMED and self._thrust.felt < _ARM_FELT:
+            raise CommandRefused(f"arm is refused: the IMU feels {self._thrust.felt:.1f} m/s^2 along b3 at rest: its axes are not what they are said to be")
         x = self._thrust.reset(x, self.law, self.compensator)
         if x.mode is State.ATTACHED:
             return recovered(x, "leaving what carries the vehicle")

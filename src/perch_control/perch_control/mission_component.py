@@ -10,9 +10,10 @@ from itertools import count
 import numpy as np
 
 from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Wake
+from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
     NANOSECONDS, Ask, AtEnd, ControllerCommand, ControllerStatus, Done, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
-    PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, nanoseconds, seconds)
+    PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, Transform, nanoseconds, seconds)
 from perch_control.mission.asked import Asked, Requests
 from perch_control.mission.departure import Departure
 from perch_control.mission.goals import goal_of, problem_with
@@ -75,9 +76,10 @@ class Mission(Component[MissionParameters]):
     """One goal at a time. Its time is the stamp of the newest odometry."""
 
     config_type = MissionParameters
-    changeable = ("",)
+    changeable = ("mission.",)
 
     imu = Input(ImuSample, "imu/data_raw", lazy=True)
+    transform = Input(Transform, "/tf_static")
     odometry = Input(OdometryState, "odometry", lazy=True)
     target = Input(TargetPose, "target/pose")
     powerlines = Input(PowerlineMap, "powerlines")
@@ -94,7 +96,12 @@ class Mission(Component[MissionParameters]):
     tick = Wake(TICK)
 
     def __init__(self, config: MissionParameters) -> None:
+        """
+        Raises:
+            ConfigError: there is no such sensor file.
+        """
         super().__init__(config)
+        self._axes = ImuAxes(self.warn, config.sensors)
         self._ids = count(1)  # the controller tells trajectories apart by them: they go on from goal to goal
         self._running: _Running | None = None
         self._begin()
@@ -121,13 +128,16 @@ class Mission(Component[MissionParameters]):
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
+    def on_transform(self, transform: Transform) -> None:
+        """Where a frame, perhaps the IMU's, is in another."""
+        self._axes.add_transform(transform)
+
     def on_imu(self, sample: ImuSample) -> None:
         """Keep the specific force for the next tick."""
-        if why := sample.axes_problem:
-            self.warn(f"imu/data_raw: {why}: ignored", every=1.0)
-        elif self._believed(sample.stamp, "imu/data_raw"):
+        taken = self._axes.in_body(sample)
+        if taken is not None and self._believed(sample.stamp, "imu/data_raw"):
             self._imu_period.update(seconds(sample.stamp))
-            self._forces.append(sample.f_B)
+            self._forces.append(taken.f_B)
 
     def on_odometry(self, state: OdometryState) -> None:
         """Keep the newest."""

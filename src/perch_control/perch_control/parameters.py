@@ -10,6 +10,7 @@ from perch_control.laws import check_law
 from perch_control.nmpc.settings import NmpcSettings
 from perch_core.config import part, quantity, text
 from perch_core.errors import ConfigError
+from perch_core.imu_axes import IMU_AXES
 from perch_core.vehicle import ControlGains, Vector3, load_vehicle
 
 
@@ -48,6 +49,7 @@ class ControllerParameters:
     """Parameters of the node `controller`. Gains that are not set become those of the vehicle file, so that `ros2 param get` shows them."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
+    sensors: str = text("", doc=IMU_AXES)
     controller: ControllerChoice = part(ControllerChoice)
     gains: GainParameters = part(GainParameters)
     nmpc: NmpcSettings = part(NmpcSettings)

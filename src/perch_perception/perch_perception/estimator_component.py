@@ -14,7 +14,7 @@ from perch_core.errors import PerchError
 from perch_core.values import EstimatorHealth, ImuSample, InertialState, OdometryState, Transform, rotated
 from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
-from perch_perception.sensor_file import imu_axes, imu_noise
+from perch_perception.sensor_file import imu_noise
 from perch_perception.ukf import Estimate, Estimator, VioOutcome, VioPose
 from perch_perception.ukf.estimator import COVARIANCE_STRIDE
 from perch_perception.ukf.odometry import covariances, pose_of, state_of
@@ -46,7 +46,7 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def __init__(self, config: EstimatorConfig) -> None:
         super().__init__(replace(config, imu=imu_noise(config.sensors, config.imu)))
-        self._intake = ImuIntake(self.warn, imu_axes(config.sensors))
+        self._intake = ImuIntake(self.warn, config.sensors)
         self._begin()
 
     def _begin(self) -> None:
@@ -61,7 +61,7 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def on_transform(self, transform: Transform) -> None:
         """Where a frame, perhaps the IMU's, is in another."""
-        self._intake.add_transform(transform)
+        self._intake.axes.add_transform(transform)
 
     def on_vio_state(self, state: InertialState) -> None:
         """Keep VIO's state for the next IMU sample."""

@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
 from perch_core.values import CameraModel, Transform
-from perch_perception.static_transforms import BASE, StaticTransforms
+from perch_core.static_transforms import BASE, StaticTransforms
 
 CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which they are believed to have changed
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from perch_core import config
 from perch_core.camera_mount import CameraMount
 from perch_core.errors import ConfigError
@@ -40,12 +38,6 @@ def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:
         raise ConfigError(sensors, "imu", "missing")
     return ImuNoise(imu.accel_noise_density, imu.gyro_noise_density, imu.accel_bias_walk, imu.gyro_bias_walk, imu.accel_bias, imu.gyro_bias,
                     imu.accel_range, imu.gyro_range, imu.integration)
-
-
-def imu_axes(sensors: str) -> np.ndarray | None:
-    """R_BI of the sensor file, shape (3, 3); None: the IMU's axes are those of B, or its frame says what they are."""
-    imu = load_sensors(sensors).imu if sensors else None
-    return None if imu is None or np.array_equal(imu.R_BI, np.eye(3)) else imu.R_BI
 
 
 def calibration_sigmas(sensors: str, camera: str, given: CalibrationSigmas) -> CalibrationSigmas:

@@ -14,7 +14,7 @@ from perch_core.vehicle import load_vehicle
 from perch_perception.camera_component import CameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, mono_image
 from perch_perception.imu_intake import ImuIntake
-from perch_perception.sensor_file import calibration_sigmas, imu_axes, imu_noise, sensors_parameter
+from perch_perception.sensor_file import calibration_sigmas, imu_noise, sensors_parameter
 from perch_perception.ukf.odometry import covariances
 from perch_perception.vio import FrameOutcome, VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
 from perch_perception.vio.drawing import TrackPainter
@@ -56,7 +56,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         super().__init__(replace(config, imu=imu_noise(config.sensors, config.imu),
                                  calibration=calibration_sigmas(config.sensors, config.camera, config.calibration)))
         self._standing_height = load_vehicle(config.vehicle).standing_height
-        self._intake = ImuIntake(self.warn, imu_axes(config.sensors))
+        self._intake = ImuIntake(self.warn, config.sensors)
         self._counts = dict.fromkeys(FrameOutcome, 0)
         self._painter = TrackPainter()
         self._begin()
@@ -78,7 +78,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
 
     def on_transform(self, transform: Transform) -> None:
         """Where a frame, perhaps the camera's or the IMU's, is in another."""
-        self._intake.add_transform(transform)
+        self._intake.axes.add_transform(transform)
         super().on_transform(transform)
 
     def on_imu(self, sample: ImuSample) -> None:

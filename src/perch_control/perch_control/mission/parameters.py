@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perch_core.config import part
+from perch_core.config import part, text
+from perch_core.imu_axes import IMU_AXES
 from perch_control.mission.settings import MissionSettings
 
 
@@ -12,4 +13,5 @@ from perch_control.mission.settings import MissionSettings
 class MissionParameters:
     """Parameters of the node `mission`."""
 
+    sensors: str = text("", doc=IMU_AXES)
     mission: MissionSettings = part(MissionSettings)

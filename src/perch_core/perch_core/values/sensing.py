@@ -25,11 +25,6 @@ class ImuSample(NamedTuple):
     f_B: tuple[float, float, float]
     frame: str = "imu_link"
 
-    @property
-    def axes_problem(self) -> str:
-        """Why it is of no use where nobody turns it; empty: its frame's axes are those of B."""
-        return "" if self.frame in ("imu_link", "base_link", "") else f"frame {self.frame!r} is none of imu_link, base_link"
-
 
 class CameraImage:
     """One image, drawn or decoded when it is looked at.

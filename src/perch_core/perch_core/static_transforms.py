@@ -1,4 +1,4 @@
-"""Where frames that do not move are in each other: `/tf_static` as perception needs it."""
+"""Where frames that do not move are in each other: `/tf_static` as the nodes need it."""
 
 from __future__ import annotations
 

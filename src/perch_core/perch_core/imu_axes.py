@@ -1,0 +1,64 @@
+"""IMU samples in the axes of B, wherever the IMU's own point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from perch_core.sensors import load_sensors
+from perch_core.static_transforms import BASE, StaticTransforms
+from perch_core.values import ImuSample, Transform
+
+IMU_AXES = "sensor file, config/sensors/<name>.yaml or a path: axes of the IMU; empty: those of its frame by /tf_static"
+"""The parameter `sensors` of a node that needs no more of the file."""
+AXES_OF_B = frozenset(("imu_link", BASE, ""))
+
+
+class ImuAxes:
+    """Turns samples into the axes of B: by the sensor file where it mounts the IMU turned, otherwise by the sample's frame and `/tf_static`."""
+
+    def __init__(self, warn: Callable[[str, float], None], sensors: str = "") -> None:
+        """
+        Args:
+            warn: called with a warning and the least time between two of its kind [s].
+            sensors: sensor file; empty: none.
+
+        Raises:
+            ConfigError: no such file, or a value that is refused.
+        """
+        imu = load_sensors(sensors).imu if sensors else None
+        self._R_BI = None if imu is None or np.array_equal(imu.R_BI, np.eye(3)) else imu.R_BI
+        self._warn = warn
+        self._transforms = StaticTransforms()
+        self._turns: dict[str, np.ndarray] = {}  # frame -> R_BI
+
+    def add_transform(self, transform: Transform) -> None:
+        """Take where a frame is in another."""
+        if problem := self._transforms.add(transform):
+            self._warn(f"/tf_static: {problem}", 1.0)
+        self._turns.clear()
+
+    def in_body(self, sample: ImuSample) -> ImuSample | None:
+        """The sample in the axes of B; None where nobody has said yet what its axes are."""
+        if self._R_BI is not None:
+            return _turned(sample, self._R_BI)
+        if sample.frame in AXES_OF_B:
+            return sample
+        R_BI = self._axes(sample.frame)
+        return None if R_BI is None else _turned(sample, R_BI)
+
+    def _axes(self, frame: str) -> np.ndarray | None:
+        """R_BI of a frame, shape (3, 3); None where it is not known."""
+        if frame not in self._turns:
+            place = self._transforms.pose(frame)
+            if place is None:
+                self._warn(f"imu/data_raw: frame {frame!r} is not imu_link: samples are not used until /tf_static says "
+                           f"where it is in {BASE}", 1.0)
+                return None
+            self._turns[frame] = place[1]
+        return self._turns[frame]
+
+
+def _turned(sample: ImuSample, R_BI: np.ndarray) -> ImuSample:
+    return ImuSample(sample.stamp, tuple((R_BI @ np.array(sample.w_B)).tolist()), tuple((R_BI @ np.array(sample.f_B)).tolist()))
